@@ -266,7 +266,7 @@ BAD = {
                                                                                     "unit "
                                                                                    "deg")),
     "no readings": ("settings", "readings:\nsettings", 8, "'readings' is empty"),
-    "an empty missing value": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing entry 1' is "
+    "an empty value": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing entry 1' is "
                                                                           "empty")),
 }  # fmt: skip
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files and records: values in SI units, and errors in one sentence with their line."""  # noqa: E501
+"""YAML files and records: values in SI units, and errors in one sentence with their line."""
 
 import math
 from dataclasses import dataclass

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plane and perpendicular line in two forms, surfaces as unknowns and the paper's elimination: one
-problem.
+"""Plane and perpendicular line in two forms: unknown surfaces, and elimination as in the paper.
 
-Both see the same points of a hexapod: four groups of twelve, reached as a coordinate measuring
-machine holds coordinates.
+Both forms use the same points of a hexapod, four groups of twelve, and give the same results.
 """
 
 from dataclasses import replace
@@ -42,13 +40,13 @@ def layout(planned) -> Layout:
     return Layout(planned.robot, planned.place_points(planned.draw(GROUPS, 0)))
 
 
-def exact(layout: Layout) -> np.ndarray:
-    """Readings (1, n, 6) at which the machine as designed stands on its surfaces."""
+def solve_exact_readings(layout: Layout) -> np.ndarray:
+    """Return readings (1, n, 6) at which the nominal machine touches its surfaces."""
     return layout.solve_readings(layout.robot.parameters.nominal[None], 0.0, 0)
 
 
-def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layout) -> None:
-    local = build_measurements(layout, exact(layout)[0], NOISE).nuisance_parameters
+def test_plane_and_line_on_the_same_surface_share_its_direction(layout) -> None:
+    local = build_measurements(layout, solve_exact_readings(layout)[0], NOISE).nuisance_parameters
     names = {
         f"plane{g + 1}.held_z.{part}"
         for g in range(GROUPS)
@@ -58,8 +56,8 @@ def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layou
     assert len(local) == 5 * GROUPS
 
 
-def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> None:
-    data = build_measurements(layout, exact(layout)[0], NOISE)
+def test_shared_surface_is_read_from_a_measurement_file_as_saved(layout, tmp_path) -> None:
+    data = build_measurements(layout, solve_exact_readings(layout)[0], NOISE)
     lc.save_measurements(data, tmp_path / "points.csv", layout.robot)
     read = lc.load_measurements(tmp_path / "points.csv", layout.robot)
     assert sorted(read.nuisance_parameters.table.names) == sorted(
@@ -68,17 +66,17 @@ def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> Non
 
 
 @pytest.mark.slow
-def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_and_platform(
-    layout,
-) -> None:
-    known = identifiability(layout.robot, build_measurements(layout, exact(layout)[0], NOISE))
+def test_rank_is_33_of_42_and_nine_directions_are_rigid_motions(layout) -> None:
+    known = identifiability(
+        layout.robot, build_measurements(layout, solve_exact_readings(layout)[0], NOISE)
+    )
     assert known.rank == 33
     assert known.singular_values[32] > 1e6 * known.singular_values[33]
     motions = [c.meaning.data for c in known.unidentifiable if isinstance(c.meaning, Finding)]
     assert [m["frame"] for m in motions].count("base") == 6
     turns = [m for m in motions if m["frame"] == "platform" and m["motion"] == "rotation"]
     assert sum(m["through_origin"] for m in turns) == 3
-    rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whiten(
+    rows, _ = PaperRows(layout, solve_exact_readings(layout), MM, NOISE).whiten(
         np.zeros((1, 42)), np.zeros(1, dtype=int)
     )
     s = np.linalg.svd(rows[0, :, :42], compute_uv=False)
@@ -86,8 +84,10 @@ def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_
     assert s[32] > 1e-7 * s[0]
 
 
-def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> None:
-    at, _, _ = layout.linearize_points(layout.robot.parameters.nominal[None], exact(layout))
+def test_rows_of_the_paper_are_unchanged_by_motions_of_the_surfaces(layout) -> None:
+    at, _, _ = layout.linearize_points(
+        layout.robot.parameters.nominal[None], solve_exact_readings(layout)
+    )
     each = np.eye(3 * POINTS).reshape(POINTS, 3, 3 * POINTS)
     F, A = linearize_surfaces(at[0], np.repeat(each[None], GROUPS, axis=0), np.full(GROUPS, 2))
     B = map_displacements(*layout.levers)  # rows by points; A: held coordinates by points
@@ -98,26 +98,26 @@ def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> N
         assert np.linalg.matrix_rank(held) == POINTS - 2
 
 
-def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_variance(
-    layout, planned
-) -> None:
+def test_both_forms_and_the_rows_of_planning_give_the_same_covariance(layout, planned) -> None:
     assert compare_covariances(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
     free = select_free_parameters(layout.robot)
-    R = collect_information(free, build_measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
+    R = collect_information(free, build_measurements(layout, solve_exact_readings(layout)[0], MM))[
+        0
+    ][0, :42, :42]
     rows = planned.linearize(planned.draw(GROUPS, 0)).reshape(-1, 42)
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
 
 @pytest.mark.parametrize("name", ["6-pus", "linear-delta", "rotary-delta"])
-def test_rows_of_planning_are_those_of_surfaces_as_unknowns_on_other_robots_too(name) -> None:
+def test_rows_of_planning_agree_with_unknown_surfaces_on_other_robots(name) -> None:
     robot = lc.load_robot(name)
     planned = PlaneLineGroups(robot, 8, MM)
     design = planned.draw(8, 0)
     layout = Layout(robot, planned.place_points(design))
     free = select_free_parameters(robot)
-    R = collect_information(free, build_measurements(layout, exact(layout)[0], MM))[0][
-        0, : len(free), : len(free)
-    ]
+    R = collect_information(free, build_measurements(layout, solve_exact_readings(layout)[0], MM))[
+        0
+    ][0, : len(free), : len(free)]
     rows = planned.linearize(design).reshape(-1, len(free))
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
@@ -127,13 +127,13 @@ def test_both_forms_agree_with_lines_along_different_axes(planned) -> None:
     design = mixed.draw(GROUPS, 5)
     assert len(np.unique(design[:, 3])) > 1
     layout = Layout(mixed.robot, mixed.place_points(design))
-    assert len(build_measurements(layout, exact(layout)[0], NOISE).observations) > 2
+    assert len(build_measurements(layout, solve_exact_readings(layout)[0], NOISE).observations) > 2
     assert compare_covariances(layout, NOISE) < 1e-9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()], ids=["least squares", "MAP"])
-def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, method) -> None:
+def test_both_forms_give_the_same_estimate_to_first_order(layout, method) -> None:
     truth = draw_true_machines(layout.robot, MM, 1, 3)
     unlike = []
     for noise in (NOISE, 10.0 * NOISE):
@@ -153,11 +153,11 @@ def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, meth
     assert unlike[1] > 1.5 * unlike[0]  # second order: it falls with the noise
 
 
-def test_full_covariance_of_the_papers_rows_is_that_of_drawn_noise(layout) -> None:
+def test_covariance_of_the_rows_of_the_paper_agrees_with_drawn_noise(layout) -> None:
     d_1, d = layout.levers
     noise = np.random.default_rng(0).normal(size=(20000, 3 * POINTS)) * NOISE
     whitened = (
-        PaperRows(layout, exact(layout), MM, NOISE).whitener[0]
+        PaperRows(layout, solve_exact_readings(layout), MM, NOISE).whitener[0]
         @ map_displacements(d_1, d)[0]
         @ noise.T
     )

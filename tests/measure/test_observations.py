@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of one kind: whitening against closed forms, absence, and refusals."""
+"""Rows of one kind: whitening, missing components, weights and refusals."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def covariances(r, m, seed=0):
     return (A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(m)) * np.outer(scale, scale)
 
 
-def test_the_whitener_is_the_inverse_lower_cholesky_factor():
+def test_whitener_is_the_inverse_lower_cholesky_factor():
     C = covariances(20, 6)
     data = Observations(POSE, np.arange(20), np.zeros((20, 6)), C)
     W = data.whitener
@@ -34,10 +34,10 @@ def test_the_whitener_is_the_inverse_lower_cholesky_factor():
 
 
 @given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(0, 1000))
-def test_missing_components_equal_leaving_them_out_of_the_covariance(there, seed):
-    here = np.flatnonzero(there)
+def test_missing_components_are_removed_from_the_covariance(is_present, seed):
+    present = np.flatnonzero(is_present)
     C = covariances(1, 3, seed)
-    measured = np.where(there, np.random.default_rng(seed).normal(size=3), np.nan)[None]
+    measured = np.where(is_present, np.random.default_rng(seed).normal(size=3), np.nan)[None]
     data = Observations(POINT, np.array([0]), measured, C)
     T = geometry.apply_twist(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
     result = data.evaluate(T)
@@ -45,14 +45,14 @@ def test_missing_components_equal_leaving_them_out_of_the_covariance(there, seed
         data.whitener[0] @ result.residual[0, 0],
         data.whitener[0] @ result.jacobian[0, 0],
     )
-    assert_allclose(np.delete(white, here), 0.0, atol=0.0)
-    assert_allclose(np.delete(slopes, here, axis=0), 0.0, atol=0.0)
-    W = np.linalg.inv(np.linalg.cholesky(C[0][np.ix_(here, here)]))
-    assert_allclose(white[here], W @ (T[0, 0, here, 3] - measured[0, here]), rtol=1e-9)
-    assert data.n_residuals == len(here)
+    assert_allclose(np.delete(white, present), 0.0, atol=0.0)
+    assert_allclose(np.delete(slopes, present, axis=0), 0.0, atol=0.0)
+    W = np.linalg.inv(np.linalg.cholesky(C[0][np.ix_(present, present)]))
+    assert_allclose(white[present], W @ (T[0, 0, present, 3] - measured[0, present]), rtol=1e-9)
+    assert data.n_residuals == len(present)
 
 
-def test_what_is_written_in_a_covariance_beside_a_missing_component_does_not_matter():
+def test_covariance_entries_of_missing_components_are_ignored():
     C = covariances(1, 3)
     measured = np.array([[1.0, np.nan, 2.0]])
     broken = C.copy()
@@ -61,7 +61,7 @@ def test_what_is_written_in_a_covariance_beside_a_missing_component_does_not_mat
     assert np.array_equal(first.whitener, second.whitener)
 
 
-def test_a_weight_multiplies_the_square_and_zero_makes_a_row_absent_in_the_same_shape():
+def test_weight_multiplies_the_square_and_zero_removes_a_row():
     C = covariances(3, 3)
     one = Observations(POINT, np.arange(3), np.zeros((3, 3)), C)
     weighed = one.with_weights([1.0, 0.25, 0.0])
@@ -71,14 +71,14 @@ def test_a_weight_multiplies_the_square_and_zero_makes_a_row_absent_in_the_same_
     assert (one.n_residuals, weighed.n_residuals) == (9, 6)
 
 
-def test_sigma_may_be_one_number_one_per_column_or_one_per_row_and_column():
+def test_sigma_is_one_number_one_per_column_or_one_per_row_and_column():
     rows, measured = np.arange(2), np.zeros((2, 3))
     for sigma in (2.0, [2.0, 2.0, 2.0], np.full((2, 3), 2.0)):
         data = Observations.from_sigma(POINT, rows, measured, sigma)
         assert_allclose(data.covariance, np.broadcast_to(4.0 * np.eye(3), (2, 3, 3)), rtol=1e-15)
 
 
-def test_arrays_are_copies_that_cannot_be_written():
+def test_arrays_are_read_only_copies():
     measured = np.zeros((2, 3))
     data = Observations.from_sigma(POINT, np.arange(2), measured, 1.0)
     measured[0, 0] = 7.0
@@ -126,20 +126,20 @@ def test_arrays_are_copies_that_cannot_be_written():
         ),
     ],
 )
-def test_a_mistake_is_one_sentence(change, sentence):
+def test_invalid_observations_are_refused_in_one_sentence(change, sentence):
     right = {"kind": POINT, "rows": [0, 1], "measured": np.zeros((2, 3)), "covariance": np.eye(3)}
     with pytest.raises(DataError, match=sentence):
         Observations(**(right | change))
 
 
-def test_the_row_with_the_broken_covariance_is_named():
+def test_row_with_an_invalid_covariance_is_named():
     C = np.repeat(np.eye(3)[None], 5, axis=0)
     C[3, 0, 1] = C[3, 1, 0] = 1.5
     with pytest.raises(DataError, match="covariance of row 4 is not positive definite"):
         Observations(POINT, np.arange(5), np.zeros((5, 3)), C)
 
 
-def test_a_sigma_of_the_wrong_length_names_the_columns():
+def test_sigma_of_the_wrong_length_is_refused_with_the_columns():
     with pytest.raises(
         DataError,
         match=r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z",
@@ -150,6 +150,6 @@ def test_a_sigma_of_the_wrong_length_names_the_columns():
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_rows_are_whitened_without_a_loop():
+def test_100000_rows_are_whitened():
     data = Observations.from_sigma(POSE, np.arange(100_000), np.zeros((100_000, 6)), 1e-3)
     assert_allclose(data.whitener[99_999], 1e3 * np.eye(6), rtol=1e-12)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What public objects print, and what they say of an argument of the wrong type."""
+"""Texts of public objects, and refusals of arguments of the wrong type."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def poses():
     return zoo.make_poses(np.random.default_rng(0).uniform(-0.02, 0.02, (40, 6)) + middle)
 
 
-def test_every_public_object_prints_on_a_screen(robot, instrument, poses):
+def test_text_of_every_public_object_has_fewer_than_20_lines(robot, instrument, poses):
     data = simulate(robot, poses, instrument, seed=1)
     trials = simulate_trials(robot, robot.values[None], poses, instrument, seed=1)
     many = Measurements("many", np.zeros((2, 1)), data.take([0, 1]).observations * 30)
@@ -64,14 +64,14 @@ def test_every_public_object_prints_on_a_screen(robot, instrument, poses):
         assert text.count("\n") < LINES
 
 
-def test_the_text_of_a_kind_names_what_differs_from_the_default():
+def test_text_of_a_kind_states_only_settings_that_differ_from_the_default():
     assert repr(Pose()) == "Pose()"
     assert repr(Position(unknown=("frame",), frame="tracker")) == (
         "Position(unknown=('frame',), frame='tracker')"
     )
 
 
-def test_the_text_of_measurements_counts_poses_and_rows(robot, instrument, poses):
+def test_text_of_measurements_counts_poses_and_rows(robot, instrument, poses):
     text = repr(simulate(robot, poses, instrument, seed=1))
     assert "40 poses, 6 actuator readings each" in text
     assert "40 rows; 240 residuals" in text
@@ -119,12 +119,6 @@ def test_the_text_of_measurements_counts_poses_and_rows(robot, instrument, poses
         (lambda: Gaussian("1 um"), DataError, "got the text '1 um'; give an array"),  # type: ignore[arg-type]
     ],
 )
-def test_an_argument_of_the_wrong_type_says_what_to_pass(call, error, words):
+def test_wrong_argument_type_is_refused_with_advice(call, error, words):
     with pytest.raises(error, match=words):
         call()
-
-
-def test_the_share_of_a_split_is_the_share_that_is_fitted():
-    data = Measurements("toy", np.arange(8.0)[:, None], ())
-    fitted, held_out = data.split(hold_out=0.25, seed=1)
-    assert (fitted.n_poses, held_out.n_poses) == (6, 2)

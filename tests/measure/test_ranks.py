@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each kind can tell of a hexapod's 42 parameters: ranks against counts of what it cannot see.
+"""Each kind determines as many of a hexapod's 42 parameters as counting predicts.
 
 Six are lost to each unknown frame, three to a point's unknown orientation or to an orientation's
-unknown place, and so on; the numbers were computed beforehand for two hexapods by other code.
+unknown place, and so on. The numbers were computed beforehand for two hexapods by other code.
 """
 
 import numpy as np
@@ -84,8 +84,8 @@ CASES = {
 }
 
 
-def sensors(kind):
-    """The kind looking at all poses; a ball-bar at many pairs of them."""
+def build_instrument(kind):
+    """Return a sensor of this kind that measures all poses, or many pairs of them."""
     rows = None
     if kind.poses_per_row == 2:
         rows = np.concatenate([np.stack([ALL, np.roll(ALL, -k)], axis=-1) for k in (1, 7, 19)])
@@ -94,10 +94,8 @@ def sensors(kind):
     return Instrument((Sensor(kind, Gaussian(sigma), rows=rows),))
 
 
-def singular_values(robot, poses, instrument):
-    """Singular values of the machine's columns, with those of the kind's unknowns projected out,
-    all scaled.
-    """
+def compute_singular_values(robot, poses, instrument):
+    """Return singular values of the scaled machine columns; nuisance columns are projected out."""
     trials = simulate_trials(robot, robot.values, poses, instrument, seed=1, controller=robot)
     data = trials.trial(0)
     state = forward_trials(robot, robot.values[None], data.readings[None])
@@ -109,9 +107,9 @@ def singular_values(robot, poses, instrument):
         D,
     )[0]
     p = len(robot.parameters)
-    machine, own = rows[:, :p], rows[:, p:-1]
-    if own.shape[1]:
-        U, s, _ = np.linalg.svd(own / np.linalg.norm(own, axis=0), full_matrices=False)
+    machine, nuisance = rows[:, :p], rows[:, p:-1]
+    if nuisance.shape[1]:
+        U, s, _ = np.linalg.svd(nuisance / np.linalg.norm(nuisance, axis=0), full_matrices=False)
         U = U[:, s > 1e-10]
         machine = machine - U @ (U.T @ machine)
         machine = machine - U @ (U.T @ machine)
@@ -139,12 +137,12 @@ def generic():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_rank_of_a_kind_is_what_counting_says(robot, generic, name):
+def test_rank_of_each_kind_is_the_predicted_one(robot, generic, name):
     kind, rank = CASES[name]
-    check_rank(singular_values(robot, generic, sensors(kind)), rank)
+    check_rank(compute_singular_values(robot, generic, build_instrument(kind)), rank)
 
 
-def test_planes_and_perpendicular_lines_touched_at_poses_on_them_tell_33(robot):
+def test_planes_and_perpendicular_lines_have_rank_33(robot):
     rng = np.random.default_rng(4)
     turns = zoo.make_poses(rng.uniform(-0.3, 0.3, (180, 6)))[:, :3, :3]
     points, seen, first = [], [], 0
@@ -166,11 +164,13 @@ def test_planes_and_perpendicular_lines_touched_at_poses_on_them_tell_33(robot):
             seen.append(Sensor(made, noise, rows=np.arange(first, first + 30)))
             first += 30
     poses = geometry.make_pose(turns, np.concatenate(points) - (turns @ POINT[0]))
-    check_rank(singular_values(robot, poses, Instrument(tuple(seen))), 33)
+    check_rank(compute_singular_values(robot, poses, Instrument(tuple(seen))), 33)
 
 
-def test_ball_bar_and_tilts_in_one_fit_tell_more_than_each_alone(robot, generic):
-    both = Instrument(sensors(Separation(places=POINT)).sensors + sensors(Inclination()).sensors)
+def test_ball_bar_and_tilts_together_have_rank_38(robot, generic):
+    both = Instrument(
+        build_instrument(Separation(places=POINT)).sensors + build_instrument(Inclination()).sensors
+    )
     # the ball-bar leaves six of the base and three of the tool's orientation; level gravity gives
     # two of the base and the mounting all three of the tool
-    check_rank(singular_values(robot, generic, both), 38)
+    check_rank(compute_singular_values(robot, generic, both), 38)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standard deviations of readings that cannot be meant are refused in a sentence that names the
-actuator and the unit.
-"""
+"""Invalid standard deviations of readings are refused with the actuator and the unit."""
 
 from dataclasses import replace
 
@@ -15,8 +13,8 @@ from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor
 from loopcal.mechanism import sample_workspace
 
 
-def data_of(name, n=20, sigma=None):
-    """A robot, and measured positions of it."""
+def simulate_positions(name, n=20, sigma=None):
+    """Return a robot and simulated positions of it."""
     robot = load_robot(name)
     seen = Instrument((Sensor(Position(), Gaussian(np.full(3, 1e-5))),))
     return robot, simulate(
@@ -25,14 +23,14 @@ def data_of(name, n=20, sigma=None):
 
 
 @pytest.mark.parametrize("given", ["5 um", 1j, np.array([1j]), [[1.0], "a"]])
-def test_what_is_no_number_is_refused_as_given(given):
+def test_sigma_that_is_not_a_number_is_refused(given):
     with pytest.raises(DataError, match="give numbers, in metres and radians"):
         Measurements("r", [[0.0, 0.0]], (), reading_sigma=given)  # type: ignore[arg-type]
     with pytest.raises(DataError, match="give numbers, in metres and radians"):
-        data_of("linear-delta", 1, given)
+        simulate_positions("linear-delta", 1, given)
 
 
-def test_a_reading_that_is_not_there_asks_for_an_infinite_sigma():
+def test_missing_reading_needs_an_infinite_sigma():
     with pytest.raises(
         DataError,
         match=r"row 1, column 2 is nan; give a finite number, or "
@@ -48,7 +46,7 @@ def test_a_reading_that_is_not_there_asks_for_an_infinite_sigma():
 
 
 @pytest.mark.parametrize(
-    ("name", "sigma", "said"),
+    ("name", "sigma", "message"),
     [
         (
             "linear-delta",
@@ -65,14 +63,14 @@ def test_a_reading_that_is_not_there_asks_for_an_infinite_sigma():
         ("linear-delta", np.nan, "is not a standard deviation"),
     ],
 )
-def test_a_sigma_that_says_nothing_is_refused_by_the_name_of_the_actuator(name, sigma, said):
+def test_invalid_sigma_of_a_reading_is_refused_with_the_actuator(name, sigma, message):
     robot = load_robot(name)
-    said = said.replace("slide1", robot.actuators[0].name)
-    with pytest.raises(DataError, match=said):
-        data_of(name, 3, sigma)
+    message = message.replace("slide1", robot.actuators[0].name)
+    with pytest.raises(DataError, match=message):
+        simulate_positions(name, 3, sigma)
     if sigma > 0.0:
-        robot, data = data_of(name)
-        with pytest.raises(DataError, match=said):
+        robot, data = simulate_positions(name)
+        with pytest.raises(DataError, match=message):
             identify(
                 robot,
                 replace(data, reading_sigma=np.full(data.readings.shape, sigma)),
@@ -80,8 +78,8 @@ def test_a_sigma_that_says_nothing_is_refused_by_the_name_of_the_actuator(name, 
             )
 
 
-def test_one_exact_reading_among_redundant_ones_is_refused_as_a_limit_of_the_method():
-    robot, data = data_of("cable-4")
+def test_exact_reading_of_a_redundant_actuator_is_refused():
+    robot, data = simulate_positions("cable-4")
     exact = replace(data, reading_sigma=np.array([0.0, 1e-3, 1e-3, 1e-3]))
     with pytest.raises(
         DataError, match="readings of redundant actuators cannot be exact: state a sigma above 0"
@@ -90,8 +88,8 @@ def test_one_exact_reading_among_redundant_ones_is_refused_as_a_limit_of_the_met
     assert "contradict" not in str(error.value)
 
 
-def test_sigmas_that_drown_others_in_rounding_are_noted():
-    robot, data = data_of("cable-4")
+def test_sigmas_of_very_different_size_are_reported():
+    robot, data = simulate_positions("cable-4")
     usual = identify(robot, data, LeastSquares())
     assert not any("standard deviations differ" in note for note in map(str, usual.findings))
     extreme = identify(robot, replace(data, reading_sigma=1e-15), LeastSquares())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated measurements: noise, streams, commanded poses, and checks against the robot."""
+"""Simulated measurements: noise, random streams, commanded poses, checks against the robot."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def truth(robot):
     return robot.with_values(sample_truth(robot, 1, seed=5)[0])
 
 
-def test_commanded_poses_become_the_readings_of_the_controllers_geometry(robot, truth):
+def test_readings_are_those_of_the_controller_for_the_commanded_poses(robot, truth):
     assert_allclose(
         solve_commanded_poses(robot, COMMANDED).q, inverse(robot, COMMANDED).q, atol=0.0
     )
@@ -70,7 +70,7 @@ def test_commanded_poses_become_the_readings_of_the_controllers_geometry(robot, 
     assert_allclose(own, inverse(truth, COMMANDED).q, atol=0.0)
 
 
-def test_a_perfect_machine_is_seen_where_it_was_commanded_within_the_noise(robot):
+def test_nominal_machine_is_measured_at_the_commanded_poses_within_noise(robot):
     data = simulate(robot, COMMANDED, TRACKER, seed=1)
     for rows in data.observations:
         white = (rows.whitener @ rows.evaluate(COMMANDED[None]).residual[0, ..., None])[..., 0]
@@ -79,7 +79,7 @@ def test_a_perfect_machine_is_seen_where_it_was_commanded_within_the_noise(robot
     assert data.robot_name == robot.name
 
 
-def test_a_true_machine_is_seen_where_its_own_geometry_puts_it(robot, truth):
+def test_true_machine_is_measured_at_the_poses_of_its_geometry(robot, truth):
     trials = simulate_trials(robot, truth.values, COMMANDED, TRACKER, seed=1)
     white = (trials.trial(0).observations[0].whitener @ _residual(trials)[..., None])[..., 0]
     assert np.abs(white).max() < 5.0
@@ -93,7 +93,7 @@ def _residual(trials):
     return trials.trial(0).observations[0].evaluate(trials.T[:1]).residual[0]
 
 
-def test_trial_i_is_the_same_in_every_study_and_simulate_is_trial_0(robot):
+def test_trial_does_not_depend_on_the_number_of_trials(robot):
     values = sample_truth(robot, 5, seed=9)
     assert np.array_equal(values[:2], sample_truth(robot, 2, seed=9))
     five = simulate_trials(robot, values, COMMANDED, TRACKER, seed=3)
@@ -107,7 +107,7 @@ def test_trial_i_is_the_same_in_every_study_and_simulate_is_trial_0(robot):
     assert not np.allclose(five.measured[0][0], five.measured[0][1], atol=1e-9)
 
 
-def test_a_second_sensor_does_not_change_the_noise_of_the_first(robot):
+def test_second_sensor_does_not_change_the_noise_of_the_first(robot):
     alone = simulate(robot, COMMANDED, Instrument(TRACKER.sensors[:1]), seed=3)
     assert np.array_equal(
         alone.observations[0].measured,
@@ -123,7 +123,7 @@ def test_true_values_have_the_tolerances_as_standard_deviations(robot):
     assert np.all(np.abs(scatter - 1.0) < 0.05)
 
 
-def test_noise_has_the_spread_it_states():
+def test_drawn_noise_has_the_stated_standard_deviation():
     for noise in (Gaussian(SIGMA), Uniform(SIGMA)):
         drawn = noise.draw(make_random_stream(1, 0), 20000)
         # 1 / sqrt(40000) = 0.5 % for the normal one, less for the uniform one; six columns within
@@ -133,19 +133,19 @@ def test_noise_has_the_spread_it_states():
 
 
 @pytest.mark.parametrize("sigma", [[0.0], [-1.0], [np.nan]])
-def test_noise_that_is_none_is_refused(sigma):
+def test_noise_without_a_positive_sigma_is_refused(sigma):
     with pytest.raises(DataError, match="the sigma of the noise"):
         Gaussian(np.array(sigma))
 
 
-def test_a_noise_of_the_wrong_length_names_the_columns():
+def test_noise_of_the_wrong_length_is_refused_with_the_columns():
     with pytest.raises(DataError, match="give one for each of rx, ry, rz, x, y, z"):
         Sensor(Pose(), Gaussian(np.ones(1)))
     with pytest.raises(DataError, match="at least one sensor"):
         Instrument(())
 
 
-def test_a_pose_the_controller_cannot_reach_is_named(robot):
+def test_commanded_pose_out_of_reach_is_refused_by_name(robot):
     far = COMMANDED.copy()
     far[2, 0, 3] = np.nan
     with pytest.raises(DataError, match="does not reach commanded pose '3'"):
@@ -155,7 +155,7 @@ def test_a_pose_the_controller_cannot_reach_is_named(robot):
         solve_commanded_poses(robot, far, labels)
 
 
-def test_a_machine_that_cannot_follow_is_absent_from_its_trial_only(robot):
+def test_machine_that_cannot_reach_its_poses_has_nan_in_its_trial_only(robot):
     values = np.stack([robot.values, robot.values])
     values[1, robot.parameters.index("leg1.length")] += 10.0
     trials = simulate_trials(robot, values, COMMANDED, TRACKER, seed=1)
@@ -192,7 +192,7 @@ def test_readings_of_another_robot_are_refused_with_the_actuators(robot):
     assert error.value.args[0].data["actuators"] == tuple(a.name for a in robot.actuators)
 
 
-def test_a_row_given_twice_is_refused():
+def test_duplicate_row_is_refused():
     kind = Component(("z",), T_platform_tool=np.eye(4))
     rows = Observations.from_sigma(kind, [0, 1, 2], [[1.0], [2.0], [1.0]], 1.0)
     once = Measurements("toy", np.array([[1.0], [1.0], [2.0]]), (rows,))
@@ -205,7 +205,7 @@ def test_a_row_given_twice_is_refused():
     check_duplicates(twice, allow=True)
 
 
-def test_true_values_of_unknowns_are_seen_and_unknown_names_are_refused(robot):
+def test_stated_nuisance_values_are_simulated_and_unknown_names_are_refused(robot):
     tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker")
     instrument = Instrument((Sensor(tracker, Gaussian(np.full(3, 1e-9))),))
     at = {"tracker.x": 1.0, "tracker.rz": np.pi / 2, "ball.z": 0.1}
@@ -226,7 +226,7 @@ def test_true_values_of_unknowns_are_seen_and_unknown_names_are_refused(robot):
         simulate(robot, COMMANDED, instrument, seed=1, nuisance_values={"traker.x": 1.0})
 
 
-def test_rows_may_see_some_poses_compare_two_and_stand_in_sessions(robot):
+def test_sensors_measure_selected_poses_pairs_and_sessions(robot):
     pairs = np.array([[0, 5], [3, 1]])
     bar = Sensor(Separation(), Gaussian(np.array([1e-9])), rows=pairs)
     some = Sensor(

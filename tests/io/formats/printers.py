@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records of real delta printers as printer.cfg: our own lines around the numbers of the firmware."""
+"""Records of real delta printers as printer.cfg, with our own lines around their numbers."""
 
 from typing import Any
 

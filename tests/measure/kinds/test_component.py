@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `component`: subsets, wrapped angles, the normal near zero tilt, mapped covariances,
-refusals.
-"""
+"""Kind `component`: subsets, wrapped angles, the normal near zero tilt, covariances, refusals."""
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from tests.jacobians import check_jacobian
 FIVE = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", T_platform_tool=np.eye(4))
 
 
-def poses_of(phi, theta, psi):
+def make_poses(phi, theta, psi):
     return geometry.make_pose(
         geometry.tilt_torsion_to_matrix(*np.broadcast_arrays(phi, theta, psi)), np.zeros(3)
     )[None]
@@ -28,19 +26,19 @@ def map_covariance(kind, T, measured, covariance):
     return rows @ covariance @ np.swapaxes(rows, -1, -2)
 
 
-def test_a_probed_height_is_z_of_the_tool_alone():
+def test_probed_height_is_z_of_the_tool_point():
     T_platform_tool = geometry.make_pose(np.eye(3), np.array([0.0, 0.1, -0.2]))
     height = Component(T_platform_tool=T_platform_tool)
     T = geometry.make_pose(geometry.rotation_about_axis(0.5, 0), np.array([1.0, 2.0, 3.0]))[
         None, None
     ]
-    residual, jacobian, own, _ = height.evaluate(T, np.array([[[3.0]]]))
-    assert own is None
+    residual, jacobian, nuisance, _ = height.evaluate(T, np.array([[[3.0]]]))
+    assert nuisance is None
     assert_allclose(residual, 0.1 * np.sin(0.5) - 0.2 * np.cos(0.5), atol=1e-15)
     assert_allclose(jacobian[0, 0, 0, 3:], [0.0, 0.0, 1.0], atol=0.0)
 
 
-def test_angle_differences_wrap_across_half_a_turn():
+def test_angle_differences_are_wrapped_at_180_deg():
     kind = Component(("a", "c"), "euler-xyz", T_platform_tool=np.eye(4))
     T = geometry.make_pose(
         geometry.euler_to_matrix(np.array([np.pi - 1e-3, 0.2, -np.pi + 2e-3]), "xyz"), np.zeros(3)
@@ -49,8 +47,8 @@ def test_angle_differences_wrap_across_half_a_turn():
     assert_allclose(residual[0, 0], [-2e-3, 4e-3], atol=1e-15)
 
 
-def test_azimuth_wraps_too():
-    T = poses_of(np.array([np.pi - 1e-3]), np.array([0.3]), np.array([0.0]))
+def test_azimuth_differences_are_wrapped():
+    T = make_poses(np.array([np.pi - 1e-3]), np.array([0.3]), np.array([0.0]))
     measured = np.array([[[0.0, 0.0, 0.0, -np.pi + 1e-3, 0.3]]])
     assert_allclose(FIVE.evaluate(T, measured).residual[0, 0, 3:], [-2e-3, 0.0], atol=1e-14)
 
@@ -58,8 +56,8 @@ def test_azimuth_wraps_too():
 @pytest.mark.parametrize(
     "theta", [0.0, 1e-9, pytest.param(0.9 * SMALL_TILT, marks=pytest.mark.slow)]
 )
-def test_near_zero_tilt_the_normal_stands_in_for_phi_and_theta(theta):
-    T = poses_of(np.array([2.0]), np.array([theta]), np.array([0.4]))
+def test_normal_replaces_phi_and_theta_near_zero_tilt(theta):
+    T = make_poses(np.array([2.0]), np.array([theta]), np.array([0.4]))
     noise = np.array([[[0.0, 0.0, 0.0, 2e-4, -1e-4]]])
     measured = FIVE.measure(T, noise)
     assert_allclose(FIVE.evaluate(T, measured).residual, -noise, atol=1e-15)
@@ -74,7 +72,7 @@ def test_near_zero_tilt_the_normal_stands_in_for_phi_and_theta(theta):
     check_jacobian(residual, result.jacobian, np.zeros(6), scale=0.02, automatic=automatic)
 
 
-def test_the_information_does_not_jump_where_the_normal_takes_over():
+def test_information_is_continuous_at_the_tilt_limit_of_the_normal():
     covariance = np.diag([1e-10, 1e-10, 1e-10, 1e-12, 1e-12, 1e-12])[None]
     measured = np.array(
         [
@@ -82,7 +80,7 @@ def test_the_information_does_not_jump_where_the_normal_takes_over():
             [0.0, 0.0, 0.0, 0.7, SMALL_TILT * (1 + 1e-9)],
         ]
     )
-    T = poses_of(measured[:, 3], measured[:, 4], np.zeros(2))
+    T = make_poses(measured[:, 3], measured[:, 4], np.zeros(2))
     data = Observations(FIVE, np.arange(2), measured, map_covariance(FIVE, T, measured, covariance))
     white = data.whitener @ data.evaluate(T).jacobian[0]
     information = np.swapaxes(white, -1, -2) @ white
@@ -91,7 +89,7 @@ def test_the_information_does_not_jump_where_the_normal_takes_over():
     assert_allclose(information[0], information[1], atol=1e-7 * information.max())
 
 
-def test_a_covariance_of_rotation_is_mapped_to_the_angles_as_by_drawing():
+def test_mapped_covariance_of_angles_agrees_with_drawn_rotations():
     rng = np.random.default_rng(3)
     kind = Component(("z", "a", "b", "c"), "euler-xyz", T_platform_tool=np.eye(4))
     A = rng.normal(size=(6, 6))
@@ -107,7 +105,7 @@ def test_a_covariance_of_rotation_is_mapped_to_the_angles_as_by_drawing():
     )
 
 
-def test_all_six_components_carry_the_information_of_the_full_pose():
+def test_six_components_have_the_information_of_a_full_pose():
     C = np.diag([1e-10, 2e-10, 3e-10, 1e-12, 2e-12, 3e-12])
     T = geometry.apply_twist(np.eye(4), np.array([0.4, 0.6, -0.3, 0.1, 0.2, 0.3]))[None, None]
     kinds = (
@@ -152,12 +150,12 @@ def test_all_six_components_carry_the_information_of_the_full_pose():
         ),
     ],
 )
-def test_what_cannot_be_measured_is_refused_with_what_can(components, orientation, sentence):
+def test_invalid_components_are_refused_with_the_allowed_ones(components, orientation, sentence):
     with pytest.raises(DataError, match=sentence):
         Component(components, orientation)
 
 
-def test_a_measured_gimbal_lock_is_refused_with_the_way_out():
+def test_measured_gimbal_lock_is_refused():
     kind = Component(("a", "b"), "euler-xyz", T_platform_tool=np.eye(4))
     with pytest.raises(
         DataError, match=r"row 2 .* b = 90 deg, where a and c of euler-xyz are the same rotation"

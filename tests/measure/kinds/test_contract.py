@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every kind must satisfy. The tests loop over `KINDS` and the examples of each, so a new kind
-is in at once.
+"""Requirements on every kind of measurement.
+
+The tests loop over `KINDS` and the examples of each, so that a new kind is tested at once.
 """
 
 import dataclasses
@@ -36,16 +37,16 @@ def platform_poses(kind, t, r, seed=0, spread=0.4):
     )
 
 
-def placed(kind):
-    """The kind on a robot with a tool, seen from a frame of its own where the kind has one."""
+def attach_frame_and_tool(kind):
+    """Return the kind with a tool, and with a stated frame if it has one."""
     stated = getattr(kind, "T_base_frame", None)
     if stated is not None and np.array_equal(stated, np.eye(4)):
         kind = dataclasses.replace(kind, T_base_frame=T_BASE_FRAME)
     return kind.with_tool(T_PLATFORM_TOOL)
 
 
-def own_unknowns(kind, seed=2):
-    """Values of the kind's unknowns (1, 1, u) off their nominal ones, None where it has none."""
+def draw_nuisance_values(kind, seed=2):
+    """Return values of the unknowns (1, 1, u) that differ from nominal, None without unknowns."""
     if not kind.nuisance_parameters:
         return None
     return kind.nominal_values[None, None] + np.random.default_rng(seed).uniform(
@@ -53,28 +54,28 @@ def own_unknowns(kind, seed=2):
     )
 
 
-def joints_of(kind, T, seed=3):
-    """Values of the joints that the kind looks at (t, r, j), None where it looks at none."""
+def draw_joint_values(kind, T, seed=3):
+    """Return values of the sensed joints (t, r, j), None without sensed joints."""
     if not kind.sensed_joints:
         return None
     return np.random.default_rng(seed).uniform(-0.5, 0.5, (*T.shape[:2], len(kind.sensed_joints)))
 
 
-def measured_near(kind, T, size, seed=1):
-    """Readings of the true poses with errors of this size in the noise columns."""
+def measure_with_errors(kind, T, size, seed=1):
+    """Return measurements of the true poses with errors of this size, and the errors."""
     noise = size * np.random.default_rng(seed).uniform(
         -1.0, 1.0, (*T.shape[:2], len(kind.noise_columns))
     )
-    return kind.measure(T, noise, own_unknowns(kind), joints_of(kind, T)), noise
+    return kind.measure(T, noise, draw_nuisance_values(kind), draw_joint_values(kind, T)), noise
 
 
-def evaluated(kind, T, measured):
-    """The kind at its unknowns and joints."""
-    return kind.evaluate(T, measured, own_unknowns(kind), joints_of(kind, T))
+def evaluate_kind(kind, T, measured):
+    """Evaluate the kind at drawn values of its unknowns and joints."""
+    return kind.evaluate(T, measured, draw_nuisance_values(kind), draw_joint_values(kind, T))
 
 
 @every_kind
-def test_a_kind_is_registered_under_its_name_and_says_what_its_columns_measure(kind):
+def test_kind_is_registered_and_its_columns_have_dimensions(kind):
     assert KINDS[kind.name] is type(kind)
     assert len({c.name for c in kind.columns}) == len(kind.columns) > 0
     assert all(isinstance(c.dimension, Dimension) for c in (*kind.columns, *kind.noise_columns))
@@ -82,38 +83,38 @@ def test_a_kind_is_registered_under_its_name_and_says_what_its_columns_measure(k
 
 
 @every_kind
-def test_shapes_follow_trials_and_rows(kind):
-    kind = placed(kind)
+def test_shapes_follow_the_numbers_of_trials_and_rows(kind):
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 3, 5)
-    measured, _ = measured_near(kind, T, 1e-3)
+    measured, _ = measure_with_errors(kind, T, 1e-3)
     m, links = len(kind.noise_columns), () if kind.poses_per_row == 1 else (kind.poses_per_row,)
     assert measured.shape == (3, 5, len(kind.columns))
     assert kind.detect_present(measured).shape == (3, 5, m)
     assert kind.linearize_noise(measured).shape == (3, 5, m, m)
     for rows in (measured, measured[:1]):
-        result = evaluated(kind, T, rows)
+        result = evaluate_kind(kind, T, rows)
         assert result.residual.shape == (3, 5, m)
         assert result.jacobian.shape == (3, 5, *links, m, 6)
         assert (result.nuisance is None) == (not kind.nuisance_parameters)
 
 
 @every_kind
-def test_the_residual_of_a_noise_free_reading_is_zero(kind):
-    kind = placed(kind)
+def test_residual_of_a_noise_free_measurement_is_zero(kind):
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 2, 50)
-    measured, _ = measured_near(kind, T, 0.0)
-    residual = evaluated(kind, T, measured).residual
+    measured, _ = measure_with_errors(kind, T, 0.0)
+    residual = evaluate_kind(kind, T, measured).residual
     assert_allclose(
         residual, 0.0, atol=1e-13
     )  # [m, rad], ulps over the sine of the smallest tilt, about 0.01
 
 
 @every_kind
-def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turned(kind):
-    kind = placed(kind)
+def test_residual_of_a_noisy_measurement_is_minus_the_mapped_noise(kind):
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 2, 50)
-    measured, noise = measured_near(kind, T, 1e-6)
-    residual = evaluated(kind, T, measured).residual
+    measured, noise = measure_with_errors(kind, T, 1e-6)
+    residual = evaluate_kind(kind, T, measured).residual
     expected = -(kind.linearize_noise(measured) @ noise[..., None])[..., 0]
     assert_allclose(
         residual, expected, atol=1e-11
@@ -121,11 +122,11 @@ def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turne
 
 
 def check_derivatives(kind, error, *, with_jax):
-    """By the platform's twist (of every pose of a row) and by the unknowns, all at once."""
-    kind = placed(kind)
+    """Check derivatives by the platform's twist (of every pose of a row) and by the unknowns."""
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 2, 4, seed=5)
-    measured, _ = measured_near(kind, T, error)
-    values, joints = own_unknowns(kind), joints_of(kind, T)
+    measured, _ = measure_with_errors(kind, T, error)
+    values, joints = draw_nuisance_values(kind), draw_joint_values(kind, T)
     found = kind.evaluate(T, measured, values, joints)
     parts = (
         [found.jacobian]
@@ -166,41 +167,41 @@ def check_derivatives(kind, error, *, with_jax):
 
 @every_kind
 @pytest.mark.parametrize("error", [1e-4, 0.3])
-def test_the_derivatives_by_twist_and_unknowns_agree_with_differences(kind, error):
+def test_derivatives_by_twist_and_unknowns_agree_with_finite_differences(kind, error):
     check_derivatives(kind, error, with_jax=False)
 
 
 @every_kind
 @pytest.mark.slow
-def test_the_derivatives_by_twist_and_unknowns_agree_with_an_automatic_derivative(kind):
+def test_derivatives_by_twist_and_unknowns_agree_with_automatic_ones(kind):
     check_derivatives(kind, 0.1, with_jax=True)
 
 
 @pytest.mark.parametrize("kind", WITH_JOINTS)
-def test_the_jacobian_by_the_joints_agrees_with_differences(kind):
+def test_derivatives_by_joints_agree_with_finite_differences(kind):
     T = platform_poses(kind, 2, 4)
-    measured, _ = measured_near(kind, T, 1e-3)
-    joints = joints_of(kind, T)
-    found = kind.evaluate(T, measured, own_unknowns(kind), joints).joints
+    measured, _ = measure_with_errors(kind, T, 1e-3)
+    joints = draw_joint_values(kind, T)
+    found = kind.evaluate(T, measured, draw_nuisance_values(kind), joints).joints
 
     def residual(x):
-        return kind.evaluate(T, measured, own_unknowns(kind), joints + x).residual
+        return kind.evaluate(T, measured, draw_nuisance_values(kind), joints + x).residual
 
     check_jacobian(residual, found, np.zeros(len(kind.sensed_joints)), scale=0.05, atol=1e-13)
     with pytest.raises(DataError, match="needs the values of"):
-        kind.evaluate(T, measured, own_unknowns(kind))
+        kind.evaluate(T, measured, draw_nuisance_values(kind))
 
 
 @pytest.mark.parametrize("kind", WITH_UNKNOWNS)
-def test_unknowns_may_differ_from_row_to_row_and_from_trial_to_trial(kind):
-    kind = placed(kind)
+def test_nuisance_values_may_differ_between_rows_and_trials(kind):
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 2, 3)
-    joints = joints_of(kind, T)
+    joints = draw_joint_values(kind, T)
     values = kind.nominal_values + np.random.default_rng(8).uniform(
         -0.1, 0.1, (2, 3, len(kind.nuisance_parameters))
     )
     measured = kind.measure(T, np.zeros((2, 3, len(kind.noise_columns))), values, joints)
-    together = kind.evaluate(T, measured, own_unknowns(kind), joints)
+    together = kind.evaluate(T, measured, draw_nuisance_values(kind), joints)
     assert_allclose(kind.evaluate(T, measured, values, joints).residual, 0.0, atol=1e-13)
     one = (slice(1, 2), slice(2, 3))
     alone = kind.measure(
@@ -214,16 +215,16 @@ def test_unknowns_may_differ_from_row_to_row_and_from_trial_to_trial(kind):
 
 
 @every_kind
-def test_components_not_measured_are_zero_and_leave_the_others_as_they_were(kind):
-    kind = placed(kind)
+def test_missing_components_are_zero_and_do_not_change_the_others(kind):
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 2, 20)
-    measured, _ = measured_near(kind, T, 1e-3)
-    whole = evaluated(kind, T, measured)
+    measured, _ = measure_with_errors(kind, T, 1e-3)
+    whole = evaluate_kind(kind, T, measured)
     for column in range(len(kind.columns)):
         holed = measured.copy()
         holed[:, ::2, column] = np.nan
         present = kind.detect_present(holed)
-        part = evaluated(kind, T, holed)
+        part = evaluate_kind(kind, T, holed)
         assert not present[:, ::2].all()
         assert present[:, 1::2].all()
         assert_allclose(part.residual[~present], 0.0, atol=0.0)
@@ -236,15 +237,18 @@ def test_components_not_measured_are_zero_and_leave_the_others_as_they_were(kind
 
 @every_kind
 def test_rows_do_not_depend_on_their_batch(kind):
-    kind = placed(kind)
+    kind = attach_frame_and_tool(kind)
     T = platform_poses(kind, 3, 6)
-    measured, _ = measured_near(kind, T, 1e-3)
-    together = evaluated(kind, T, measured)
+    measured, _ = measure_with_errors(kind, T, 1e-3)
+    together = evaluate_kind(kind, T, measured)
     for i, j in ((0, 0), (2, 5)):
         one = (slice(i, i + 1), slice(j, j + 1))
-        joints = joints_of(kind, T)
+        joints = draw_joint_values(kind, T)
         alone = kind.evaluate(
-            T[one], measured[one], own_unknowns(kind), None if joints is None else joints[one]
+            T[one],
+            measured[one],
+            draw_nuisance_values(kind),
+            None if joints is None else joints[one],
         )
         # numpy takes another path through vectorised sines and small products for other lengths: a
         # rounding each
@@ -253,7 +257,7 @@ def test_rows_do_not_depend_on_their_batch(kind):
 
 
 @every_kind
-def test_a_kind_that_needs_a_tool_says_so_and_keeps_its_own(kind):
+def test_kind_without_a_tool_is_refused_and_keeps_the_first_tool(kind):
     if kind.has_tool:
         assert kind.with_tool(T_PLATFORM_TOOL) is kind
         return
@@ -267,6 +271,6 @@ def test_a_kind_that_needs_a_tool_says_so_and_keeps_its_own(kind):
 
 
 @every_kind
-def test_nothing_the_kind_stores_can_be_changed(kind):
+def test_arrays_of_a_kind_are_read_only(kind):
     for value in vars(kind.with_tool(T_PLATFORM_TOOL)).values():
         assert not isinstance(value, np.ndarray) or not value.flags.writeable

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors on joints: passive ones by name, driven ones as encoders, locks."""
+"""Joint sensors and locks: passive joints by name, encoders of driven joints, locked joints."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ COMMANDED = np.random.default_rng(2).uniform([0.65, -np.pi, 0.05], [0.75, np.pi,
 TINY = 1e-9
 
 
-def sensor(kind, **labels):
+def build_sensor(kind, **labels):
     return Sensor(kind, Gaussian(np.full(len(kind.noise_columns), TINY)), **labels)
 
 
@@ -33,10 +33,14 @@ def robot():
     return zoo.three_prs()
 
 
-def test_a_sensor_on_a_passive_joint_shows_its_value_and_the_offset(robot):
+def test_sensor_on_a_passive_joint_measures_its_value_plus_the_offset(robot):
     kind = JointSensor(joints=("limb2.pin", "limb1.pin"), measures="angle", unknown=("offset",))
     data = simulate(
-        robot, COMMANDED, Instrument((sensor(kind),)), 1, nuisance_values={"limb1.pin.joint": 0.1}
+        robot,
+        COMMANDED,
+        Instrument((build_sensor(kind),)),
+        1,
+        nuisance_values={"limb1.pin.joint": 0.1},
     )
     solution = inverse(robot, COMMANDED)
     expected = [solution.passive[:, solution.passive_names.index(name)] for name in kind.joints]
@@ -44,19 +48,19 @@ def test_a_sensor_on_a_passive_joint_shows_its_value_and_the_offset(robot):
     assert_allclose(data.observations[0].measured, shown, atol=1e-8)
 
 
-def test_an_encoder_is_a_sensor_on_a_driven_joint(robot):
+def test_sensor_on_a_driven_joint_measures_the_reading(robot):
     kind = JointSensor(joints=("q1", "q2", "q3"))
-    data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1)
+    data = simulate(robot, COMMANDED, Instrument((build_sensor(kind),)), 1)
     assert_allclose(data.observations[0].measured, data.readings, atol=1e-8)
 
 
-def test_a_lock_holds_at_a_constant_of_its_group(robot):
+def test_lock_measures_the_deviation_from_the_constant_of_its_group(robot):
     kind = Locked(joints=("q1",))
     groups = np.repeat(["a", "b"], 4)
     data = simulate(
         robot,
         COMMANDED,
-        Instrument((sensor(kind, group=groups),)),
+        Instrument((build_sensor(kind, group=groups),)),
         1,
         nuisance_values={"a.q1.locked": 0.2},
     )
@@ -64,9 +68,9 @@ def test_a_lock_holds_at_a_constant_of_its_group(robot):
     assert_allclose(data.observations[0].measured[:, 0], slip, atol=1e-8)
 
 
-def test_rows_of_joints_follow_the_joints(robot):
+def test_rows_of_joints_have_the_derivatives_of_the_joints(robot):
     kind = JointSensor(joints=("limb1.pin", "q2"), measures="angle")
-    data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1)
+    data = simulate(robot, COMMANDED, Instrument((build_sensor(kind),)), 1)
     state = forward_trials(robot, robot.values[None], data.readings[None])
     values = select_joint_values(robot, kind.sensed_joints, data.readings[None], state)
     slopes = {name: np.random.default_rng(5).normal(size=(1, 8, 4)) for name in kind.sensed_joints}
@@ -82,6 +86,8 @@ def test_rows_of_joints_follow_the_joints(robot):
         evaluate_measurements(data, state.T, np.zeros((1, 0)))
 
 
-def test_a_joint_that_is_not_there_is_named_with_those_that_are(robot):
+def test_unknown_joint_is_refused_with_the_existing_ones(robot):
     with pytest.raises(DataError, match=r"has no joint 'limb1.pim'.*limb1\.pin"):
-        simulate(robot, COMMANDED, Instrument((sensor(JointSensor(joints=("limb1.pim",))),)), 1)
+        simulate(
+            robot, COMMANDED, Instrument((build_sensor(JointSensor(joints=("limb1.pim",))),)), 1
+        )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `pose`: its residual, the forms of orientation, and what it refuses."""
+"""Kind `pose`: residual, forms of orientation, noise and refusals."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from loopcal.errors import DataError
 from loopcal.measure import Observations, Pose
 
 
-def test_the_residual_is_a_rotation_vector_and_a_difference_of_positions():
+def test_residual_is_a_rotation_vector_and_a_difference_of_positions():
     T = geometry.apply_twist(np.eye(4), np.array([0.2, 0.0, 0.0, 1.0, 2.0, 3.0]))[None, None]
     measured = np.array([[[0.1, 0.0, 0.0, 1.0, 2.0, 2.5]]])
     residual = Pose(T_platform_tool=np.eye(4)).evaluate(T, measured).residual
@@ -38,7 +38,7 @@ def test_all_forms_of_orientation_give_the_same_residual_in_every_frame():
         )  # [m, rad], ulps over the tilt
 
 
-def test_the_length_and_sign_of_a_quaternion_do_not_matter():
+def test_length_and_sign_of_a_quaternion_do_not_change_the_residual():
     kind = Pose("quaternion", T_platform_tool=np.eye(4))
     T = geometry.apply_twist(np.eye(4), np.full(6, 0.2))[None, None]
     measured = kind.measure(T, np.zeros((1, 1, 6)))
@@ -46,7 +46,7 @@ def test_the_length_and_sign_of_a_quaternion_do_not_matter():
     assert_allclose(kind.evaluate(T, measured).residual, 0.0, atol=1e-15)
 
 
-def test_a_sigma_of_euler_angles_becomes_that_of_the_rotation_error():
+def test_sigma_of_euler_angles_is_converted_to_that_of_the_rotation_error():
     kind = Pose("euler-xyz", T_platform_tool=np.eye(4))
     measured = np.array([[0.3, 1.0, -0.4, 0.0, 0.0, 0.0]])
     sigma = np.array([1e-5, 2e-5, 3e-5, 1e-6, 2e-6, 3e-6])
@@ -57,7 +57,7 @@ def test_a_sigma_of_euler_angles_becomes_that_of_the_rotation_error():
     assert_allclose(data.covariance[0, :3, 3:], 0.0, atol=0.0)
 
 
-def test_half_an_orientation_is_refused():
+def test_incomplete_orientation_is_refused():
     with pytest.raises(DataError, match="row 2 of kind 'pose' has an incomplete orientation"):
         Observations.from_sigma(
             Pose(T_platform_tool=np.eye(4)),
@@ -67,14 +67,14 @@ def test_half_an_orientation_is_refused():
         )
 
 
-def test_a_quaternion_that_is_none_is_refused():
+def test_zero_quaternion_is_refused():
     with pytest.raises(DataError, match="has a quaternion of length 0; the length must be 1"):
         Observations.from_sigma(
             Pose("quaternion", T_platform_tool=np.eye(4)), [0], np.zeros((1, 7)), 1e-3
         )
 
 
-def test_a_frame_that_is_no_pose_is_refused():
+def test_frame_that_is_not_a_pose_is_refused():
     mirrored = np.diag([1.0, 1.0, -1.0, 1.0])
     with pytest.raises(DataError, match="T_base_frame is not a pose"):
         Pose(T_base_frame=mirrored)
@@ -84,7 +84,7 @@ def test_a_frame_that_is_no_pose_is_refused():
 
 @pytest.mark.parametrize("form", ["tilt-torsion", "euler-ZXZ"])
 @pytest.mark.parametrize("tilt", [0.0, 1e-9, 1e-3])
-def test_noise_of_angles_that_are_nearly_the_same_turn_is_a_rotation_error(form, tilt):
+def test_noise_near_zero_tilt_is_a_rotation_error(form, tilt):
     # before, a tilt of 1e-9 made one rotation a thousand million times as certain as stated, and a
     # tilt of zero was refused
     kind = Pose(form, T_platform_tool=np.eye(4))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unknowns of measurements: who shares which, names, priors, and refusals."""
+"""Nuisance parameters of measurements: sharing between rows, names, priors and refusals."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ BED = Plane(unknown=("surface",), places=np.zeros((1, 3)), surface="bed")
 LEVEL = ("0", "1", "2", "3")
 
 
-def rows(kind, count=4, **labels):
+def make_rows(kind, count=4, **labels):
     seen = (
         np.arange(count)
         if kind.poses_per_row == 1
@@ -40,8 +40,8 @@ def rows(kind, count=4, **labels):
     return Observations.from_sigma(kind, seen, measured, 1e-3, **labels)
 
 
-def test_kinds_that_name_the_same_frame_share_its_unknowns():
-    local = collect_nuisance_parameters([rows(TRACKER), rows(AXIS)], LEVEL)
+def test_kinds_with_the_same_frame_share_its_parameters():
+    local = collect_nuisance_parameters([make_rows(TRACKER), make_rows(AXIS)], LEVEL)
     turns = ["tracker.rx", "tracker.ry", "tracker.rz"]
     assert list(local.table.names) == [
         *turns,
@@ -55,13 +55,15 @@ def test_kinds_that_name_the_same_frame_share_its_unknowns():
     assert np.array_equal(local.indices[1], np.tile([0, 1, 2], (4, 1)))
 
 
-def test_every_session_and_every_group_has_its_own():
+def test_every_session_and_group_has_separate_parameters():
     sessions = np.array(["mon", "mon", "tue", "tue"])
-    local = collect_nuisance_parameters([rows(TRACKER, session=sessions)], LEVEL)
+    local = collect_nuisance_parameters([make_rows(TRACKER, session=sessions)], LEVEL)
     assert len(local) == 18
     assert local.table.names[0] == "mon.tracker.rx"
     assert np.array_equal(local.indices[0][:, 0], [0, 0, 9, 9])
-    groups = collect_nuisance_parameters([rows(BED, group=np.array(["a", "b", "a", "b"]))], LEVEL)
+    groups = collect_nuisance_parameters(
+        [make_rows(BED, group=np.array(["a", "b", "a", "b"]))], LEVEL
+    )
     assert groups.table.names == (
         "a.bed.u",
         "a.bed.v",
@@ -72,32 +74,32 @@ def test_every_session_and_every_group_has_its_own():
     )
     assert np.array_equal(groups.indices[0][:, 2], [2, 5, 2, 5])
     both = collect_nuisance_parameters(
-        [rows(BED, session=sessions, group=np.array(["a", "b", "a", "b"]))], LEVEL
+        [make_rows(BED, session=sessions, group=np.array(["a", "b", "a", "b"]))], LEVEL
     )
     assert "mon.a.bed.u" in both.table.names
 
 
-def test_one_name_stated_in_two_ways_is_refused():
+def test_name_with_two_different_statements_is_refused():
     elsewhere = Position(targets=("ball",), places=np.ones((1, 3)), unknown=("targets",))
     with pytest.raises(
         DataError, match=r"states the parameter 'ball.x' as 1 .*another kind states it as 0"
     ):
-        collect_nuisance_parameters([rows(TRACKER), rows(elsewhere)], LEVEL)
+        collect_nuisance_parameters([make_rows(TRACKER), make_rows(elsewhere)], LEVEL)
     turned = Direction(
         unknown=("frame",),
         frame="tracker",
         T_base_frame=geometry.make_pose(geometry.rotation_about_axis(0.1, 0), np.zeros(3)),
     )
     with pytest.raises(DataError, match=r"another orientation or place of 'tracker'"):
-        collect_nuisance_parameters([rows(TRACKER), rows(turned)], LEVEL)
+        collect_nuisance_parameters([make_rows(TRACKER), make_rows(turned)], LEVEL)
     clash = Position(targets=("frame",), places=np.zeros((1, 3)), unknown=("frame", "targets"))
     with pytest.raises(DataError, match=r"two parameters called 'frame\.x'"):
-        collect_nuisance_parameters([rows(clash)], LEVEL)
+        collect_nuisance_parameters([make_rows(clash)], LEVEL)
 
 
-def test_priors_fixed_values_and_values_by_name():
+def test_priors_and_values_are_set_by_name_or_pattern():
     local = (
-        collect_nuisance_parameters([rows(TRACKER)], LEVEL)
+        collect_nuisance_parameters([make_rows(TRACKER)], LEVEL)
         .with_prior("tracker.r?", 1e-3)
         .with_fixed("ball.*")
     )
@@ -114,13 +116,13 @@ def test_priors_fixed_values_and_values_by_name():
         local.with_prior("ball.*", 0.0)
 
 
-def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
+def test_whitened_matrix_has_a_derivative_column_for_every_unknown():
     rng = np.random.default_rng(3)
     T = geometry.apply_twist(np.eye(4), rng.uniform(-0.3, 0.3, (2, 4, 6)))
     parts = (
-        rows(TRACKER, session=np.array(["a", "a", "b", "b"])),
-        rows(Separation(places=np.ones((1, 3)))),
-        rows(AXIS),
+        make_rows(TRACKER, session=np.array(["a", "a", "b", "b"])),
+        make_rows(Separation(places=np.ones((1, 3)))),
+        make_rows(AXIS),
     )
     data = Measurements("toy", np.zeros((4, 1)), parts)
     local = collect_nuisance_parameters(parts, data.labels).with_fixed("a.ball.x")
@@ -147,7 +149,7 @@ def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
         assert_allclose(found[..., column], 0.0 if fixed else difference, atol=2e-4)
 
 
-def test_rows_of_weight_zero_and_absent_components_are_zero_in_the_same_shape():
+def test_rows_of_weight_zero_and_missing_components_are_zero():
     measured = np.ones((4, 3))
     measured[1, 2] = np.nan
     part = Observations.from_sigma(TRACKER, np.arange(4), measured, 1e-3).with_weights(
@@ -166,8 +168,8 @@ def test_rows_of_weight_zero_and_absent_components_are_zero_in_the_same_shape():
     assert np.flatnonzero(empty).tolist() == [5, 6, 7, 8]
 
 
-def test_kinds_without_unknowns_and_joints_need_neither():
-    data = Measurements("toy", np.zeros((4, 1)), (rows(Component(T_platform_tool=np.eye(4))),))
+def test_kind_without_unknowns_has_no_nuisance_columns():
+    data = Measurements("toy", np.zeros((4, 1)), (make_rows(Component(T_platform_tool=np.eye(4))),))
     found = evaluate_measurements(data, np.broadcast_to(np.eye(4), (1, 4, 4, 4)), np.zeros((1, 0)))
     assert found[0].nuisance.shape == (1, 4, 1, 0)
     assert found[0].jacobian.shape == (1, 4, 1, 1, 6)

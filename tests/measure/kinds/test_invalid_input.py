@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What cannot be meant is refused by every kind, in one sentence that says what to do."""
+"""Every kind refuses invalid settings and rows in one sentence."""
 
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ EXAMPLES = [
         (lambda: JointSensor(measures="force"), "the joints measure 'force'; use length or angle"),
     ],
 )
-def test_settings_that_make_no_kind(make, sentence):
+def test_invalid_settings_of_a_kind_are_refused(make, sentence):
     with pytest.raises(DataError, match=sentence):
         make()
 
@@ -101,7 +101,7 @@ def test_settings_that_make_no_kind(make, sentence):
         ),
     ],
 )
-def test_rows_that_no_instrument_shows(kind, row, sentence):
+def test_impossible_rows_are_refused(kind, row, sentence):
     good = {"distance": [1.0], "separation": [1.0], "direction": [0.0, 0.0, 1.0]}.get(
         kind.name, [0.0, 0.0]
     )
@@ -110,13 +110,13 @@ def test_rows_that_no_instrument_shows(kind, row, sentence):
         Observations.from_sigma(kind, poses, [good, row], 1e-4)
 
 
-def test_a_row_that_compares_a_pose_with_itself():
+def test_row_that_compares_a_pose_with_itself_is_refused():
     with pytest.raises(DataError, match="row 2 of kind 'separation' compares pose 3 with itself"):
         Observations.from_sigma(Separation(places=POINT), [[0, 1], [3, 3]], np.ones((2, 1)), 1e-4)
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
+def test_singular_covariance_and_duplicate_rows_are_refused(kind):
     kind = kind.with_tool(np.eye(4))
     T = geometry.apply_twist(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
     rows = np.array([0, 1, 1]) if kind.poses_per_row == 1 else np.array([[0, 1], [1, 2], [1, 2]])
@@ -136,13 +136,13 @@ def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
 
 
 @pytest.mark.parametrize("name", ["a,b", 'say "hello"', "Kügelchen №1", "日本"])
-def test_names_may_hold_anything(name):
+def test_names_of_targets_may_contain_any_text(name):
     kind = Position(targets=(name, "b"), places=np.zeros((2, 3)), unknown=("targets",))
     assert kind.columns[0].name == f"{name}.x"
     assert kind.nuisance_parameters[0].name == f"{name}.x"
 
 
-def test_a_target_that_no_pose_moves_is_named():
+def test_target_that_never_moves_is_refused_by_name():
     T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     kind = Position(targets=("a", "b"), places=0.1 * np.eye(3)[:2])
     noise = 1e-5 * np.random.default_rng(1).normal(size=(1, 8, 6))
@@ -176,7 +176,7 @@ FOLLOWING = [
 
 
 @pytest.mark.parametrize("kind", FOLLOWING, ids=lambda kind: kind.name)
-def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_robot(kind):
+def test_constant_values_are_refused_for_every_kind_that_follows_the_robot(kind):
     kind = kind.with_tool(np.eye(4))
     T = zoo.make_poses(
         np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)) + np.array([0, 0, 0, 0.1, 0.1, 0.0])
@@ -198,9 +198,10 @@ def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_rob
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_sentence(kind):
-    """No turn and one height: something stays open in every kind, and is named; where a frame
-    cannot be found, that is said.
+def test_poses_in_one_plane_give_unidentifiable_combinations_or_a_refusal(kind):
+    """Poses without rotation at one height leave combinations unidentifiable in every kind.
+
+    A kind whose frame cannot be found is refused instead.
     """
     robot = zoo.hexapod()
     flat = np.column_stack(
@@ -229,14 +230,14 @@ def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_senten
 
 
 @pytest.mark.parametrize("kind", [Plane(places=POINT), Line(places=POINT), JointSensor()])
-def test_touched_surfaces_and_joints_may_stay_where_they_are(kind):
+def test_constant_values_are_accepted_for_surfaces_and_joints(kind):
     T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
     data = Measurements("toy", np.arange(8.0)[:, None], (rows,))
     assert check_targets_move(data, T) is None
 
 
-def test_a_sensor_that_is_to_look_at_poses_that_are_not_there():
+def test_sensor_rows_of_missing_poses_are_refused():
     kind = Separation(places=POINT)
     with pytest.raises(DataError, match="refer to pose 7, but the 4 poses are 0 to 3"):
         Sensor(kind, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).assign_rows(4)

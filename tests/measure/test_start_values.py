@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial values of unknown frames, targets and surfaces: any orientation, no guess."""
+"""Start values of unknown frames, targets and surfaces, in any orientation, without a guess."""
 
 import json
 from dataclasses import replace
@@ -39,7 +39,7 @@ def poses(rng):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_unknown_is_found_without_a_guess(name):
+def test_start_values_of_every_unknown_explain_exact_data(name):
     for seed in range(4):
         rng = np.random.default_rng(seed)
         T = poses(rng)
@@ -54,7 +54,7 @@ def test_every_unknown_is_found_without_a_guess(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["targets in a frame", "frame and tool of poses"])
-def test_starts_are_found_in_150_of_150_random_frames_with_a_machine_that_is_a_millimetre_off(name):
+def test_start_values_are_found_for_150_random_frames_and_machine_errors(name):
     for seed in range(150):
         one = start(name, seed)
         assert one is not None
@@ -62,7 +62,7 @@ def test_starts_are_found_in_150_of_150_random_frames_with_a_machine_that_is_a_m
 
 
 @pytest.mark.evidence
-def test_every_frame_is_found_at_full_size_and_of_others_no_more_than_one_in_200_is_missed(root):
+def test_evidence_every_frame_and_99_5_percent_of_others_are_found(root):
     path = root / "docs" / "evidence" / "starts.json"
     if not path.exists():
         pytest.skip("docs/evidence/starts.json is made by `make evidence`")
@@ -76,7 +76,7 @@ def test_every_frame_is_found_at_full_size_and_of_others_no_more_than_one_in_200
             assert found >= 0.995 * draws, name
 
 
-def test_kinds_that_share_a_frame_start_it_together():
+def test_kinds_that_share_a_frame_get_one_start_value():
     rng = np.random.default_rng(0)
     T = poses(rng)
     balls = Position(targets=("ball",), places=NOWHERE, unknown=("frame", "targets"))
@@ -94,7 +94,7 @@ def test_kinds_that_share_a_frame_start_it_together():
     )
 
 
-def test_sessions_are_started_one_by_one():
+def test_sessions_get_separate_start_values():
     rng = np.random.default_rng(1)
     T = poses(rng)
     parts = [
@@ -114,7 +114,7 @@ def test_sessions_are_started_one_by_one():
     )
 
 
-def test_fixed_values_stay_and_priors_pull():
+def test_fixed_values_are_kept_and_priors_change_start_values():
     rng = np.random.default_rng(2)
     T = poses(rng)
     data, local, truth = measured_at(KINDS["a frame"], T, rng)
@@ -127,7 +127,7 @@ def test_fixed_values_stay_and_priors_pull():
     assert_allclose(tight[3], truth[3] + 1e-3, atol=1e-5)
 
 
-def test_points_in_one_plane_need_a_word_on_the_side():
+def test_points_in_one_plane_need_a_stated_side():
     rng = np.random.default_rng(3)
     T = poses(rng)
     T[:, 2, 3] = 0.8
@@ -145,7 +145,7 @@ def test_points_in_one_plane_need_a_word_on_the_side():
     assert_allclose(found, truth, atol=1e-7)
 
 
-def test_points_on_a_line_leave_a_turn_open_and_are_refused():
+def test_collinear_points_with_an_unknown_frame_are_refused():
     rng = np.random.default_rng(3)
     T = poses(rng)
     T[:, :3, 3] = np.array([0.1, 0.2, 0.3]) * np.linspace(0, 1, N)[:, None]
@@ -156,7 +156,7 @@ def test_points_on_a_line_leave_a_turn_open_and_are_refused():
         guess_nuisance_values(data, T, local)
 
 
-def test_the_24_rotations_of_a_cube_leave_none_out():
+def test_every_rotation_is_within_63_deg_of_a_rotation_of_the_cube():
     assert OCTAHEDRAL_ROTATIONS.shape == (24, 3, 3)
     assert_allclose(
         OCTAHEDRAL_ROTATIONS @ np.swapaxes(OCTAHEDRAL_ROTATIONS, 1, 2),
