@@ -411,3 +411,41 @@ def test_data_of_another_robot_give_a_note(tmp_path, capsys, stated, noted) -> N
         main(words)
         said = f"loopcal: note: {data} names the robot 'other-robot', but 'hexapod-42'"
         assert (said in capsys.readouterr().err) == noted
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence", "hint"),
+    [
+        ("calibrate", "Missing argument 'ROBOT'.", "see loopcal calibrate --help"),
+        ("simulate r.yaml", "Missing option '-o' / '--output'.", "see loopcal simulate --help"),
+        (
+            "calibrate r.yaml d.csv -o run --hold-out 1.5",
+            "'--hold-out': 1.5 is not in the range",
+            "see loopcal calibrate --help",
+        ),
+        (
+            "simulate r.yaml -o d.csv --sigma-position=-5um",
+            "'--sigma-position': '-5um' is not above 0; give a positive number",
+            "see loopcal simulate --help",
+        ),
+    ],
+)
+def test_wrong_use_names_the_option_and_the_help(run_refused, words, sentence, hint) -> None:
+    message = run_refused(words)
+    assert sentence in message
+    assert message.endswith(f"Hint: {hint}\n")
+
+
+def test_misspelled_key_for_the_family_is_named_with_its_line(run_refused) -> None:
+    message = run_refused("check r.yaml", r_yaml=f"format: 1\nfamilly: gough\n{UNITS}")
+    assert "r.yaml:2: unknown key 'familly' (did you mean 'family'?); correct it" in message
+
+
+def test_missing_column_does_not_suggest_another_column_that_is_needed(run_refused) -> None:
+    data = """# kind: pose
+# orientation: rotation-vector
+pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],rx [rad],ry [rad],rz [rad],x [mm],y [mm]
+a,0,0,0,0,0,0,0,0,0,0,0
+"""
+    message = run_refused("calibrate hexapod-42 data.csv -o run", data_csv=data)
+    assert "no column 'z', which the kind 'pose' measures; add it with its unit" in message

@@ -95,6 +95,22 @@ def test_long_work_shows_percentage_and_remaining_time_on_a_terminal():
     assert "0:00" in shown
 
 
+def test_bar_begins_at_the_steps_that_are_done_and_keeps_its_time():
+    bar = terminal.ProgressBar()
+    bar._bar = terminal._make_bar()
+    bar(2, 5, "fitting")
+    first = bar._task
+    assert (bar._bar.tasks[0].completed, bar._bar.tasks[0].total) == (2, 5)
+    bar(3, 5, "searching for outliers")
+    assert bar._task == first
+    assert (bar._bar.tasks[0].completed, bar._bar.tasks[0].description) == (
+        3,
+        "searching for outliers",
+    )
+    bar(1, 9, "comparing")
+    assert [(task.completed, task.total) for task in bar._bar.tasks] == [(1, 9)]
+
+
 def test_progress_is_hidden_for_short_work_and_without_a_terminal():
     assert _run_on_terminal(1).split() == ["end"]
     words = [sys.executable, "-c", WORK, "8"]

@@ -128,6 +128,8 @@ def test_without_held_out_poses_the_verdict_is_undecided(robot, data):
     assert report.exit_code == 0
     assert report.top_findings[0].code == "workflow.no-held-out-poses"
     assert report.next_step.code == "workflow.next-hold-out"
+    few = calibrate(robot, data, CalibrationOptions(hold_out=0.1))
+    assert (few.verdict, few.next_step.code) == (Verdict.UNDECIDED, "workflow.next-hold-out-more")
     assert report.validation is None
     assert report.fitted_errors is not None
 

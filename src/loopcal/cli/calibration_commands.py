@@ -190,7 +190,7 @@ def validate(
     The errors are those before and after calibration; of a robot file without identified values
     there is only one. The noise floor is the error that the measurement noise alone causes.
 
-    Frames, targets and surfaces keep the values that RUN found, by name. Others are fitted to DATA,
+    Frames, targets and surfaces keep their values in RUN, by name. Others are fitted to DATA,
     which makes the errors optimistic; a note says so.
 
     The exit code is 2 where a limit is exceeded.

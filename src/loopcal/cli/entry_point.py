@@ -136,6 +136,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
         return 1
+    except (click.BadParameter, click.NoSuchOption) as error:
+        path = "loopcal" if error.ctx is None else error.ctx.command_path
+        return _refuse(error.format_message(), f"see {path} --help")
     except click.ClickException as error:
         return _refuse(error.format_message())
     except LoopcalError as error:

@@ -14,6 +14,7 @@ from loopcal.cli.hints import hint_for
 from loopcal.cli.options import (
     FILE,
     LENGTH,
+    POSITIVE_LENGTH,
     add_options,
     file_option,
     force_option,
@@ -57,7 +58,9 @@ SHOWN = 20
 )
 @add_options(
     *(
-        click.option(f"--sigma-{of}", type=LENGTH, help=f"Noise of {what}.  [default: {default}]")
+        click.option(
+            f"--sigma-{of}", type=POSITIVE_LENGTH, help=f"Noise of {what}.  [default: {default}]"
+        )
         for of, what, default in (
             ("height", "the probe (klipper)", "0.02mm"),
             ("distance", "distances (klipper)", "0.1mm"),

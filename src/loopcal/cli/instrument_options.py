@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from loopcal.cli.options import ANGLE, LENGTH, add_options
+from loopcal.cli.options import POSITIVE_ANGLE, POSITIVE_LENGTH, add_options
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.units import parse_quantity
 
@@ -52,13 +52,13 @@ instrument_options = add_options(
     ),
     click.option(
         "--sigma-position",
-        type=LENGTH,
+        type=POSITIVE_LENGTH,
         default="0.01mm",
         help="Standard deviation of each measured length.",
     ),
     click.option(
         "--sigma-angle",
-        type=ANGLE,
+        type=POSITIVE_ANGLE,
         default="50urad",
         help="Standard deviation of each measured angle.",
     ),

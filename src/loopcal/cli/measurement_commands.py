@@ -75,8 +75,8 @@ def identifiability(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Show which parameters of ROBOT the measurements DATA determine, which combinations remain
-    open, and which further measurement determines them.
+    """Show which parameters of ROBOT the measurements DATA determine, which combinations they
+    cannot determine, and which further measurement does.
 
     Without DATA, an instrument is assumed that measures --poses, or poses drawn from the workspace
     of ROBOT. Its options are --measure (or --kind, --components, --orientation), --frames and the

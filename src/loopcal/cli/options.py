@@ -53,12 +53,17 @@ def data_option(name: str, help_text: str, **kind: Any) -> Decorator:
 
 
 class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """A number with its unit on the command line, such as 0.02mm; its value is in SI."""
+    """A number with its unit on the command line, such as 0.02mm; its value is in SI.
+
+    Parameters
+    ----------
+    dimension : of the unit. is_positive : whether only numbers above 0 are allowed.
+    """
 
     name = "quantity"
 
-    def __init__(self, dimension: Dimension) -> None:
-        self.dimension = dimension
+    def __init__(self, dimension: Dimension, is_positive: bool = False) -> None:
+        self.dimension, self.is_positive = dimension, is_positive
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -67,13 +72,18 @@ class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  
         if isinstance(value, float):
             return value
         try:
-            return parse_quantity(value, self.dimension)
+            number = parse_quantity(value, self.dimension)
         except UnitError as error:
             self.fail(str(error), param, ctx)
+        if self.is_positive and not number > 0.0:
+            self.fail(f"{value!r} is not above 0; give a positive number", param, ctx)
+        return number
 
 
 LENGTH = Quantity(Dimension.LENGTH)
 ANGLE = Quantity(Dimension.ANGLE)
+POSITIVE_LENGTH = Quantity(Dimension.LENGTH, is_positive=True)
+POSITIVE_ANGLE = Quantity(Dimension.ANGLE, is_positive=True)
 
 
 def add_options(*options: Decorator) -> Decorator:
@@ -119,8 +129,8 @@ def _limit_option(name: str, kind: Quantity, quantity: str, example: str) -> Dec
 
 
 limit_options = add_options(
-    _limit_option("--limit-position", LENGTH, "position", "0.02mm"),
-    _limit_option("--limit-angle", ANGLE, "orientation", "0.01deg"),
+    _limit_option("--limit-position", POSITIVE_LENGTH, "position", "0.02mm"),
+    _limit_option("--limit-angle", POSITIVE_ANGLE, "orientation", "0.01deg"),
 )
 """Decorator for limits on the errors."""
 

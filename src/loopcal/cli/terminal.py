@@ -83,7 +83,7 @@ class ProgressBar:
         self._bar: Any = None
         self._task: Any = None
         self._state: tuple[int, int, str] | None = None
-        self._shown = ""
+        self._total: int | None = None
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
@@ -120,12 +120,12 @@ class ProgressBar:
             self._draw(*self._state)
 
     def _draw(self, done: int, total: int, what: str) -> None:
-        """Update the bar; work of another name begins a bar of its own."""
-        if what != self._shown:
+        """Update the bar; work with another number of steps begins a bar of its own."""
+        if total != self._total:
             if self._task is not None:
                 self._bar.remove_task(self._task)
-            self._task, self._shown = self._bar.add_task(what, total=total), what
-        self._bar.update(self._task, completed=done, total=total)
+            self._task, self._total = self._bar.add_task(what, total=total, completed=done), total
+        self._bar.update(self._task, completed=done, description=what)
 
 
 def _make_bar() -> Any:

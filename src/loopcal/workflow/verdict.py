@@ -61,6 +61,8 @@ def choose_next_step(
     if verdict is Verdict.CALIBRATED:
         return report_finding("workflow.next-use-result")
     if verdict is Verdict.UNDECIDED:
+        if any(finding.code == "workflow.few-held-out-poses" for finding in findings):
+            return report_finding("workflow.next-hold-out-more")
         return report_finding("workflow.next-hold-out")
     if outliers:
         return report_finding(

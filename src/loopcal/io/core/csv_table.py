@@ -173,10 +173,11 @@ def read_table(path: str | Path) -> Table:
 
 def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
     """Raise FileError for the first needed column that the table lacks; `why` follows its name."""
+    spare = [name for name in table.names if name not in needed]
     for name in needed:
         if name not in table.units:
             hints = (suggest_header(other, symbol, [name]) for other, symbol in table.units.items())
-            hint = next(filter(None, hints), suggest_names(name, table.names))
+            hint = next(filter(None, hints), suggest_names(name, spare))
             raise table.header_error(f"no column {name!r}{hint}, {why}; add it with its unit")
 
 

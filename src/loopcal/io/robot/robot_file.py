@@ -167,6 +167,9 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
     """Return the family that a robot file names."""
     family = file.content.get("family")
     if "family" not in file.content:
+        for key in file.content:
+            if suggestion := suggest_names(key, ["family"]):
+                raise file.error(f"unknown key {key!r}{suggestion}; correct it", (key,))
         raise file.error(
             f"this file names no family; write 'family:' and one of {', '.join(known)}"
         )
