@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Golden results: numbers that loopcal computed before its redesign, and the means to compute them
+"""Golden results: numbers computed by loopcal before its redesign, and the code that computes them
 again.
 """

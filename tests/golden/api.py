@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 # size: the only file of the golden results that knows names of loopcal, so that one file changes
 # with them
-"""The thin adapter: the only file of the golden results that imports loopcal.
+"""The adapter between the golden cases and loopcal: the only file of the golden results that
+imports loopcal.
 
-Where names in loopcal move, this file changes and nothing else. Functions that report return plain
-dicts of arrays, numbers and strings; what stands under the key `kinematic` is divided by the
-robot's size where it is a length. Everything else that is passed between functions (robots, data,
-fits) is opaque to the cases.
+If names in loopcal move, only this file changes. Functions that report return plain dicts of
+arrays, numbers and strings. Lengths under the key `kinematic` are divided by the robot's size.
+Other objects that functions exchange (robots, data, fits) are opaque to the cases.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ def robot(name: str) -> Robot:
 
 @cache
 def robot_with_leg_joints() -> Robot:
-    """Build hexapod-42 with the passive joints of its legs, so that sensors can look at them."""
+    """Build hexapod-42 with passive joints in its legs, for joint sensors."""
     record = replace(robot("hexapod-42").record.record, legs="ups")
     return build(record.expand(), record=record)
 
 
-def freed(machine: Robot, endings: Sequence[str]) -> Robot:
-    """Free the parameters alone whose names end so."""
+def free_only(machine: Robot, endings: Sequence[str]) -> Robot:
+    """Free only the parameters whose names have one of these endings."""
     entries = tuple(
         replace(p, free=p.name.endswith(tuple(endings))) for p in machine.parameters.entries
     )
@@ -90,20 +90,20 @@ def with_values(machine: Robot, values: Array) -> Robot:
     return machine.with_values(values)
 
 
-def wrong_by_one_parameter(machine: Robot, values: Array, name: str, change: float) -> Array:
+def change_value(machine: Robot, values: Array, name: str, change: float) -> Array:
     """Change one of the values (p,) [SI]."""
     moved = values.copy()
     moved[machine.parameters.names.index(name)] += change
     return moved
 
 
-def wrong_by(machine: Robot, values: Array, endings: Sequence[str]) -> Array:
-    """Return true values (p,) but nominal ones for the parameters whose names end so."""
+def replace_by_nominal(machine: Robot, values: Array, endings: Sequence[str]) -> Array:
+    """Return `values` (p,) with nominal ones for parameters whose names have these endings."""
     chosen = [name.endswith(tuple(endings)) for name in machine.parameters.names]
     return np.where(chosen, machine.values, values)
 
 
-def poses(machine: Robot, n: int, seed: int) -> Array:
+def draw_poses(machine: Robot, n: int, seed: int) -> Array:
     """Draw controlled coordinates (n, c) from the workspace."""
     return sample_workspace(machine, n, seed).coordinates
 
@@ -151,7 +151,7 @@ def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Repo
 
 
 def _size(machine: Robot, dimension: Dimension) -> float:
-    """What a quantity is divided by to have no unit."""
+    """Return the divisor that removes the unit of a quantity."""
     return machine.size if dimension is Dimension.LENGTH else 1.0
 
 
@@ -169,7 +169,7 @@ def kind_names() -> list[str]:
     return list(KINDS)
 
 
-def kind(name: str, *args: Any, **settings: Any) -> Any:
+def make_kind(name: str, *args: Any, **settings: Any) -> Any:
     """Make a kind of measurement."""
     return KINDS[name](*args, **settings)
 
@@ -180,17 +180,15 @@ def most_unknown_example(name: str) -> Any:
 
 
 def joint_example(name: str, machine: Robot) -> Any:
-    """Return the last example of a kind that looks at joints, looking at the passive ones, or the
-    driven without any.
-    """
+    """Return the last example of a joint sensor, on the passive joints or else the driven ones."""
     passive = passive_names(machine)
     return replace(
         most_unknown_example(name), joints=passive or actuator_names(machine), measures="angle"
     )
 
 
-def sensor(made: Any, sigma: ArrayLike | None = None, **seen: Any) -> Any:
-    """Let a kind look with this noise at `rows`, in `session` and `group`."""
+def make_sensor(made: Any, sigma: ArrayLike | None = None, **seen: Any) -> Any:
+    """Make a sensor of a kind with this noise for `rows`, in `session` and `group`."""
     default = [SIGMA[c.dimension] for c in made.noise_columns]
     noise = (
         np.array(default)
@@ -200,10 +198,10 @@ def sensor(made: Any, sigma: ArrayLike | None = None, **seen: Any) -> Any:
     return Sensor(made, Gaussian(noise), **seen)
 
 
-def sensor_of_pairs(made: Any, n: int, steps: Sequence[int] = (1, 7, 19), groups: int = 3) -> Any:
-    """Look at n poses; in pairs where the kind compares two, in groups where unknowns are a
-    group's.
-    """
+def make_sensor_of_all_poses(
+    made: Any, n: int, steps: Sequence[int] = (1, 7, 19), groups: int = 3
+) -> Any:
+    """Make a sensor of n poses, in pairs or groups if the kind needs them."""
     every = np.arange(n)
     rows = (
         np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in steps])
@@ -212,10 +210,10 @@ def sensor_of_pairs(made: Any, n: int, steps: Sequence[int] = (1, 7, 19), groups
     )
     grouped = any(p.scope == "group" for p in made.nuisance_parameters)
     group = np.array([f"g{i % groups}" for i in range(len(rows))]) if grouped else np.array("")
-    return sensor(made, rows=rows, group=group)
+    return make_sensor(made, rows=rows, group=group)
 
 
-def simulated(
+def simulate_data(
     machine: Robot,
     values: Array,
     coordinates: Array,
@@ -224,7 +222,7 @@ def simulated(
     unknowns: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
 ) -> Data:
-    """Measure a machine of these true values."""
+    """Simulate measurements of a machine with these true values."""
     looking = Instrument(tuple(sensors))
     true = machine.with_values(values)
     return measure.simulate(
@@ -232,19 +230,21 @@ def simulated(
     )
 
 
-def simulated_trials(
+def simulate_trials(
     machine: Robot, values: Array, coordinates: Array, sensors: Iterable[Any], seed: int
 ) -> Data:
-    """Measure machines of true values (t, p), stacked."""
+    """Simulate stacked measurements of machines with true values (t, p)."""
     return measure.simulate_trials(machine, values, coordinates, Instrument(tuple(sensors)), seed)
 
 
-def one_trial(trials: Data, i: int) -> Data:
+def select_trial(trials: Data, i: int) -> Data:
     """Return the measurements of one trial."""
     return trials.trial(i)
 
 
-def own_truth(machine: Robot, sensors: Iterable[Any], n: int, seed: int) -> dict[str, float]:
+def draw_setup_values(
+    machine: Robot, sensors: Iterable[Any], n: int, seed: int
+) -> dict[str, float]:
     """Draw true setup values within 20 mm and 0.3 rad of the stated ones."""
     reach = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
     seeing = [s.assign_rows(n) for s in Instrument(tuple(sensors)).with_tool(machine).sensors]
@@ -255,35 +255,35 @@ def own_truth(machine: Robot, sensors: Iterable[Any], n: int, seed: int) -> dict
     return dict(zip(table.names, (table.nominal + drawn).tolist(), strict=True))
 
 
-def taken(data: Data, rows: ArrayLike) -> Data:
+def take_poses(data: Data, rows: ArrayLike) -> Data:
     """Take some poses of the data."""
     return data.take(np.asarray(rows))
 
 
-def altered(data: Data, measured: Array, place: int = 0) -> Data:
+def replace_measured(data: Data, measured: Array, place: int = 0) -> Data:
     """Put other measured values in the place of those of one kind."""
     seen = list(data.observations)
     seen[place] = replace(seen[place], measured=measured)
     return replace(data, observations=tuple(seen))
 
 
-def measured_of(data: Data, place: int = 0) -> Array:
+def copy_measured(data: Data, place: int = 0) -> Array:
     """Return a copy of the measured values (r, c) of one kind."""
     return np.array(data.observations[place].measured)
 
 
-def readings_of(data: Data) -> tuple[Array, Array | None]:
+def copy_readings(data: Data) -> tuple[Array, Array | None]:
     """Return copies of readings (n, a) and of their sigma."""
     sigma = data.reading_sigma
     return np.array(data.readings), None if sigma is None else np.array(sigma)
 
 
-def with_readings(data: Data, readings: Array, sigma: Array | None) -> Data:
+def replace_readings(data: Data, readings: Array, sigma: Array | None) -> Data:
     """Put other readings and sigmas into the data."""
     return replace(data, readings=readings, reading_sigma=sigma)
 
 
-def with_known(data: Data, known: Mapping[str, tuple[float, float | None]]) -> Data:
+def state_values(data: Data, known: Mapping[str, tuple[float, float | None]]) -> Data:
     """State priors of unknowns: name -> (standard deviation, value); a deviation of 0 fixes it."""
     return replace(
         data,
@@ -301,7 +301,7 @@ def report_data(data: Data) -> Report:
 # ---
 
 
-def method(name: str, value: Any = None) -> Any:
+def make_method(name: str, value: Any = None) -> Any:
     """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd,
     tsvd-gcv.
     """
@@ -320,7 +320,7 @@ def method(name: str, value: Any = None) -> Any:
     return makers[name]()
 
 
-def loss(name: str, constant: float | None = None) -> Any:
+def make_loss(name: str, constant: float | None = None) -> Any:
     """Make a loss by its name: huber, tukey."""
     made = {"huber": estimate.Huber, "tukey": estimate.Tukey}[name]
     return made() if constant is None else made(constant)
@@ -333,12 +333,11 @@ def fit(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
     return estimate.identify(machine, data, how, options=estimate.FitOptions(**given))
 
 
-def polished(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
-    """Identify, then take three more steps: to rounding, where the first end depends on rounding
-    itself.
+def fit_to_rounding(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
+    """Identify, then take three more steps, so that the estimate is exact to rounding.
 
-    The descent ends where a step is no longer seen to gain, which may be some 1e-5 standard
-    deviations off the minimum.
+    The descent ends when a step no longer reduces the cost, up to 1e-5 standard deviations from
+    the minimum.
     """
     found = fit(machine, data, how, **options)
     one_step = estimate.StepControl(relative=1e-4)
@@ -348,8 +347,8 @@ def polished(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit
 
 
 def report_fit(found: Fit, parts: bool = True) -> Report:
-    """Report estimates, standard deviations and diagnostics; with `parts` own unknowns, poses and
-    combinations, too.
+    """Report estimates, standard deviations and diagnostics; with `parts` also setup parameters,
+    poses and combinations.
     """
     check = found.residual_test
     result: Report = {
@@ -370,7 +369,7 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
         "p_value": check.p_value,
         "sigma_scale": check.sigma_scale,
         "intervals": check.intervals,
-        **_open(found.names, found.unidentifiable),
+        **_report_unidentifiable(found.names, found.unidentifiable),
     }
     if not parts:
         return result
@@ -384,8 +383,8 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
     }
     if len(found.nuisance):
         local = found.nuisance
-        # where an unknown is known only together with the machine, it stands where the search for a
-        # start put it
+        # a setup parameter that is determined only together with the machine keeps its start
+        # value
         told, scale = (
             np.where(np.isinf(local.sd), np.nan, local.estimate),
             np.full(len(local), 1e-3),
@@ -412,13 +411,12 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
     return result
 
 
-def _open(names: Sequence[str], combinations: Sequence[Any]) -> Report:
-    """Report the directions that stay open: how many, which parameters, and how far each lies in
-    them (0 to 1).
+def _report_unidentifiable(names: Sequence[str], combinations: Sequence[Any]) -> Report:
+    """Report the null space: its dimension, its parameters, and the share (0 to 1) of each in it.
 
-    With several directions the basis in which they are told is a matter of rounding; the space that
-    they span is not. A single one is told in full, in the order of the parameters and with the sign
-    of its first part that is not small.
+    The basis of several directions depends on rounding, but their span does not. A single
+    direction is reported in full, in the order of the parameters, its first component that is
+    not small positive.
     """
     W = np.zeros((len(combinations), len(names)))
     for row, one in zip(W, combinations, strict=True):
@@ -454,7 +452,7 @@ def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
 
 
 def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> Report:
-    """Score methods by leaving out blocks, from one linearisation."""
+    """Score methods by leave-one-out from one linearization."""
     found = diagnose.score_leave_one_out(machine, data, tuple(methods))
     return {"score": found.score, "dof": found.dof, "best": list(methods).index(found.best)}
 
@@ -467,18 +465,18 @@ def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
     return {"values": found.robot.values, "conditions": found.conditions}
 
 
-def fix_unknowns(data: Data, pattern: str, values: Mapping[str, float] | None = None) -> Any:
-    """Return the unknowns of the data, some kept at their values."""
+def fix_setup(data: Data, pattern: str, values: Mapping[str, float] | None = None) -> Any:
+    """Return the setup parameters of the data, some of them fixed."""
     local = collect_nuisance_parameters(data.observations, data.labels)
     return local.with_nominal(local.values(values)).with_fixed(pattern)
 
 
-def hold_unknowns(data: Data, pattern: str, sd: float) -> Any:
-    """Return the unknowns of the data, some with a prior of this standard deviation."""
+def set_setup_prior(data: Data, pattern: str, sd: float) -> Any:
+    """Return the setup parameters of the data, some with a prior of this standard deviation."""
     return collect_nuisance_parameters(data.observations, data.labels).with_prior(pattern, sd)
 
 
-def prior_of(earlier: Fit) -> Any:
+def make_prior(earlier: Fit) -> Any:
     """Make a prior of an earlier fit."""
     return estimate.prior_from(earlier.posterior)
 
@@ -500,14 +498,12 @@ def report_recalibration(
     return {"again": report_fit(found, parts=False), "change": tested}
 
 
-# --- what can be known, how well, and what is wrong
+# --- identifiability, validation and diagnosis
 # ---
 
 
 def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> Report:
-    """Report what the data determine; with `cures` which further measurements would determine the
-    rest.
-    """
+    """Report what the data determine, and with `cures` the suggested measurements."""
     found = diagnose.identifiability(machine, data)
     result: Report = {
         "rank": found.rank,
@@ -516,7 +512,7 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
         "improved": found.improved,
         "condition": found.condition,
         "singular_values": found.singular_values,
-        **_open(found.free_parameters.names, found.unidentifiable),
+        **_report_unidentifiable(found.free_parameters.names, found.unidentifiable),
         "weak_values": [c.singular_value for c in found.weak],
         "indices": {name: getattr(found.indices, name) for name in ("o1", "o2", "o3", "o4", "o5")},
         "states": [v.state for v in found.parameters],
@@ -618,7 +614,7 @@ def report_monte_carlo(
 
 
 def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -> Report:
-    """Report what to command instead."""
+    """Report compensated commands."""
     done = apply.compensate(found, targets, mode, **options)
     robot_ = done.robot
     strokes = np.array([_size(robot_, a.dimension) for a in robot_.actuators])
@@ -641,7 +637,7 @@ def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -
 
 
 def report_outliers(found: Fit, data: Data) -> Report:
-    """Report which rows do not fit the others."""
+    """Report outliers."""
     seen = diagnose.find_outliers(found, data)
     return {
         "names": list(seen.names),
@@ -657,9 +653,7 @@ def report_outliers(found: Fit, data: Data) -> Report:
 
 
 def report_examination(found: Fit, data: Data) -> Report:
-    """Report lack of fit, groups that correlate, worth of the calibration, and the start compared
-    with the fit.
-    """
+    """Report lack of fit, correlated parameters, the expected gain, and the check of the start."""
     seen = diagnose.examine_fit(found, data)
     lack, worth, start = seen.lack_of_fit, seen.gain, diagnose.check_start_values(found)
     return {
@@ -684,8 +678,8 @@ def report_examination(found: Fit, data: Data) -> Report:
     }
 
 
-def report_arrival(machine: Robot, data: Data) -> Report:
-    """Report whether stated conventions fit: as numbers and as whether another one was found."""
+def report_conventions(machine: Robot, data: Data) -> Report:
+    """Report the convention check."""
     found = compare_conventions(machine, data)
     return {
         "misfit": found.misfit,
@@ -697,7 +691,7 @@ def report_arrival(machine: Robot, data: Data) -> Report:
 
 
 def report_parameter_error(found: Fit, truth: Array) -> Report:
-    """Report errors of parameters with and without what the data leave open."""
+    """Report errors of parameters with and without the unidentifiable combinations."""
     off = diagnose.compare_with_truth(found, truth)
     return {
         "names": list(off.names),

@@ -3,9 +3,8 @@
 """The registry of golden cases: small calibrations with fixed seeds, each a function that returns
 plain results.
 
-Names are paths, `part/what/setting`. Noise is 5 um and 25 urad unless said otherwise: much above
-rounding, so that the results repeat to far less than a thousand-millionth of their standard
-deviations.
+Names are paths, `part/what/setting`. Noise is 5 um and 25 urad by default: far above rounding, so
+that the results repeat to less than 1e-9 of their standard deviations.
 """
 
 from __future__ import annotations
@@ -55,14 +54,16 @@ def truth(name: str, seed: int = 3) -> np.ndarray:
     return api.true_values(api.robot(name), seed)[0]
 
 
-def measured(name: str, n: int, *sensors: Any, seed: int = 1, **options: Any) -> Any:
+def simulate_measurements(name: str, n: int, *sensors: Any, seed: int = 1, **options: Any) -> Any:
     """Return measurements of a true machine at n poses; full poses unless sensors are given."""
     robot = api.robot(name)
-    seen = sensors or (api.sensor(api.kind("pose")),)
-    return api.simulated(robot, truth(name), api.poses(robot, n, seed), seen, seed, **options)
+    seen = sensors or (api.make_sensor(api.make_kind("pose")),)
+    return api.simulate_data(
+        robot, truth(name), api.draw_poses(robot, n, seed), seen, seed, **options
+    )
 
 
-def fitted(name: str, data: Any, how: Any = None, **options: Any) -> dict[str, Any]:
+def report_fit_of(name: str, data: Any, how: Any = None, **options: Any) -> dict[str, Any]:
     """Identify a shipped robot and report."""
     return api.report_fit(api.fit(api.robot(name), data, how, **options))
 
@@ -70,14 +71,14 @@ def fitted(name: str, data: Any, how: Any = None, **options: Any) -> dict[str, A
 @cache
 def usual_fit(how: str = "map", name: str = HEXAPOD) -> Any:
     """Return the fit of a robot to 24 full poses."""
-    return api.fit(api.robot(name), measured(name, 24), api.method(how))
+    return api.fit(api.robot(name), simulate_measurements(name, 24), api.make_method(how))
 
 
 # --- 1. every shipped robot
 
 
 SECOND_ORDER = ("linear-delta-6", "ls")
-"""Some directions show in second order only; least squares over them does not come to rest, so they
+"""Some directions have second-order effects only; least squares does not converge in them, so they
 are cut.
 """
 
@@ -85,7 +86,7 @@ are cut.
 def kinematics(name: str) -> dict[str, Any]:
     """Solve a robot at four poses, at nominal and at true values."""
     robot = api.robot(name)
-    at = api.poses(robot, 4, 1)
+    at = api.draw_poses(robot, 4, 1)
     return {
         "poses": {"kinematic": at},
         "nominal": api.report_kinematics(robot, robot.values, at[:2]),
@@ -95,11 +96,11 @@ def kinematics(name: str) -> dict[str, Any]:
 
 def calibration(name: str, how: str) -> dict[str, Any]:
     """Calibrate a robot from 24 full poses."""
-    data = measured(name, 24)
+    data = simulate_measurements(name, 24)
     options = {"rank_tolerance": 3e-4} if (name, how) == SECOND_ORDER else {}
-    identify = api.polished if name == "hexapod-nategh-agheli" else api.fit
+    identify = api.fit_to_rounding if name == "hexapod-nategh-agheli" else api.fit
     found = api.report_fit(
-        identify(api.robot(name), data, api.method(how), allow_fewer_equations=True, **options)
+        identify(api.robot(name), data, api.make_method(how), allow_fewer_equations=True, **options)
     )
     return {"data": api.report_data(data) if how == "map" else {}, **found}
 
@@ -113,30 +114,34 @@ for _name in api.robot_names():
 # --- 2. every kind of measurement
 
 
-LEAN = ("length",)
-"""Parameters that least squares finds where a kind tells so little that all 42 would be
+SMALL_SET = ("length",)
+"""Endings of the parameters that least squares estimates with weak kinds; all 42 would be
 ill-conditioned.
 """
 
 
-def one_kind(kind: Any, n: int = 30, machine: Any = None, lean: bool = False) -> dict[str, Any]:
-    """Calibrate a hexapod from one kind, whose own unknowns are off, by LS and MAP."""
+def calibrate_with_kind(
+    kind: Any, n: int = 30, machine: Any = None, lean: bool = False
+) -> dict[str, Any]:
+    """Calibrate a hexapod with one kind, whose setup parameters are off, by LS and MAP."""
     robot = machine or api.robot(HEXAPOD)
     values = api.true_values(robot, 3)[0]
-    sensors = (api.sensor_of_pairs(kind, n),)
-    own = api.own_truth(robot, sensors, n, 5)
-    data = api.simulated(robot, values, api.poses(robot, n, 1), sensors, 1, unknowns=own)
+    sensors = (api.make_sensor_of_all_poses(kind, n),)
+    own = api.draw_setup_values(robot, sensors, n, 5)
+    data = api.simulate_data(robot, values, api.draw_poses(robot, n, 1), sensors, 1, unknowns=own)
     less = (
-        api.with_values(api.freed(robot, LEAN), api.wrong_by(robot, values, LEAN))
+        api.with_values(
+            api.free_only(robot, SMALL_SET), api.replace_by_nominal(robot, values, SMALL_SET)
+        )
         if lean
         else robot
     )
     return {
         "data": api.report_data(data)["measured"],
         "ls": api.report_fit(
-            api.polished(less, data, api.method("ls"), allow_fewer_equations=True)
+            api.fit_to_rounding(less, data, api.make_method("ls"), allow_fewer_equations=True)
         ),
-        "map": api.report_fit(api.polished(robot, data, api.method("map"))),
+        "map": api.report_fit(api.fit_to_rounding(robot, data, api.make_method("map"))),
     }
 
 
@@ -150,32 +155,30 @@ MORE_ROWS = {
     "sphere": 60,
     "component": 60,
 }
-"""Poses of kinds that tell little in a row."""
+"""Numbers of poses for kinds with few values in a row."""
 
 
-def looking_at_joints(name: str) -> dict[str, Any]:
+def calibrate_with_joint_sensors(name: str) -> dict[str, Any]:
     """Calibrate a hexapod with joints in its legs from sensors on these."""
     robot = api.robot_with_leg_joints()
-    return one_kind(api.joint_example(name, robot), 10, robot)
+    return calibrate_with_kind(api.joint_example(name, robot), 10, robot)
 
 
-INSTEAD = {
-    "component": api.kind(
+SUBSTITUTES = {
+    "component": api.make_kind(
         "component", ("x", "y", "z", "phi", "theta"), "tilt-torsion", unknown=("frame",)
     ),
-    "distance": api.kind(
+    "distance": api.make_kind(
         "distance", anchor=np.array([0.5, -0.4, 0.6]), unknown=("anchor",), anchor_name="wire1"
     ),
-    "sphere": api.kind(
+    "sphere": api.make_kind(
         "sphere", unknown=("surface",), through=np.array([0.1, -0.08, 0.3]), surface="ball"
     ),
-    "inclination": api.kind("inclination", unknown=("gravity",), sensor="level"),
+    "inclination": api.make_kind("inclination", unknown=("gravity",), sensor="level"),
 }
-"""Of examples that are so far away, or leave so much open, that the start of their unknowns depends
-on rounding.
-"""
+"""Replacements of examples in which the start of the setup parameters depends on rounding."""
 
-LITTLE = (
+WEAK_KINDS = (
     "line",
     "plane",
     "bearing",
@@ -190,87 +193,95 @@ LITTLE = (
 )
 
 FORMS = {
-    "pose/quaternion": api.kind("pose", "quaternion"),
-    "pose/tilt-torsion": api.kind("pose", "tilt-torsion"),
-    "pose/euler-ZYX": api.kind("pose", "euler-ZYX"),
-    "component/z": api.kind("component", ("z",)),
-    "component/x,y,z,phi,theta": api.kind(
+    "pose/quaternion": api.make_kind("pose", "quaternion"),
+    "pose/tilt-torsion": api.make_kind("pose", "tilt-torsion"),
+    "pose/euler-ZYX": api.make_kind("pose", "euler-ZYX"),
+    "component/z": api.make_kind("component", ("z",)),
+    "component/x,y,z,phi,theta": api.make_kind(
         "component", ("x", "y", "z", "phi", "theta"), "tilt-torsion"
     ),
-    "position/known": api.kind("position", targets=("a", "b", "c"), places=THREE),
-    "bearing/theodolite": api.kind("bearing", places=POINT, T_base_frame=STATION),
-    "bearing/camera": api.kind(
+    "position/known": api.make_kind("position", targets=("a", "b", "c"), places=THREE),
+    "bearing/theodolite": api.make_kind("bearing", places=POINT, T_base_frame=STATION),
+    "bearing/camera": api.make_kind(
         "bearing",
         T_base_frame=api.transform((0.1, -0.1, -0.8)),
         form="camera",
         unknown=("frame",),
         frame="camera",
     ),
-    "distance/known": api.kind("distance", anchor=np.array([1.5, -0.8, 1.1])),
-    "sphere/known": api.kind("sphere", through=np.array([1.5, -0.8, 1.1])),
+    "distance/known": api.make_kind("distance", anchor=np.array([1.5, -0.8, 1.1])),
+    "sphere/known": api.make_kind("sphere", through=np.array([1.5, -0.8, 1.1])),
 }
 
 for _name in api.kind_names():
     if _name in JOINTS:
-        add(f"kinds/{_name}", looking_at_joints, _name)
+        add(f"kinds/{_name}", calibrate_with_joint_sensors, _name)
     else:
-        _kind = INSTEAD.get(_name) or api.most_unknown_example(_name)
-        add(f"kinds/{_name}", one_kind, _kind, MORE_ROWS.get(_name, 30), lean=_name in LITTLE)
+        _kind = SUBSTITUTES.get(_name) or api.most_unknown_example(_name)
+        add(
+            f"kinds/{_name}",
+            calibrate_with_kind,
+            _kind,
+            MORE_ROWS.get(_name, 30),
+            lean=_name in WEAK_KINDS,
+        )
 for _name, _kind in FORMS.items():
     _poses = 48 if _name.split("/")[0] in ("component", "distance", "sphere") else 20
-    add(f"kinds/{_name}", one_kind, _kind, _poses, lean=_name in LITTLE)
+    add(f"kinds/{_name}", calibrate_with_kind, _kind, _poses, lean=_name in WEAK_KINDS)
 
 
-def mixed(kinds: dict[str, Any], n: int = 24) -> dict[str, Any]:
+def calibrate_with_kinds(kinds: dict[str, Any], n: int = 24) -> dict[str, Any]:
     """Calibrate a hexapod from several kinds at once, and say what they determine together."""
     robot = api.robot(HEXAPOD)
-    sensors = tuple(api.sensor_of_pairs(kind, n) for kind in kinds.values())
-    own = api.own_truth(robot, sensors, n, 6)
-    data = api.simulated(robot, truth(HEXAPOD), api.poses(robot, n, 2), sensors, 2, unknowns=own)
+    sensors = tuple(api.make_sensor_of_all_poses(kind, n) for kind in kinds.values())
+    own = api.draw_setup_values(robot, sensors, n, 6)
+    data = api.simulate_data(
+        robot, truth(HEXAPOD), api.draw_poses(robot, n, 2), sensors, 2, unknowns=own
+    )
     return {
-        "map": fitted(HEXAPOD, data, api.method("map")),
-        "ls": fitted(HEXAPOD, data, api.method("ls"), allow_fewer_equations=True),
+        "map": report_fit_of(HEXAPOD, data, api.make_method("map")),
+        "ls": report_fit_of(HEXAPOD, data, api.make_method("ls"), allow_fewer_equations=True),
         "known": api.report_identifiability(robot, data),
     }
 
 
 PARTS = {
-    "pose": api.kind("pose"),
-    "framed-pose": api.kind("pose", unknown=("frame", "tool"), frame="tracker"),
-    "targets": api.kind(
+    "pose": api.make_kind("pose"),
+    "framed-pose": api.make_kind("pose", unknown=("frame", "tool"), frame="tracker"),
+    "targets": api.make_kind(
         "position",
         targets=("a", "b", "c"),
         places=THREE,
         unknown=("frame", "targets"),
         frame="laser",
     ),
-    "position": api.kind("position", places=POINT, unknown=("frame",), frame="cmm"),
-    "inclination": api.kind("inclination", unknown=("gravity",), sensor="level"),
-    "bearing": api.kind(
+    "position": api.make_kind("position", places=POINT, unknown=("frame",), frame="cmm"),
+    "inclination": api.make_kind("inclination", unknown=("gravity",), sensor="level"),
+    "bearing": api.make_kind(
         "bearing", places=POINT, T_base_frame=STATION, unknown=("frame",), frame="station"
     ),
-    "separation": api.kind("separation", places=POINT, unknown=("offset",)),
-    "plane": api.kind("plane", places=POINT, unknown=("surface",), surface="bed"),
-    "line": api.kind(
+    "separation": api.make_kind("separation", places=POINT, unknown=("offset",)),
+    "plane": api.make_kind("plane", places=POINT, unknown=("surface",), surface="bed"),
+    "line": api.make_kind(
         "line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"
     ),
-    "sphere": api.kind(
+    "sphere": api.make_kind(
         "sphere", unknown=("surface",), through=np.array([1.5, -0.8, 1.1]), surface="ball"
     ),
-    "direction": api.kind(
+    "direction": api.make_kind(
         "direction",
         axis=np.array([0.0, 0.6, 0.8]),
         unknown=("axis", "frame"),
         frame="gauge",
         axis_name="face",
     ),
-    "mirror": api.kind(
+    "mirror": api.make_kind(
         "autocollimation", unknown=("frame", "mirror"), frame="collimator", mirror="mirror"
     ),
-    "wire": api.kind(
+    "wire": api.make_kind(
         "distance", anchor=np.array([0.5, -0.4, 0.6]), unknown=("offset",), anchor_name="wire"
     ),
-    "tilt": api.kind("component", ("z", "phi", "theta"), "tilt-torsion"),
+    "tilt": api.make_kind("component", ("z", "phi", "theta"), "tilt-torsion"),
 }
 COMBINED = (
     ("position", "inclination", "bearing", "separation", "plane"),
@@ -280,18 +291,25 @@ COMBINED = (
     ("targets", "direction", "mirror", "separation"),
 )
 for _names in COMBINED:
-    add(f"combined/{'+'.join(_names)}", mixed, {name: PARTS[name] for name in _names})
+    add(
+        f"combined/{'+'.join(_names)}", calibrate_with_kinds, {name: PARTS[name] for name in _names}
+    )
 
 
 # --- 3. every method and loss, stacked trials
 
 
-def by_method(how: str, value: Any, weak: bool, **options: Any) -> dict[str, Any]:
+def calibrate_by_method(how: str, value: Any, weak: bool, **options: Any) -> dict[str, Any]:
     """Calibrate a hexapod by a method: full poses, or (weak) heights and tilts that leave
     directions open.
     """
-    sensors = (api.sensor(PARTS["tilt"]),) if weak else ()
-    return fitted(HEXAPOD, measured(HEXAPOD, 30, *sensors), api.method(how, value), **options)
+    sensors = (api.make_sensor(PARTS["tilt"]),) if weak else ()
+    return report_fit_of(
+        HEXAPOD,
+        simulate_measurements(HEXAPOD, 30, *sensors),
+        api.make_method(how, value),
+        **options,
+    )
 
 
 LAMBDAS = tuple(np.linspace(0.0, 4.0, 42).tolist())
@@ -308,87 +326,102 @@ METHODS: dict[str, tuple[str, Any]] = {
     "map-widened": ("map-widened", None),
 }
 for _name, (_how, _value) in METHODS.items():
-    add(f"methods/{_name}/poses", by_method, _how, _value, weak=False)
+    add(f"methods/{_name}/poses", calibrate_by_method, _how, _value, weak=False)
     add(
         f"methods/{_name}/heights-and-tilts",
-        by_method,
+        calibrate_by_method,
         _how,
         _value,
         weak=True,
         allow_fewer_equations=True,
     )
 for _how in ("ls", "map", "map-widened"):
-    add(f"methods/noise-estimated/{_how}", by_method, _how, None, weak=False, noise="estimated")
-add("methods/begin-closure", by_method, "ls", None, weak=False, begin="closure")
-add("methods/rank-tolerance", by_method, "ls", None, weak=False, rank_tolerance=2e-2)
-add("methods/drop", by_method, "map", None, weak=False, drop=("2", "17"))
+    add(
+        f"methods/noise-estimated/{_how}",
+        calibrate_by_method,
+        _how,
+        None,
+        weak=False,
+        noise="estimated",
+    )
+add("methods/begin-closure", calibrate_by_method, "ls", None, weak=False, begin="closure")
+add("methods/rank-tolerance", calibrate_by_method, "ls", None, weak=False, rank_tolerance=2e-2)
+add("methods/drop", calibrate_by_method, "map", None, weak=False, drop=("2", "17"))
 
 
-def from_a_start() -> dict[str, Any]:
+def calibrate_from_start() -> dict[str, Any]:
     """Begin with values that are as far off as the true errors again."""
     robot = api.robot(HEXAPOD)
     far = api.true_values(robot, 77)[0]
-    return fitted(HEXAPOD, measured(HEXAPOD, 24), api.method("ls"), start=far)
+    return report_fit_of(
+        HEXAPOD, simulate_measurements(HEXAPOD, 24), api.make_method("ls"), start=far
+    )
 
 
-add("methods/start", from_a_start)
+add("methods/start", calibrate_from_start)
 
 
-def without_tolerances() -> dict[str, Any]:
+def calibrate_without_tolerances() -> dict[str, Any]:
     """Free some parameters only, and hold none of them back."""
-    robot = api.freed(api.robot(HEXAPOD), ("length", "base.z"))
-    data = api.simulated(
+    robot = api.free_only(api.robot(HEXAPOD), ("length", "base.z"))
+    data = api.simulate_data(
         robot,
         api.true_values(robot, 3)[0],
-        api.poses(robot, 20, 1),
-        [api.sensor(api.kind("pose"))],
+        api.draw_poses(robot, 20, 1),
+        [api.make_sensor(api.make_kind("pose"))],
         1,
     )
     return api.report_fit(api.fit(robot, data))
 
 
-add("methods/some-parameters-free", without_tolerances)
+add("methods/some-parameters-free", calibrate_without_tolerances)
 
 
 @cache
-def blundered(name: str = HEXAPOD) -> Any:
+def make_data_with_outliers(name: str = HEXAPOD) -> Any:
     """Return 30 poses of which three are off by tens of sigma."""
-    data = measured(name, 30)
-    values = api.measured_of(data)
+    data = simulate_measurements(name, 30)
+    values = api.copy_measured(data)
     rng = np.random.default_rng(4)
     for pose in (3, 10, 22):
         step = rng.standard_normal(6)
         values[pose] += 25.0 * step / np.linalg.norm(step) * np.array([25 * UM] * 3 + [5 * UM] * 3)
-    return api.altered(data, values)
+    return api.replace_measured(data, values)
 
 
-def by_loss(loss: str, how: str, constant: float | None = None, **options: Any) -> dict[str, Any]:
+def calibrate_by_loss(
+    loss: str, how: str, constant: float | None = None, **options: Any
+) -> dict[str, Any]:
     """Calibrate from data with blunders, with a loss; and look for the blunders."""
-    data = blundered()
+    data = make_data_with_outliers()
     found = api.fit(
-        api.robot(HEXAPOD), data, api.method(how), loss=api.loss(loss, constant), **options
+        api.robot(HEXAPOD),
+        data,
+        api.make_method(how),
+        loss=api.make_loss(loss, constant),
+        **options,
     )
     return api.report_fit(found) | {"outliers": api.report_outliers(found, data)}
 
 
 for _loss in ("huber", "tukey"):
     for _how in ("ls", "map", "map-widened"):
-        add(f"losses/{_loss}/{_how}", by_loss, _loss, _how)
-add("losses/huber/constant", by_loss, "huber", "ls", 2.0)
-add("losses/tukey/noise-estimated", by_loss, "tukey", "ls", noise="estimated")
+        add(f"losses/{_loss}/{_how}", calibrate_by_loss, _loss, _how)
+add("losses/huber/constant", calibrate_by_loss, "huber", "ls", 2.0)
+add("losses/tukey/noise-estimated", calibrate_by_loss, "tukey", "ls", noise="estimated")
 
 
 def trials(name: str, how: str, value: Any, kinds: tuple[str, ...]) -> dict[str, Any]:
     """Identify four machines at once."""
     robot = api.robot(name)
-    sensors = [api.sensor(PARTS[kind]) for kind in kinds]
-    made = api.simulated_trials(
-        robot, api.true_values(robot, 3, 4), api.poses(robot, 24, 1), sensors, 1
+    sensors = [api.make_sensor(PARTS[kind]) for kind in kinds]
+    made = api.simulate_trials(
+        robot, api.true_values(robot, 3, 4), api.draw_poses(robot, 24, 1), sensors, 1
     )
     one = api.report_fit(
-        api.fit(robot, api.one_trial(made, 2), api.method(how, value)), parts=False
+        api.fit(robot, api.select_trial(made, 2), api.make_method(how, value)), parts=False
     )
-    return api.report_trials(robot, made, api.method(how, value)) | {"third": one}
+    return api.report_trials(robot, made, api.make_method(how, value)) | {"third": one}
 
 
 for _name in (HEXAPOD, TRIPOD, DELTA):
@@ -399,7 +432,7 @@ add("trials/hexapod-42/tsvd-gcv", trials, HEXAPOD, "tsvd-gcv", None, ("pose",))
 add("trials/hexapod-42/unknown-frame", trials, HEXAPOD, "map", None, ("position", "inclination"))
 
 
-def left_out() -> dict[str, Any]:
+def score_leave_one_out() -> dict[str, Any]:
     """Score methods by leave-one-out."""
     wanted = (
         ("ls", None),
@@ -409,49 +442,62 @@ def left_out() -> dict[str, Any]:
         ("tsvd", 10),
         ("tsvd", 30),
     )
-    methods = [api.method(name, value) for name, value in wanted]
-    return api.report_leave_one_out(api.robot(HEXAPOD), measured(HEXAPOD, 24), methods)
+    methods = [api.make_method(name, value) for name, value in wanted]
+    return api.report_leave_one_out(api.robot(HEXAPOD), simulate_measurements(HEXAPOD, 24), methods)
 
 
-add("methods/leave-one-out", left_out)
-add("methods/per-leg", lambda: api.report_per_leg(api.robot(HEXAPOD), measured(HEXAPOD, 12), 3))
+add("methods/leave-one-out", score_leave_one_out)
+add(
+    "methods/per-leg",
+    lambda: api.report_per_leg(api.robot(HEXAPOD), simulate_measurements(HEXAPOD, 12), 3),
+)
 
 
 # --- 4. uncertain readings, sessions, priors
 
 
-def uncertain(name: str, sigma: float, how: str, *sensors: Any, n: int = 20) -> dict[str, Any]:
+def calibrate_with_uncertain_readings(
+    name: str, sigma: float, how: str, *sensors: Any, n: int = 20
+) -> dict[str, Any]:
     """Calibrate where readings have noise of their own."""
-    return fitted(name, measured(name, n, *sensors, reading_sigma=sigma), api.method(how))
+    return report_fit_of(
+        name, simulate_measurements(name, n, *sensors, reading_sigma=sigma), api.make_method(how)
+    )
 
 
-add("latent/hexapod-42/poses", uncertain, HEXAPOD, 10 * UM, "ls")
-add("latent/hexapod-42/map", uncertain, HEXAPOD, 10 * UM, "map")
-add("latent/3-prs/poses", uncertain, TRIPOD, 10 * UM, "map")
+add("latent/hexapod-42/poses", calibrate_with_uncertain_readings, HEXAPOD, 10 * UM, "ls")
+add("latent/hexapod-42/map", calibrate_with_uncertain_readings, HEXAPOD, 10 * UM, "map")
+add("latent/3-prs/poses", calibrate_with_uncertain_readings, TRIPOD, 10 * UM, "map")
 add(
     "latent/hexapod-42/unknown-frame",
-    uncertain,
+    calibrate_with_uncertain_readings,
     HEXAPOD,
     10 * UM,
     "map",
-    api.sensor(PARTS["position"]),
+    api.make_sensor(PARTS["position"]),
     n=24,
 )
 add(
-    "latent/hexapod-42/heights", uncertain, HEXAPOD, 10 * UM, "map", api.sensor(PARTS["tilt"]), n=30
+    "latent/hexapod-42/heights",
+    calibrate_with_uncertain_readings,
+    HEXAPOD,
+    10 * UM,
+    "map",
+    api.make_sensor(PARTS["tilt"]),
+    n=30,
 )
 
 
-def latent_mixed(loss: str | None = None) -> dict[str, Any]:
+def calibrate_with_mixed_readings(loss: str | None = None) -> dict[str, Any]:
     """Miss a reading, state one as exact, measure some poses in part and link others."""
-    robot = api.freed(
+    robot = api.free_only(
         api.robot(HEXAPOD), ("base.x", "leg2.base.z", "leg3.platform.y", "leg4.length")
     )
-    full = api.sensor(api.kind("pose"), rows=np.arange(10))
-    ball = api.sensor(api.kind("separation"), rows=np.array([[1, 10], [10, 11], [0, 12]]))
-    point = api.sensor(api.kind("position"), rows=np.array([10, 11, 12, 13]))
-    coordinates = api.poses(robot, 14, 1)
-    data = api.simulated(
+    full = api.make_sensor(api.make_kind("pose"), rows=np.arange(10))
+    ball = api.make_sensor(api.make_kind("separation"), rows=np.array([[1, 10], [10, 11], [0, 12]]))
+    point = api.make_sensor(api.make_kind("position"), rows=np.array([10, 11, 12, 13]))
+    coordinates = api.draw_poses(robot, 14, 1)
+    data = api.simulate_data(
         robot,
         api.true_values(robot, 3)[0],
         coordinates,
@@ -459,43 +505,45 @@ def latent_mixed(loss: str | None = None) -> dict[str, Any]:
         1,
         reading_sigma=15 * UM,
     )
-    readings, sigma = api.readings_of(data)
+    readings, sigma = api.copy_readings(data)
     assert sigma is not None
     readings[2, 4], sigma[2, 4] = np.nan, np.inf
     sigma[5, 0] = 0.0
-    data = api.with_readings(data, readings, sigma)
+    data = api.replace_readings(data, readings, sigma)
     return api.report_fit(
-        api.fit(robot, data, api.method("ls"), loss=None if loss is None else api.loss(loss))
+        api.fit(
+            robot, data, api.make_method("ls"), loss=None if loss is None else api.make_loss(loss)
+        )
     )
 
 
-add("latent/missing-reading-and-linked-poses", latent_mixed)
-add("latent/missing-reading-and-linked-poses/huber", latent_mixed, "huber")
+add("latent/missing-reading-and-linked-poses", calibrate_with_mixed_readings)
+add("latent/missing-reading-and-linked-poses/huber", calibrate_with_mixed_readings, "huber")
 
 
-def nobody_measured(how: str) -> dict[str, Any]:
+def calibrate_cable_robot(how: str) -> dict[str, Any]:
     """Calibrate a cable robot from its own redundant readings, a few positions measured."""
     robot = api.robot(CABLE)
-    seen = api.sensor(api.kind("position"), 1e-3, rows=np.arange(8))
-    data = api.simulated(
-        robot, truth(CABLE), api.poses(robot, 24, 5), [seen], 1, reading_sigma=np.deg2rad(1.0)
+    seen = api.make_sensor(api.make_kind("position"), 1e-3, rows=np.arange(8))
+    data = api.simulate_data(
+        robot, truth(CABLE), api.draw_poses(robot, 24, 5), [seen], 1, reading_sigma=np.deg2rad(1.0)
     )
-    found = api.fit(robot, data, api.method(how))
+    found = api.fit(robot, data, api.make_method(how))
     return api.report_fit(found) | {"known": api.report_identifiability(robot, data)}
 
 
-add("latent/cable-4/map", nobody_measured, "map")
-add("latent/cable-4/least-squares", nobody_measured, "ls")
+add("latent/cable-4/map", calibrate_cable_robot, "map")
+add("latent/cable-4/least-squares", calibrate_cable_robot, "ls")
 
 
 def missing_columns() -> dict[str, Any]:
     """Miss components of some rows."""
-    data = measured(HEXAPOD, 24)
-    values = api.measured_of(data)
+    data = simulate_measurements(HEXAPOD, 24)
+    values = api.copy_measured(data)
     values[::3, 3] = np.nan
     values[1::4, :3] = np.nan
     values[5] = np.nan
-    return fitted(HEXAPOD, api.altered(data, values), api.method("map"))
+    return report_fit_of(HEXAPOD, api.replace_measured(data, values), api.make_method("map"))
 
 
 add("unknowns/missing-components", missing_columns)
@@ -506,11 +554,14 @@ DRIFT = {"noon.frame.x": 400 * UM, "evening.frame.x": 900 * UM, "evening.frame.r
 def sessions(how: str, keep: bool) -> dict[str, Any]:
     """Measure a base that drifts in three sessions; the first says where it is, or none does."""
     day = np.repeat(["morning", "noon", "evening"], 10)
-    data = measured(
-        HEXAPOD, 30, api.sensor(api.kind("pose", unknown=("frame",)), session=day), unknowns=DRIFT
+    data = simulate_measurements(
+        HEXAPOD,
+        30,
+        api.make_sensor(api.make_kind("pose", unknown=("frame",)), session=day),
+        unknowns=DRIFT,
     )
-    local = api.fix_unknowns(data, "morning.*", {"morning.frame.x": 0.0}) if keep else None
-    return fitted(HEXAPOD, data, api.method(how), local=local)
+    local = api.fix_setup(data, "morning.*", {"morning.frame.x": 0.0}) if keep else None
+    return report_fit_of(HEXAPOD, data, api.make_method(how), local=local)
 
 
 add("unknowns/sessions/first-kept/least-squares", sessions, "ls", keep=True)
@@ -521,7 +572,7 @@ add("unknowns/sessions/all-free/map", sessions, "map", keep=False)
 def stations() -> dict[str, Any]:
     """Look from two stations, one of which was moved."""
     day = np.repeat(["left", "right"], 20)
-    seen = api.kind(
+    seen = api.make_kind(
         "bearing",
         targets=("a", "b"),
         places=PAIR,
@@ -529,8 +580,8 @@ def stations() -> dict[str, Any]:
         unknown=("frame", "targets"),
     )
     moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
-    data = measured(HEXAPOD, 40, api.sensor(seen, session=day), unknowns=moved)
-    return fitted(HEXAPOD, data, api.method("map"))
+    data = simulate_measurements(HEXAPOD, 40, api.make_sensor(seen, session=day), unknowns=moved)
+    return report_fit_of(HEXAPOD, data, api.make_method("map"))
 
 
 add("unknowns/stations", stations)
@@ -538,16 +589,19 @@ add("unknowns/stations", stations)
 
 def prior_of_unknowns(stated: bool) -> dict[str, Any]:
     """Hold a frame with a prior from the data or the fit, and fix one coordinate of it."""
-    seen = api.kind("pose", unknown=("frame",), frame="tracker")
+    seen = api.make_kind("pose", unknown=("frame",), frame="tracker")
     true = {"tracker.x": 300 * UM, "tracker.ry": 5e-4}
-    data = measured(HEXAPOD, 24, api.sensor(seen), unknowns=true)
+    data = simulate_measurements(HEXAPOD, 24, api.make_sensor(seen), unknowns=true)
     if stated:
         known = {"tracker.x": (1e-3, None), "tracker.y": (1e-4, 2e-5), "tracker.z": (0.0, 0.0)}
-        return fitted(
-            HEXAPOD, api.with_known(data, known), api.method("ls"), allow_fewer_equations=True
+        return report_fit_of(
+            HEXAPOD,
+            api.state_values(data, known),
+            api.make_method("ls"),
+            allow_fewer_equations=True,
         )
-    return fitted(
-        HEXAPOD, data, api.method("map"), local=api.hold_unknowns(data, "tracker.*", 1e-3)
+    return report_fit_of(
+        HEXAPOD, data, api.make_method("map"), local=api.set_setup_prior(data, "tracker.*", 1e-3)
     )
 
 
@@ -557,41 +611,52 @@ add("unknowns/prior/given-to-the-fit", prior_of_unknowns, stated=False)
 
 def surfaces_in_groups() -> dict[str, Any]:
     """Touch three unknown planes with a ball of unknown place, and two lines."""
-    plane = api.kind("plane", targets=("probe",), unknown=("surface", "targets"), surface="bed")
-    line = api.kind("line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler")
+    plane = api.make_kind(
+        "plane", targets=("probe",), unknown=("surface", "targets"), surface="bed"
+    )
+    line = api.make_kind(
+        "line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"
+    )
     groups = np.array([f"g{i % 3}" for i in range(42)])
     two = np.array([f"h{i % 2}" for i in range(20)])
-    sensors = (api.sensor(plane, group=groups), api.sensor(line, rows=np.arange(20), group=two))
-    own = api.own_truth(api.robot(HEXAPOD), sensors, 42, 8)
-    return fitted(HEXAPOD, measured(HEXAPOD, 42, *sensors, unknowns=own), api.method("map"))
+    sensors = (
+        api.make_sensor(plane, group=groups),
+        api.make_sensor(line, rows=np.arange(20), group=two),
+    )
+    own = api.draw_setup_values(api.robot(HEXAPOD), sensors, 42, 8)
+    return report_fit_of(
+        HEXAPOD, simulate_measurements(HEXAPOD, 42, *sensors, unknowns=own), api.make_method("map")
+    )
 
 
 add("unknowns/surfaces-in-groups", surfaces_in_groups)
 
 
-def again(change: float, limb: str | None) -> dict[str, Any]:
+def recalibrate_after_change(change: float, limb: str | None) -> dict[str, Any]:
     """Calibrate again after a leg became longer, an earlier fit as the prior."""
     robot = api.robot(HEXAPOD)
-    values = api.wrong_by_one_parameter(robot, truth(HEXAPOD), "leg3.length", change)
-    data = api.simulated(robot, values, api.poses(robot, 8, 9), [api.sensor(api.kind("pose"))], 9)
+    values = api.change_value(robot, truth(HEXAPOD), "leg3.length", change)
+    data = api.simulate_data(
+        robot, values, api.draw_poses(robot, 8, 9), [api.make_sensor(api.make_kind("pose"))], 9
+    )
     return api.report_recalibration(robot, data, usual_fit(), limb)
 
 
-add("recalibration/unchanged", again, 0.0, None)
-add("recalibration/longer-leg", again, 300 * UM, None)
-add("recalibration/freed-limb", again, 300 * UM, "leg3")
+add("recalibration/unchanged", recalibrate_after_change, 0.0, None)
+add("recalibration/longer-leg", recalibrate_after_change, 300 * UM, None)
+add("recalibration/freed-limb", recalibrate_after_change, 300 * UM, "leg3")
 
 
-def earlier_as_prior(how: str) -> dict[str, Any]:
+def calibrate_with_earlier_fit(how: str) -> dict[str, Any]:
     """Use an earlier fit as prior knowledge of one with too few equations."""
-    few = measured(HEXAPOD, 4, seed=6)
-    found = api.polished(
-        api.robot(HEXAPOD), few, api.method(how), prior=api.prior_of(usual_fit("ls"))
+    few = simulate_measurements(HEXAPOD, 4, seed=6)
+    found = api.fit_to_rounding(
+        api.robot(HEXAPOD), few, api.make_method(how), prior=api.make_prior(usual_fit("ls"))
     )
     return api.report_fit(found)
 
 
-add("recalibration/prior-from-earlier", earlier_as_prior, "ls")
+add("recalibration/prior-from-earlier", calibrate_with_earlier_fit, "ls")
 
 
 # --- 5. plans
@@ -600,7 +665,7 @@ add("recalibration/prior-from-earlier", earlier_as_prior, "ls")
 def plan(name: str, kind: str, n: int, criterion: str, **options: Any) -> dict[str, Any]:
     """Plan poses."""
     return api.report_plan(
-        api.robot(name), [api.sensor(PARTS[kind])], n, criterion, seed=1, **options
+        api.robot(name), [api.make_sensor(PARTS[kind])], n, criterion, seed=1, **options
     )
 
 
@@ -640,7 +705,7 @@ add(
 
 def plan_further() -> dict[str, Any]:
     """Plan poses beyond those measured already."""
-    before = measured(HEXAPOD, 6)
+    before = simulate_measurements(HEXAPOD, 6)
     return plan(HEXAPOD, "pose", 6, "I", candidates=50, hold_out=0, measured=before)
 
 
@@ -649,7 +714,7 @@ add("plans/hexapod-42/beyond-measured", plan_further)
 
 def fedorov(name: str, kind: str, n: int, criterion: str) -> dict[str, Any]:
     """Choose candidates by exchange."""
-    return api.report_fedorov(api.robot(name), [api.sensor(PARTS[kind])], n, criterion, 60, 3)
+    return api.report_fedorov(api.robot(name), [api.make_sensor(PARTS[kind])], n, criterion, 60, 3)
 
 
 for _criterion in ("D", "I"):
@@ -694,10 +759,10 @@ add("papers/cmm-constraint-2011/surfaces", api.report_cmm_constraint_2011_surfac
 
 def validation(name: str, how: str, *kinds: str) -> dict[str, Any]:
     """Judge a fit on poses held out."""
-    sensors = [api.sensor(PARTS[kind]) for kind in kinds]
-    data = measured(name, 32, *sensors)
-    found = api.fit(api.robot(name), api.taken(data, np.arange(24)), api.method(how))
-    return api.report_validation(found, api.taken(data, np.arange(24, 32)))
+    sensors = [api.make_sensor(PARTS[kind]) for kind in kinds]
+    data = simulate_measurements(name, 32, *sensors)
+    found = api.fit(api.robot(name), api.take_poses(data, np.arange(24)), api.make_method(how))
+    return api.report_validation(found, api.take_poses(data, np.arange(24, 32)))
 
 
 for _name in (HEXAPOD, TRIPOD, DELTA, "ru-pus-prs", "five-bar"):
@@ -708,7 +773,7 @@ add("validation/hexapod-42/three-kinds", validation, HEXAPOD, "map", "pose", "ti
 
 def accuracy(name: str, how: str, frame: str) -> dict[str, Any]:
     """Map the accuracy of a fit."""
-    return api.report_accuracy(usual_fit(how, name), measured(name, 24), 20, 2, frame)
+    return api.report_accuracy(usual_fit(how, name), simulate_measurements(name, 24), 20, 2, frame)
 
 
 add("accuracy/hexapod-42/base", accuracy, HEXAPOD, "map", "base")
@@ -716,21 +781,23 @@ add("accuracy/hexapod-42/platform", accuracy, HEXAPOD, "ls", "platform")
 add("accuracy/3-prs/base", accuracy, TRIPOD, "map", "base")
 
 
-def accuracy_with_open_frame() -> dict[str, Any]:
+def map_accuracy_with_unknown_frame() -> dict[str, Any]:
     """Map the accuracy of a fit that leaves frames open."""
-    data = measured(HEXAPOD, 30, api.sensor(PARTS["targets"]))
-    return api.report_accuracy(api.fit(api.robot(HEXAPOD), data, api.method("ls")), data, 10, 2)
+    data = simulate_measurements(HEXAPOD, 30, api.make_sensor(PARTS["targets"]))
+    return api.report_accuracy(
+        api.fit(api.robot(HEXAPOD), data, api.make_method("ls")), data, 10, 2
+    )
 
 
-add("accuracy/hexapod-42/open-frame", accuracy_with_open_frame)
+add("accuracy/hexapod-42/open-frame", map_accuracy_with_unknown_frame)
 
 
 def monte_carlo() -> dict[str, Any]:
     """Compare with a few drawn machines."""
     robot = api.robot(HEXAPOD)
-    where = api.poses(robot, 4, 3)
+    where = api.draw_poses(robot, 4, 3)
     return api.report_monte_carlo(
-        robot, api.poses(robot, 20, 1), [api.sensor(PARTS["pose"])], where, 10
+        robot, api.draw_poses(robot, 20, 1), [api.make_sensor(PARTS["pose"])], where, 10
     )
 
 
@@ -740,7 +807,7 @@ add("accuracy/hexapod-42/monte-carlo", monte_carlo)
 def compensation(name: str, mode: str, **options: Any) -> dict[str, Any]:
     """Say what to command a calibrated machine."""
     return api.report_compensation(
-        usual_fit("map", name), api.poses(api.robot(name), 6, 4), mode, **options
+        usual_fit("map", name), api.draw_poses(api.robot(name), 6, 4), mode, **options
     )
 
 
@@ -751,12 +818,12 @@ for _name in (HEXAPOD, TRIPOD, DELTA):
 
 def outliers(how: str) -> dict[str, Any]:
     """Name the rows that do not belong, and examine the fit."""
-    data = blundered()
-    found = api.fit(api.robot(HEXAPOD), data, api.method(how))
+    data = make_data_with_outliers()
+    found = api.fit(api.robot(HEXAPOD), data, api.make_method(how))
     clean = usual_fit("ls")
     return {
         "blunders": api.report_outliers(found, data),
-        "clean": api.report_outliers(clean, measured(HEXAPOD, 24)),
+        "clean": api.report_outliers(clean, simulate_measurements(HEXAPOD, 24)),
         "examined": api.report_examination(found, data),
     }
 
@@ -768,9 +835,9 @@ add("outliers/map", outliers, "map")
 def repeats() -> dict[str, Any]:
     """Measure every pose twice."""
     robot = api.robot(HEXAPOD)
-    at = np.repeat(api.poses(robot, 15, 1), 2, axis=0)
-    data = api.simulated(robot, truth(HEXAPOD), at, [api.sensor(PARTS["pose"])], 1)
-    found = api.fit(robot, data, api.method("map"))
+    at = np.repeat(api.draw_poses(robot, 15, 1), 2, axis=0)
+    data = api.simulate_data(robot, truth(HEXAPOD), at, [api.make_sensor(PARTS["pose"])], 1)
+    found = api.fit(robot, data, api.make_method("map"))
     return api.report_examination(found, data) | {
         "error": api.report_parameter_error(found, truth(HEXAPOD))
     }
@@ -782,7 +849,7 @@ add("validation/repeats", repeats)
 def cross_validation(how: str, value: Any = None) -> dict[str, Any]:
     """Score a method on four folds."""
     return api.report_cross_validation(
-        api.robot(HEXAPOD), measured(HEXAPOD, 24), api.method(how, value), 4, 1
+        api.robot(HEXAPOD), simulate_measurements(HEXAPOD, 24), api.make_method(how, value), 4, 1
     )
 
 
@@ -791,7 +858,10 @@ add("cross-validation/tsvd-20", cross_validation, "tsvd", 20)
 add(
     "cross-validation/choose-model",
     lambda: api.report_model_choice(
-        api.robot(DELTA), measured(DELTA, 20, api.sensor(PARTS["position"])), api.method("map"), 3
+        api.robot(DELTA),
+        simulate_measurements(DELTA, 20, api.make_sensor(PARTS["position"])),
+        api.make_method("map"),
+        3,
     ),
 )
 
@@ -799,7 +869,7 @@ add(
 def identifiability(name: str, *kinds: str, cures: bool = True) -> dict[str, Any]:
     """Say what kinds determine, and what would determine the rest."""
     robot = api.robot(name)
-    data = measured(name, 24, *[api.sensor(PARTS[kind]) for kind in kinds])
+    data = simulate_measurements(name, 24, *[api.make_sensor(PARTS[kind]) for kind in kinds])
     return api.report_identifiability(robot, data, cures)
 
 
@@ -810,10 +880,10 @@ add("identifiability/3-prs/tilt", identifiability, TRIPOD, "tilt")
 add("identifiability/linear-delta/heights", identifiability, DELTA, "plane")
 
 
-def arrival(slip: str) -> dict[str, Any]:
+def check_conventions(slip: str) -> dict[str, Any]:
     """Ask whether data with a slip, or none, fit as they are written."""
-    data = measured(HEXAPOD, 16)
-    values = api.measured_of(data)
+    data = simulate_measurements(HEXAPOD, 16)
+    values = api.copy_measured(data)
     if slip == "unit":
         values[:, :3] *= 1e3
     elif slip == "sign":
@@ -822,8 +892,8 @@ def arrival(slip: str) -> dict[str, Any]:
         values[:, [3, 4]] = values[:, [4, 3]]
     elif slip == "row":
         values[3, 3] += 0.05
-    return api.report_arrival(api.robot(HEXAPOD), api.altered(data, values))
+    return api.report_conventions(api.robot(HEXAPOD), api.replace_measured(data, values))
 
 
 for _slip in ("none", "unit", "sign", "order", "row"):
-    add(f"arrival/{_slip}", arrival, _slip)
+    add(f"arrival/{_slip}", check_conventions, _slip)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number that loopcal computed before its redesign is still what it was; see `compare` for
-how closely.
+"""Golden results: loopcal still computes the numbers of before its redesign, to the tolerances of
+`compare`.
 
-Where the adapter `api` was changed for a new name and a case fails, the redesign changed a result.
-The fixture is made by `python -m tests.golden.collect`; it is not made anew to let a change pass
-that nobody can explain.
+If a case fails after a change of the adapter `api` for a new name, the change altered a result.
+`python -m tests.golden.collect` writes the fixture. Never regenerate it to accept an unexplained
+change.
 """
 
 import numpy as np
@@ -22,12 +22,12 @@ EXCEPTIONS: dict[str, tuple[float, str]] = {
     "papers/hexapod-42/presumed-noise": (1e3, PER_LEG),
     "papers/hexapod-42/stated-noise": (1e3, PER_LEG),
 }
-"""case -> (factor on all its tolerances, reason)."""
+"""Case: (factor on all its tolerances, reason)."""
 
 GOLDEN = compare.read()
 
 
-def test_the_fixture_has_every_case_and_no_other():
+def test_fixture_has_exactly_the_registered_cases():
     assert list(GOLDEN) == list(CASES)
     assert set(CASES) >= set(EXCEPTIONS)
 
@@ -39,13 +39,13 @@ def test_the_fixture_has_every_case_and_no_other():
         for name, case in CASES.items()
     ],
 )
-def test_results_are_what_they_were(name):
+def test_results_equal_the_golden_results(name):
     factor, _ = EXCEPTIONS.get(name, (1.0, ""))
     found = list(compare.differences(GOLDEN[name], compare.flatten(CASES[name].run()), factor))
     assert not found, "\n".join(found)
 
 
-GIVEN = compare.flatten(
+EXAMPLE = compare.flatten(
     {
         "fit": {
             "estimate": np.array([1.0, 2.0]),
@@ -76,5 +76,5 @@ GIVEN = compare.flatten(
         ("rank", 2, False),
     ],
 )
-def test_a_change_is_found_where_it_is_larger_than_its_tolerance(path, changed, same):
-    assert (not list(compare.differences(GIVEN, GIVEN | {path: changed}))) == same
+def test_changes_larger_than_the_tolerance_are_detected(path, changed, same):
+    assert (not list(compare.differences(EXAMPLE, EXAMPLE | {path: changed}))) == same
