@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wrong rows: what a loss saves, what is named, and false alarms on clean data.
+"""Outliers: accuracy with robust losses, detected outliers, and false alarms on clean data.
 
-The 42-parameter hexapod, 40 poses, 1 um and 5 urad. Blunders: two poses moved by 20 standard
-deviations in the norm of the row, and one row of another run (the machine without its errors of leg
-length).
+The 42-parameter hexapod with 40 poses, 1 um and 5 urad. Two poses are moved by 20 standard
+deviations in the norm of the row, and one row comes from another machine (without its errors of
+leg length).
 """
 
 from dataclasses import replace
@@ -17,40 +17,40 @@ from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, sa
 
 DRAWS, CLEAN, POSES = 200, 1000, 40
 SIGMA = np.array([5e-6] * 3 + [1e-6] * 3)
-WRONG = (3, 22, 10)
+OUTLIERS = (3, 22, 10)
 LOSSES = {"least squares, no loss": None, "Huber": Huber(), "Tukey": Tukey()}
 ROBOT = load_robot("hexapod-42")
 
 
-def measured(seed: int) -> tuple[np.ndarray, Measurements]:
+def simulate_machine(seed: int) -> tuple[np.ndarray, Measurements]:
     """Return the true values of a drawn machine and its measurements."""
     truth = sample_truth(ROBOT, 1, seed)[0]
-    return truth, simulate(ROBOT.with_values(truth), poses(seed), instrument(), seed)
+    return truth, simulate(ROBOT.with_values(truth), draw_poses(seed), make_instrument(), seed)
 
 
-def instrument() -> Instrument:
-    """Full poses."""
+def make_instrument() -> Instrument:
+    """Return an instrument of full poses."""
     return Instrument((Sensor(Pose(), Gaussian(SIGMA)),))
 
 
-def poses(seed: int) -> np.ndarray:
-    """Random coordinates in the workspace."""
+def draw_poses(seed: int) -> np.ndarray:
+    """Draw coordinates from the workspace."""
     ranges = np.array([ROBOT.assembly.workspace[name] for name in ROBOT.controlled])
     return np.random.default_rng(seed).uniform(ranges[:, 0], ranges[:, 1], (POSES, len(ranges)))
 
 
-def with_blunders(truth: np.ndarray, data: Measurements, seed: int) -> Measurements:
-    """Return the measurements with three wrong rows."""
+def add_outliers(truth: np.ndarray, data: Measurements, seed: int) -> Measurements:
+    """Return the measurements with three outliers."""
     rng, rows = np.random.default_rng(seed), data.observations[0]
     values = np.array(rows.measured)
-    for pose in WRONG[:2]:
+    for pose in OUTLIERS[:2]:
         step = rng.standard_normal(6)
         values[pose] += 20.0 * step / np.linalg.norm(step) * SIGMA
     other = truth.copy()
     lengths = [i for i, name in enumerate(ROBOT.parameters.names) if name.endswith("length")]
     other[lengths] = ROBOT.values[lengths]
-    run = simulate(ROBOT.with_values(other), poses(seed), instrument(), seed)
-    values[WRONG[2]] = run.observations[0].measured[WRONG[2]]
+    run = simulate(ROBOT.with_values(other), draw_poses(seed), make_instrument(), seed)
+    values[OUTLIERS[2]] = run.observations[0].measured[OUTLIERS[2]]
     return replace(data, observations=(replace(rows, measured=values),))
 
 
@@ -59,8 +59,8 @@ def collect() -> dict:
     squares = {name: [] for name in ("clean", *LOSSES)}
     named, falsely, leverage = dict.fromkeys(LOSSES, 0), dict.fromkeys(LOSSES, 0), []
     for seed in range(DRAWS):
-        truth, data = measured(seed)
-        bad = with_blunders(truth, data, seed)
+        truth, data = simulate_machine(seed)
+        bad = add_outliers(truth, data, seed)
         squares["clean"].append(
             np.mean((identify(ROBOT, data, LeastSquares()).estimate - truth) ** 2)
         )
@@ -68,7 +68,7 @@ def collect() -> dict:
             fit = identify(ROBOT, bad, LeastSquares(), loss=loss)
             found = find_outliers(fit, bad)
             squares[name].append(np.mean((fit.estimate - truth) ** 2))
-            right = {data.labels[i] for i in WRONG}
+            right = {data.labels[i] for i in OUTLIERS}
             named[name] += len(right & set(found.names))
             falsely[name] += len(set(found.names) - right)
             leverage.append(float(found.influence.leverage.sum() / found.influence.residuals.sum()))
@@ -77,14 +77,14 @@ def collect() -> dict:
         [
             name,
             rms[name] / rms["clean"],
-            100.0 * named[name] / (len(WRONG) * DRAWS),
+            100.0 * named[name] / (len(OUTLIERS) * DRAWS),
             falsely[name] / DRAWS,
         ]
         for name in LOSSES
     ]
     alarms = sum(
         bool(find_outliers(identify(ROBOT, d, LeastSquares()), d).outliers)
-        for d in (measured(s)[1] for s in range(CLEAN))
+        for d in (simulate_machine(s)[1] for s in range(CLEAN))
     )
     return {
         "seeds": [0, CLEAN],
@@ -92,9 +92,9 @@ def collect() -> dict:
             "robust": {
                 "columns": [
                     "fit",
-                    "parameter error over that of clean data",
-                    "wrong rows named [%]",
-                    "right poses named, a data set",
+                    "parameter error / error with clean data",
+                    "outliers named [%]",
+                    "correct poses named as outliers, per data set",
                 ],
                 "formats": ["", ".3g", ".1f", ".3f"],
                 "rows": rows,
@@ -102,7 +102,7 @@ def collect() -> dict:
             "alarms": {
                 "columns": [
                     "clean data sets",
-                    "with an alarm [%]",
+                    "false alarms [%]",
                     "stated level [%]",
                     "mean leverage of a row",
                 ],

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration from planes and perpendicular lines: errors by noise over many draws, and what
-coordinate exchange gains.
+"""Calibration with planes and perpendicular lines: errors by noise over many draws, and the gain
+of coordinate exchange.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ from loopcal.papers.cmm_constraint_2011.steps import WEIGHTS
 from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 
-SEED, DRAWS, STARTS, FEW, SOME = 0, 200, 5, 40, 60
-WORDS = {
+SEED, DRAWS, STARTS, FEW_DRAWS, DRAWS_PER_INTERPRETATION = 0, 200, 5, 40, 60
+WEIGHT_NAMES = {
     "printed": "as printed: weight one",
     "distance": "divided by the distance d_1",
     "single": "divided by the sd of each, taken as independent",
     "full": "with their covariance",
 }
-"""Of the weights of the rows."""
+"""Names of the weights of the rows."""
 
 
-def once(planned: PlaneLineGroups, design: FloatArray) -> float:
-    """Seconds of one evaluation of every group's rows for each level of each coordinate."""
+def time_linearization(planned: PlaneLineGroups, design: FloatArray) -> float:
+    """Return the CPU time [s] of all rows at each level of each coordinate."""
     began = time.process_time()
     for c, values in enumerate(planned.list_levels()):
         for value in values:
@@ -69,8 +69,8 @@ def once(planned: PlaneLineGroups, design: FloatArray) -> float:
     return time.process_time() - began
 
 
-def start(robot: Mechanism, seed: int) -> tuple[Study, list]:
-    """Coordinate exchange from one random start: the study, and its row."""
+def optimize_from_start(robot: Mechanism, seed: int) -> tuple[Study, list]:
+    """Run coordinate exchange from one random start; return the study and its row."""
     began = time.process_time()
     study = plan_points(robot, GROUPS, POINTS, AXES, seed, SWEEPS)
     spent = time.process_time() - began
@@ -78,7 +78,7 @@ def start(robot: Mechanism, seed: int) -> tuple[Study, list]:
         compute_spread(rows)
         for rows in (study.planned.linearize(study.first), study.optimized.rows)
     )
-    cost = spent / once(study.planned, study.first) if seed == SEED else None
+    cost = spent / time_linearization(study.planned, study.first) if seed == SEED else None
     return study, [seed, before, after, before / after, spent, cost]
 
 
@@ -88,11 +88,11 @@ MEDIANS = {
     "position, gauge at nominal [mm]": "position, gauge at nominal [mm]",
     "parameters without gauge [mm]": "parameters without gauge [mm]",
 }
-"""Columns of Table 3, and which of MEASURES they are."""
+"""Columns of Table 3: their names in MEASURES."""
 
 
-def medians(c: Cell) -> list[float]:
-    """Position errors in each frame and the parameters', before, LS and MAP."""
+def list_medians(c: Cell) -> list[float]:
+    """Return errors of position in each frame and of parameters: before, LS and MAP."""
     return [
         float(c.compute_median(m)[MEASURES.index(name)])
         for name in MEDIANS.values()
@@ -100,9 +100,9 @@ def medians(c: Cell) -> list[float]:
     ]
 
 
-def weighed(study: Study, full: Cell) -> list[list[Any]]:
-    """Aligned position and parameters by LS and MAP with each weighting of the rows, and LS over
-    that as printed.
+def compare_weights(study: Study, full: Cell) -> list[list[Any]]:
+    """Return errors by LS and MAP for each weighting of the rows, and the ratio of LS to that as
+    printed.
     """
     cells = {
         w: full
@@ -116,7 +116,7 @@ def weighed(study: Study, full: Cell) -> list[list[Any]]:
     first = cells["printed"].compute_median(LS)[position]
     return [
         [
-            WORDS[w],
+            WEIGHT_NAMES[w],
             *(float(c.compute_median(m)[i]) for i in (position, parameters) for m in (LS, PRIOR)),
             float(c.compute_median(LS)[position] / first),
         ]
@@ -124,18 +124,22 @@ def weighed(study: Study, full: Cell) -> list[list[Any]]:
     ]
 
 
-def readings(study: Study) -> list[list[Any]]:
-    """Figure 5 as printed and under every reading."""
-    found = rank_candidates((evaluate_arrangement(TEN, study, SEED, SOME),), SEED, SOME)
+def compare_interpretations(study: Study) -> list[list[Any]]:
+    """Return figure 5 as printed and under every interpretation."""
+    found = rank_candidates(
+        (evaluate_arrangement(TEN, study, SEED, DRAWS_PER_INTERPRETATION),),
+        SEED,
+        DRAWS_PER_INTERPRETATION,
+    )
     rows = [[c.reading, c.truth, c.frame, *map(float, c.reductions)] for c in found]
     return [["as printed", None, None, *map(float, list_printed())], *rows]
 
 
-def fifties(study: Study) -> list[list[Any]]:
-    """Mean position error before, by LS and by MAP in each frame, and how often LS converges within
-    5 iterations.
+def compare_fifty_points(study: Study) -> list[list[Any]]:
+    """Return mean position errors before, by LS and by MAP in each frame, and the share of LS fits
+    that converge within 5 iterations.
     """
-    found = [calibrate_fifty(study, groups, SEED, FEW) for groups in LINES]
+    found = [calibrate_fifty(study, groups, SEED, FEW_DRAWS) for groups in LINES]
     return [
         [
             f.groups,
@@ -150,26 +154,29 @@ def fifties(study: Study) -> list[list[Any]]:
 
 # size: a list of tables with their columns
 def collect() -> dict[str, Any]:
-    """The 3 x 4 cells, the five starts, one plane against ten, the weights, readings of figure 5,
-    and fifty points.
+    """Collect the 3 x 4 cells, five starts, one plane and ten, weights, interpretations of
+    figure 5, and fifty points.
     """
     robot = load_machine()
-    study, first = start(robot, SEED)
-    starts = [first, *(start(robot, seed)[1] for seed in range(SEED + 1, SEED + STARTS))]
+    study, first = optimize_from_start(robot, SEED)
+    starts = [
+        first,
+        *(optimize_from_start(robot, seed)[1] for seed in range(SEED + 1, SEED + STARTS)),
+    ]
     cells = calibrate_grid(study, SEED, DRAWS, lambda _: None)
     rows = [
-        [given, noise, *medians(c), c.count_worse(PRIOR, 2), c.failed]
+        [given, noise, *list_medians(c), c.count_worse(PRIOR, 2), c.failed]
         for (given, noise), c in cells.items()
     ]
     ten, one = (
         cells["1", "0.01"],
         evaluate_arrangement(
-            ONE, plan_points(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW
+            ONE, plan_points(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW_DRAWS
         ),
     )
     layouts = [
         ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
-        ["one plane, one line", one.drawn, one.optimized, *_pair(one.cell), FEW],
+        ["one plane, one line", one.drawn, one.optimized, *_pair(one.cell), FEW_DRAWS],
     ]
     ranks = [
         [
@@ -185,7 +192,7 @@ def collect() -> dict[str, Any]:
         "seed": SEED,
         "draws": DRAWS,
         "tables": {
-            "table_3": table(
+            "table_3": make_table(
                 [
                     "errors [mm]",
                     "noise [mm]",
@@ -196,10 +203,10 @@ def collect() -> dict[str, Any]:
                 ["", "", *[".2g"] * len(table_3), "d", "d"],
                 rows,
             ),
-            "exchange": table(
+            "exchange": make_table(
                 [
                     "start",
-                    "drawn [mm / mm]",
+                    "random [mm / mm]",
                     "optimized [mm / mm]",
                     "gain",
                     "CPU [s]",
@@ -208,10 +215,10 @@ def collect() -> dict[str, Any]:
                 ["d", ".3g", ".3g", ".2g", ".2g", ".2g"],
                 starts,
             ),
-            "layouts": table(
+            "layouts": make_table(
                 [
                     "100 points on",
-                    "drawn [mm / mm]",
+                    "random [mm / mm]",
                     "optimized [mm / mm]",
                     "LS [mm]",
                     "MAP [mm]",
@@ -220,7 +227,7 @@ def collect() -> dict[str, Any]:
                 ["", ".3g", ".3g", ".3g", ".3g", "d"],
                 layouts,
             ),
-            "weights": table(
+            "weights": make_table(
                 [
                     "rows",
                     *(
@@ -231,11 +238,11 @@ def collect() -> dict[str, Any]:
                     "position, LS, as printed = 1",
                 ],
                 ["", ".3g", ".3g", ".3g", ".3g", ".2f"],
-                weighed(study, ten),
+                compare_weights(study, ten),
             ),
-            "readings": table(
+            "readings": make_table(
                 [
-                    '"variance" read as',
+                    'interpretation of "variance"',
                     "true errors in",
                     "frame",
                     "parameters [%]",
@@ -243,34 +250,34 @@ def collect() -> dict[str, Any]:
                     "orientation [%]",
                 ],
                 ["", "", "", ".0f", ".0f", ".0f"],
-                readings(study),
+                compare_interpretations(study),
             ),
-            "fifty": table(
+            "fifty": make_table(
                 [
                     "planes",
                     "frame",
                     "before [mm]",
                     "LS [mm]",
                     "MAP [mm]",
-                    "LS within 5 iterations [%]",
+                    "LS converged within 5 iterations [%]",
                 ],
                 ["d", "", ".2g", ".2g", ".2g", ".0f"],
-                fifties(study),
+                compare_fifty_points(study),
             ),
-            "correlation": table(
+            "correlation": make_table(
                 ["method", "rank correlation", "cells", "ratios"], ["", ".2f", "d", "d"], ranks
             ),
         },
     }
 
 
-def table(columns: list[str], formats: list[str], rows: list[list[Any]]) -> dict[str, Any]:
-    """A table as evidence/README.md describes it."""
+def make_table(columns: list[str], formats: list[str], rows: list[list[Any]]) -> dict[str, Any]:
+    """Return a table as evidence/README.md describes it."""
     return {"columns": columns, "formats": formats, "rows": rows}
 
 
 def _pair(c: Cell) -> list[float]:
-    """Aligned position error by LS and MAP."""
+    """Return the aligned position errors by LS and MAP."""
     return [
         float(c.compute_median(m)[MEASURES.index("position, aligned [mm]")]) for m in (LS, PRIOR)
     ]

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convention checks: how often true data are doubted or refused, and which slips are refused and
-named.
-"""
+"""Convention check: false alarms on correct data, and detection of wrong conventions."""
 
 from __future__ import annotations
 
@@ -35,21 +33,22 @@ from loopcal.units import Dimension
 SEED, POSES = 3, 20
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
 RATIO = 1e-4  # [1], of columns without a unit
-TIMES = (1.0, 3.0, 30.0)
-EVERY_KIND = ("hexapod-42", "3-prs", "linear-delta")
+ERROR_FACTORS = (1.0, 3.0, 30.0)
+ROBOTS_WITH_EVERY_KIND = ("hexapod-42", "3-prs", "linear-delta")
 """Robots with every kind; the others are measured as full poses and as positions in an unknown
 frame, and up to 3 times off.
 """
-SLIPPED = (*EVERY_KIND, "ru-pus-prs", "rotary-delta")
+ROBOTS_WITH_SLIPS = (*ROBOTS_WITH_EVERY_KIND, "ru-pus-prs", "rotary-delta")
 
-UNKNOWN = Position(unknown=("frame",))
+IN_UNKNOWN_FRAME = Position(unknown=("frame",))
 
 Change = Callable[[np.ndarray], np.ndarray]
 
 
-def measured(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measurements | None:
-    """What a machine that is `times` its tolerances off shows; None where the kind or the machine
-    cannot.
+def simulate_data(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measurements | None:
+    """Simulate a machine with errors of `times` its tolerances.
+
+    None if the kind does not apply or a pose is out of reach.
     """
     noise = Gaussian(np.array([SIGMA.get(c.dimension, RATIO) for c in kind.noise_columns]))
     free = select_free_parameters(robot)
@@ -66,11 +65,11 @@ def measured(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measureme
         return None
 
 
-def cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
-    """Robots with a workspace and kinds: the first and the last example of each, far off only the
-    first.
+def list_cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
+    """Yield robots with a workspace and kinds: the first and last example of each kind, or only the
+    first for large errors.
     """
-    for name in EVERY_KIND if times > 3.0 else list_shipped_robots():
+    for name in ROBOTS_WITH_EVERY_KIND if times > 3.0 else list_shipped_robots():
         robot = load_robot(name)
         every = [
             kind
@@ -82,16 +81,18 @@ def cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
             yield from (
                 (robot, k)
                 for k in (
-                    (first if times > 3.0 else every) if name in EVERY_KIND else (Pose(), UNKNOWN)
+                    (first if times > 3.0 else every)
+                    if name in ROBOTS_WITH_EVERY_KIND
+                    else (Pose(), IN_UNKNOWN_FRAME)
                 )
             )
 
 
-def false_alarms(times: float) -> list:
-    """One row: data sets, doubted, refused, largest misfit."""
+def count_false_alarms(times: float) -> list:
+    """Return one row: data sets, without a misfit, median misfit, doubtful, refused."""
     misfits, refused = [], 0
-    for seed, (robot, kind) in enumerate(cases(times)):
-        data = measured(robot, kind, times, seed)
+    for seed, (robot, kind) in enumerate(list_cases(times)):
+        data = simulate_data(robot, kind, times, seed)
         if data is not None:
             found = compare_conventions(robot, data)
             misfits.append(found.misfit)
@@ -101,8 +102,8 @@ def false_alarms(times: float) -> list:
     return [times, len(misfits), len(misfits) - len(said), float(np.median(said)), doubted, refused]
 
 
-def columns(chosen: list[int], factor: float) -> Change:
-    """Some columns times a factor."""
+def scale_columns(chosen: list[int], factor: float) -> Change:
+    """Return a change that multiplies some columns by a factor."""
 
     def change(values: np.ndarray) -> np.ndarray:
         changed = values.copy()
@@ -112,27 +113,27 @@ def columns(chosen: list[int], factor: float) -> Change:
     return change
 
 
-def exchanged(order: list[int]) -> Change:
-    """Columns in another order."""
+def reorder_columns(order: list[int]) -> Change:
+    """Return a change of the order of columns."""
     return lambda values: values[:, order]
 
 
-def rewritten(change: Change) -> Change:
-    """Rotations, the first three columns, written otherwise."""
+def rewrite_rotations(change: Change) -> Change:
+    """Return a change of the first three columns, the rotations."""
     return lambda values: np.concatenate([change(values[:, :3]), values[:, 3:]], axis=1)
 
 
 Details = dict[str, Any]
-"""Kind of a slip, and what it changes."""
+"""The slip of an interpretation, and its details."""
 
 
 def unit_slip(quantity: str, factor: float) -> Details:
-    """A wrong unit: the values are meant to be `factor` times larger."""
+    """Return the details of a wrong unit: correct values are `factor` times larger."""
     return {"slip": "unit", "quantity": quantity, "factor": factor}
 
 
 def is_named(check: ConventionCheck, details: Details) -> bool:
-    """Whether the slip is the best interpretation or one of those that fit as well."""
+    """Return whether the slip is the best interpretation or fits as well as the best."""
     if check.interpretation is None:
         return False
     every = (check.interpretation, *check.alternatives)
@@ -141,45 +142,49 @@ def is_named(check: ConventionCheck, details: Details) -> bool:
 
 XYZ = Pose("euler-xyz")
 VALUE_SLIPS: tuple[tuple[str, Kind, Change, Details], ...] = (
-    ("mm written as m", Pose(), columns([3, 4, 5], 1e3), unit_slip("lengths", 1e-3)),
+    ("mm written as m", Pose(), scale_columns([3, 4, 5], 1e3), unit_slip("lengths", 1e-3)),
     (
         "deg written as rad",
         Pose(),
-        columns([0, 1, 2], 180.0 / np.pi),
+        scale_columns([0, 1, 2], 180.0 / np.pi),
         unit_slip("angles", 1.0 / (180.0 / np.pi)),
     ),
     (
         "x and y swapped",
         Pose(),
-        exchanged([0, 1, 2, 4, 3, 5]),
+        reorder_columns([0, 1, 2, 4, 3, 5]),
         {"slip": "swapped-columns", "columns": ("x", "y")},
     ),
-    ("rotations inverted", Pose(), columns([0, 1, 2], -1.0), {"slip": "inverted-rotations"}),
+    ("rotations inverted", Pose(), scale_columns([0, 1, 2], -1.0), {"slip": "inverted-rotations"}),
     (
         "euler-zyx for euler-xyz",
         XYZ,
-        rewritten(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")),
+        rewrite_rotations(
+            lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")
+        ),
         {"slip": "orientation-form", "form": "euler-zyx"},
     ),
     (
         "moving for fixed axes",
         XYZ,
-        rewritten(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")),
+        rewrite_rotations(
+            lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")
+        ),
         {"slip": "orientation-form", "form": "euler-XYZ"},
     ),
     (
         "inches written as mm, frame unknown",
-        UNKNOWN,
-        columns([0, 1, 2], 1.0 / 25.4),
+        IN_UNKNOWN_FRAME,
+        scale_columns([0, 1, 2], 1.0 / 25.4),
         unit_slip("lengths", 25.4),
     ),
     (
         "cm written as mm, frame unknown",
-        UNKNOWN,
-        columns([0, 1, 2], 0.1),
+        IN_UNKNOWN_FRAME,
+        scale_columns([0, 1, 2], 0.1),
         unit_slip("lengths", 10.0),
     ),
-    ("drop for rise", Component(("z",)), columns([0], -1.0), {"slip": "sign", "column": "z"}),
+    ("drop for rise", Component(("z",)), scale_columns([0], -1.0), {"slip": "sign", "column": "z"}),
 )
 READING_SLIPS: tuple[tuple[str, Change, Details], ...] = (
     (
@@ -196,13 +201,13 @@ READING_SLIPS: tuple[tuple[str, Change, Details], ...] = (
 )
 
 
-def slipped(
+def simulate_slip(
     robot: Mechanism, kind: Kind, change: Change | None, change_readings: Change | None
 ) -> Measurements | None:
-    """Data with changed values or readings; None where the kind, the robot or the changed numbers
-    are impossible.
+    """Simulate data with changed values or readings; None if they are impossible for the kind or
+    robot.
     """
-    data = measured(robot, kind, 1.0, SEED)
+    data = simulate_data(robot, kind, 1.0, SEED)
     if data is None:
         return None
     rows = data.observations[0]
@@ -216,16 +221,14 @@ def slipped(
     )
 
 
-def detected() -> list[list]:
-    """For each slip: data sets, those it makes implausible, refused, and named first or among
-    others that fit as well.
-    """
+def count_detections() -> list[list]:
+    """Return for each slip: data sets, those doubtful, refused, named (alone or among equals)."""
     tried = [(name, kind, change, None, slip) for name, kind, change, slip in VALUE_SLIPS]
     tried += [(name, Pose(), None, change, slip) for name, change, slip in READING_SLIPS]
-    machines = [load_robot(name) for name in SLIPPED]
+    machines = [load_robot(name) for name in ROBOTS_WITH_SLIPS]
     rows = []
     for name, kind, change, change_readings, details in tried:
-        every = [(robot, slipped(robot, kind, change, change_readings)) for robot in machines]
+        every = [(robot, simulate_slip(robot, kind, change, change_readings)) for robot in machines]
         found = [compare_conventions(robot, data) for robot, data in every if data is not None]
         named = sum(is_named(check, details) for check in found)
         doubtful = sum(check.is_doubtful for check in found)
@@ -235,23 +238,23 @@ def detected() -> list[list]:
 
 
 def collect() -> dict:
-    """False alarms and detection."""
+    """Collect false alarms and detections."""
     alarms = {
         "columns": [
-            "deviations, in tolerances",
-            "true data sets",
-            "too few rows to say",
+            "errors [tolerances]",
+            "correct data sets",
+            "too few rows",
             "median misfit",
-            "misfit above 10, so that all else is tried",
+            "misfit above 10 (alternatives compared)",
             "refused",
         ],
         "formats": [".0f", "d", "d", ".2g", "d", "d"],
-        "rows": [false_alarms(times) for times in TIMES],
+        "rows": [count_false_alarms(times) for times in ERROR_FACTORS],
     }
     detection = {
         "columns": ["slip", "data sets", "misfit above 10", "refused", "named"],
         "formats": ["", "d", "d", "d", "d"],
-        "rows": detected(),
+        "rows": count_detections(),
     }
     return {
         "seed": SEED,

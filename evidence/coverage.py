@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Are the error bars true? Coverage of 95 % intervals, chi-square, and predicted against simulated
-spread of poses.
-"""
+"""Coverage of 95 % intervals, chi-square rejections, and simulated / predicted spread of poses."""
 
 from __future__ import annotations
 
@@ -30,7 +28,7 @@ from loopcal.mechanism import Mechanism, differentiate_pose, forward_trials, sam
 
 Array = NDArray[np.float64]
 
-FITS, TOGETHER, SEED = 4000, 250, 11
+FITS, FITS_PER_BATCH, SEED = 4000, 250, 11
 NORMAL_95 = 1.959963984540054
 """97.5 % point of the normal distribution: half-width of a 95 % interval in standard deviations."""
 
@@ -40,10 +38,10 @@ SIGMA_LENGTH, SIGMA_ANGLE = 5e-6, 25e-6
 
 @dataclass(frozen=True)
 class Case:
-    """A robot, how it is measured, and by what it is identified.
+    """A robot, its measurement, and the method of identification.
 
-    `noise` multiplies the true noise over the stated one: 1 where the error bars must be true, 2
-    where they must not be.
+    `noise` is the true noise over the stated one: 1 for correct intervals, 2 for a case that must
+    fail.
     """
 
     name: str
@@ -74,10 +72,10 @@ CASES = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What some fits of a case came to.
+    """Results of some fits of a case.
 
-    inside : (t, p) estimates whose 95 % interval holds the truth. chi_square : (t,) and its degrees
-        of freedom.
+    inside : (t, p) estimates whose 95 % interval contains the truth. chi_square : (t,) and its
+        degrees of freedom.
     spread : (t, n, 6) errors of the poses predicted at other readings, over their predicted
         standard deviations.
     """
@@ -88,8 +86,8 @@ class Outcome:
     spread: Array
 
 
-def instrument(case: Case, noise: float) -> Instrument:
-    """The instrument of a case with its noise multiplied."""
+def make_instrument(case: Case, noise: float) -> Instrument:
+    """Return the instrument of a case with its noise multiplied."""
     if case.kind == "component":
         return Instrument(
             (Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, noise * SIGMA_LENGTH))),)
@@ -98,20 +96,22 @@ def instrument(case: Case, noise: float) -> Instrument:
     return Instrument((Sensor(Pose(), Gaussian(noise * sigma)),))
 
 
-def fits(case: Case, count: int) -> Iterator[Outcome]:
-    """Simulate and identify `count` machines drawn from the tolerances, some at a time."""
+def simulate_fits(case: Case, count: int) -> Iterator[Outcome]:
+    """Simulate and identify `count` machines drawn from the tolerances, in batches."""
     robot = load_robot(case.robot)
     coordinates, elsewhere = (
         sample_workspace(robot, case.poses, SEED).coordinates,
         sample_workspace(robot, 10, SEED + 1).solution.q,
     )
-    for first in range(0, count, TOGETHER):
+    for first in range(0, count, FITS_PER_BATCH):
         seed = SEED + first
-        truth = sample_truth(robot, min(TOGETHER, count - first), seed)
-        # the stated noise whitens the rows, whatever the true one is
-        trials = simulate_trials(robot, truth, coordinates, instrument(case, 1.0), seed)
+        truth = sample_truth(robot, min(FITS_PER_BATCH, count - first), seed)
+        # the stated noise whitens the rows, also if the true noise is larger
+        trials = simulate_trials(robot, truth, coordinates, make_instrument(case, 1.0), seed)
         if case.noise != 1.0:
-            louder = simulate_trials(robot, truth, coordinates, instrument(case, case.noise), seed)
+            louder = simulate_trials(
+                robot, truth, coordinates, make_instrument(case, case.noise), seed
+            )
             trials = replace(trials, measured=louder.measured)
         found = identify_trials(robot, trials, case.method)
         good = found.converged
@@ -122,7 +122,7 @@ def fits(case: Case, count: int) -> Iterator[Outcome]:
         inside = np.abs(error) <= NORMAL_95 * np.where(decided, sd, np.inf)
         z = found.free_parameters.deviation(found.values)
         chi_square = found.cost + penalize(found.decomposition, found.penalty, z)
-        # a prior counts as one equation for each direction it holds
+        # a prior counts as one equation for each penalized direction
         dof = (
             case.poses * (3 if case.kind == "component" else 6)
             - found.decomposition.rank[0]
@@ -156,11 +156,11 @@ def _spread(
     return error / np.sqrt(np.where(variance > 0, variance, np.nan))
 
 
-def judge(case: Case, count: int = FITS) -> dict[str, float]:
-    """Coverage, chi-square level and ratio of simulated to predicted pose spread of one case."""
+def evaluate_case(case: Case, count: int = FITS) -> dict[str, float]:
+    """Return coverage, chi-square rejections and pose spread (simulated / predicted) of a case."""
     from scipy.stats import chi2
 
-    outcomes = list(fits(case, count))
+    outcomes = list(simulate_fits(case, count))
     inside = np.concatenate([o.inside for o in outcomes])
     chi_square, dof = np.concatenate([o.chi_square for o in outcomes]), outcomes[0].dof
     spread = np.concatenate([o.spread for o in outcomes])
@@ -174,8 +174,8 @@ def judge(case: Case, count: int = FITS) -> dict[str, float]:
 
 
 def collect() -> dict:
-    """Every case at full size."""
-    found = {case.name: judge(case) for case in CASES}
+    """Collect every case at full size."""
+    found = {case.name: evaluate_case(case) for case in CASES}
     rows = [
         [
             name,
@@ -195,8 +195,8 @@ def collect() -> dict:
                 "columns": [
                     "case",
                     "fits",
-                    "95 % intervals that hold the truth [%]",
-                    "the worst parameter [%]",
+                    "coverage of 95 % intervals [%]",
+                    "coverage of the worst parameter [%]",
                     "rejected by chi-square at 5 % [%]",
                     "simulated / predicted pose spread",
                 ],

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 # size: one study of all kinds, with its tables
-"""What every kind of measurement can do alone: rank, recovery of the machine up to its gauge, and
-true error bars.
+"""Each measurement kind alone: rank, recovery of the machine up to its gauge freedom, and coverage
+of intervals.
 
 Cases are the examples of every registered kind on a hexapod, a 3-PRS and a linear delta, so that a
-new kind is in at once.
+new kind is included automatically.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ Array = NDArray[np.float64]
 
 ROBOTS = ("hexapod-42", "3-prs", "linear-delta")
 POSES, HELD_OUT, SEED = 60, 15, 17
-PAIRS = (1, 7, 19)
-"""How many poses apart those are that one row of a kind with links compares."""
+PAIR_STEPS = (1, 7, 19)
+"""Distances, in poses, between the two poses that a row of a linking kind compares."""
 
-WALK = 6
-"""Steps along the gauge; each squares what is left."""
+GAUGE_STEPS = 6
+"""Steps along the gauge freedom; the error decreases quadratically."""
 
 GROUPS = 3
-"""Surfaces and locks that share the poses among them."""
+"""Groups (surfaces, locks) among which the poses are divided."""
 
-TOGETHER = 8
-"""Fits whose own unknowns are read from one fold, which must hold all their poses at once."""
+FITS_PER_BATCH = 8
+"""Fits whose setup parameters come from one factor, which needs all their poses at once."""
 
 FITS, NORMAL_95 = 100, 1.959963984540054
 """Fits of a case, and the 97.5 % point of the normal distribution."""
@@ -73,37 +73,36 @@ FITS, NORMAL_95 = 100, 1.959963984540054
 SIGMA = {Dimension.LENGTH: 5e-6, Dimension.ANGLE: 25e-6}
 """Noise, one standard deviation [m], [rad]."""
 
-REACH = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
-"""How far true frames, targets, surfaces and offsets are from the stated ones, at most [m], [rad].
-"""
+SETUP_RANGE = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
+"""Largest difference of true and stated setup parameters [m], [rad]."""
 
 
-class Silent(Gaussian):
-    """Noise that is stated but does not come."""
+class NoNoise(Gaussian):
+    """Noise of a stated sigma whose draws are zero."""
 
     def draw(self, generator: np.random.Generator, n: int) -> Array:
-        """Zeros (n, m)."""
+        """Return zeros (n, m)."""
         return np.zeros((n, len(self.sd)))
 
 
-class Loud(Gaussian):
+class DoubledNoise(Gaussian):
     """Noise twice as large as stated."""
 
     def draw(self, generator: np.random.Generator, n: int) -> Array:
-        """Noise (n, m)."""
+        """Draw noise (n, m)."""
         return 2.0 * super().draw(generator, n)
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A kind in one of its settings, and the robot that it looks at."""
+    """A kind in one of its settings, and the measured robot."""
 
     robot: str
     kind: Kind
 
     @property
     def setting(self) -> str:
-        """The kind, what it sees, and what of it is unknown."""
+        """Return the kind, its components, and its unknown setup parameters."""
         seen = (
             getattr(self.kind, "components", ())
             or getattr(self.kind, "orientation", "")
@@ -120,29 +119,27 @@ class Case:
         return f"{self.robot}: {self.setting}"
 
 
-def cases(robots: tuple[str, ...] = ROBOTS) -> tuple[Case, ...]:
-    """Every example of every kind on every robot."""
+def list_cases(robots: tuple[str, ...] = ROBOTS) -> tuple[Case, ...]:
+    """Return every example of every kind on every robot."""
     return tuple(
-        Case(name, _sensing(name, kind))
+        Case(name, _with_joints(name, kind))
         for name in robots
         for cls in KINDS.values()
         for kind in cls.examples()
     )
 
 
-def _sensing(name: str, kind: Kind) -> Kind:
-    """The kind; one that looks at joints sees all passive ones, or the driven ones where there are
-    none.
-    """
+def _with_joints(name: str, kind: Kind) -> Kind:
+    """Return the kind; a joint sensor measures all passive joints, or else the actuated ones."""
     if not isinstance(kind, JointSensor):
         return kind
-    robot = _robot(name, True)
-    passive, driven = _passive(robot), tuple(a.name for a in robot.actuators)
+    robot = _load_robot(name, True)
+    passive, driven = _passive_names(robot), tuple(a.name for a in robot.actuators)
     return replace(kind, joints=passive or driven, measures="angle" if passive else "length")
 
 
 @cache
-def _robot(name: str, chains: bool) -> Mechanism:
+def _load_robot(name: str, chains: bool) -> Mechanism:
     robot = load_robot(name)
     if not chains or name != "hexapod-42":
         return robot
@@ -151,28 +148,26 @@ def _robot(name: str, chains: bool) -> Mechanism:
 
 
 @cache
-def _commanded(name: str, seed: int) -> Array:
-    """Coordinates (n, c) all over the workspace, those held out last."""
-    return sample_workspace(_robot(name, False), POSES + HELD_OUT, seed).coordinates
+def _coordinates(name: str, seed: int) -> Array:
+    """Return coordinates (n, c) in the workspace; the last ones are held out."""
+    return sample_workspace(_load_robot(name, False), POSES + HELD_OUT, seed).coordinates
 
 
-def _passive(robot: Mechanism) -> tuple[str, ...]:
-    """Names of the passive joints."""
+def _passive_names(robot: Mechanism) -> tuple[str, ...]:
+    """Return the names of the passive joints."""
     return inverse(robot, robot.home[None]).passive_names
 
 
-def machine(case: Case) -> Mechanism:
-    """The nominal robot; a hexapod whose joints are looked at has legs with joints."""
-    return _robot(case.robot, bool(case.kind.sensed_joints))
+def load_machine(case: Case) -> Mechanism:
+    """Return the nominal robot; a hexapod with joint sensors has joints in its legs."""
+    return _load_robot(case.robot, bool(case.kind.sensed_joints))
 
 
-def instrument(kind: Kind, poses: int, noise: type[Gaussian]) -> Instrument:
-    """The kind looking at all poses; pairs of them where a row compares two, groups where unknowns
-    are a group's.
-    """
+def make_instrument(kind: Kind, poses: int, noise: type[Gaussian]) -> Instrument:
+    """Return an instrument of the kind at all poses, in pairs or groups if the kind needs them."""
     every = np.arange(poses)
     rows = (
-        np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in PAIRS])
+        np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in PAIR_STEPS])
         if kind.poses_per_row == 2
         else every
     )
@@ -182,14 +177,14 @@ def instrument(kind: Kind, poses: int, noise: type[Gaussian]) -> Instrument:
     return Instrument((Sensor(kind, noise(sigma), rows=rows, group=group),))
 
 
-def own_truth(
+def draw_setup_values(
     robot: Mechanism, looking: Instrument, poses: int, rng: np.random.Generator
 ) -> dict[str, float]:
-    """True values of the unknowns of an instrument, drawn evenly about the stated ones."""
+    """Draw true setup values of an instrument, evenly about the stated ones."""
     sensors = [sensor.assign_rows(poses) for sensor in looking.with_tool(robot).sensors]
     labels = tuple(map(str, range(poses)))
     table = collect_nuisance_parameters(sensors, labels).table
-    reach = np.array([REACH[p.dimension] for p in table.entries])
+    reach = np.array([SETUP_RANGE[p.dimension] for p in table.entries])
     drawn = rng.uniform(-reach, reach)
     drawn = np.where(
         [name.endswith("offset") for name in table.names], np.abs(drawn), drawn
@@ -199,13 +194,13 @@ def own_truth(
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """What noise-free rows of a kind told of a machine with errors.
+    """Recovery of a machine with errors from noise-free rows of one kind.
 
     rank of p parameters, and refused : the sentence instead of a fit. seen : largest error of what
     the kind sees at poses
     held out [m, rad, lengths as a share of the robot's size]. pose : of the poses themselves after
     moving the frames that the kind leaves open; NaN where it leaves more open. before : of `seen`
-    before. parameters : see `along_gauge`.
+    before. parameters : see `compare_along_gauge`.
     """
 
     rank: int
@@ -219,16 +214,16 @@ class Recovery:
     refused: str = ""
 
 
-def recover(case: Case, seed: int = SEED) -> Recovery:
-    """Identify a machine from noise-free rows of one kind, and compare it with the truth at poses
-    held out.
+def recover_machine(case: Case, seed: int = SEED) -> Recovery:
+    """Identify a machine from noise-free rows of one kind; compare it with the truth at held-out
+    poses.
     """
-    robot, rng = machine(case), np.random.default_rng(seed)
+    robot, rng = load_machine(case), np.random.default_rng(seed)
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
-    looking = instrument(case.kind, POSES + HELD_OUT, Silent)
-    own = own_truth(robot, looking, POSES + HELD_OUT, rng)
+    looking = make_instrument(case.kind, POSES + HELD_OUT, NoNoise)
+    own = draw_setup_values(robot, looking, POSES + HELD_OUT, rng)
     try:
-        data = simulate(truth, _commanded(case.robot, seed), looking, seed, nuisance_values=own)
+        data = simulate(truth, _coordinates(case.robot, seed), looking, seed, nuisance_values=own)
         some, others = data.take(np.arange(POSES)), data.take(np.arange(POSES, POSES + HELD_OUT))
         fit = identify(robot, some, LeastSquares(), options=FitOptions(allow_fewer_equations=True))
     except LoopcalError as error:
@@ -241,7 +236,7 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
         p=len(fit.names),
         seen=_largest(checked.after, robot.size),
         pose=pose_error(fit.robot, truth, others.readings, motions.frames) if not left else np.nan,
-        parameters=along_gauge(fit, some, truth.values),
+        parameters=compare_along_gauge(fit, some, truth.values),
         before=_largest(checked.before, robot.size),
         frames=motions.frames,
         machine=left,
@@ -251,8 +246,9 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
 def pose_error(
     found: Mechanism, truth: Mechanism, readings: Array, frames: tuple[str, ...]
 ) -> float:
-    """Largest error [m / size, rad] of predicted poses at readings (n, a), after the best motion of
-    the frames named.
+    """Return the largest error [m / size, rad] of predicted poses at readings (n, a).
+
+    The best rigid motion of `frames` is removed first.
     """
     T, true = forward(found, readings).T, forward(truth, readings).T
     if (
@@ -267,14 +263,14 @@ def pose_error(
 
 
 def _largest(errors: PoseErrors, size: float) -> float:
-    """The largest error, lengths as a share of the robot's size."""
+    """Return the largest error, lengths as a share of the robot's size."""
     found = np.concatenate([errors.position / size, errors.orientation])
     return float(found[np.isfinite(found)].max())
 
 
-def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
-    """Largest difference of the parameters from the truth [m / size, rad] that no motion along the
-    gauge explains.
+def compare_along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
+    """Return the largest difference of parameters and truth [m / size, rad] that no motion along
+    the gauge freedom explains.
 
     From the estimate every step goes back to what explains the data by `-A^+ r` and along the null
     directions of A towards the truth, `N N' (z_true - z)`. Where the estimate lies on the orbit of
@@ -292,7 +288,7 @@ def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
     )
     first = None
     start = problem.start(z[None])
-    for _ in range(WALK):
+    for _ in range(GAUGE_STEPS):
         at = problem.linearize(z[None], start)
         factor, start = at.factor[0], at.next_start
         U, s, vt = np.linalg.svd(factor[:-1, :-1])
@@ -305,27 +301,27 @@ def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Which 95 % intervals of t fits hold the truth.
+    """Which 95 % intervals of t fits contain the truth.
 
     directions : combinations of parameters that the data know better than the tolerances.
         parameters : (t, p).
-    own : (t, U) frames, targets, surfaces and offsets. Intervals that are infinite are left out.
+    setup : (t, U) frames, targets, surfaces and offsets. Intervals that are infinite are left out.
     """
 
     fits: int
     directions: NDArray[np.bool_]
     parameters: NDArray[np.bool_]
-    own: NDArray[np.bool_]
+    setup: NDArray[np.bool_]
 
 
-def cover(
+def compute_coverage(
     case: Case, fits: int = FITS, noise: type[Gaussian] = Gaussian, seed: int = SEED
 ) -> Coverage:
     """Simulate machines drawn from their tolerances, identify by MAP and compare with the truth."""
-    robot, rng = machine(case), np.random.default_rng(seed)
-    coordinates = _commanded(case.robot, seed)[:POSES]
-    looking = instrument(case.kind, POSES, noise)
-    own = own_truth(robot, looking, POSES, rng)
+    robot, rng = load_machine(case), np.random.default_rng(seed)
+    coordinates = _coordinates(case.robot, seed)[:POSES]
+    looking = make_instrument(case.kind, POSES, noise)
+    own = draw_setup_values(robot, looking, POSES, rng)
     truth = sample_truth(robot, fits, seed)
     trials = simulate_trials(robot, truth, coordinates, looking, seed, nuisance_values=own)
     found = identify_trials(robot, trials, MAP())
@@ -339,14 +335,14 @@ def cover(
         fits=len(good),
         directions=(known <= NORMAL_95)[~np.isnan(known)],
         parameters=np.abs(off) <= NORMAL_95 * sd,
-        own=_own_covered(found, trials, good, own),
+        setup=_setup_covered(found, trials, good, own),
     )
 
 
-def _own_covered(
+def _setup_covered(
     found: IdentifiedTrials, trials: Trials, good: IntArray, own: dict[str, float]
 ) -> NDArray[np.bool_]:
-    """Whether intervals of the own unknowns hold the truth, those that are finite."""
+    """Return whether finite intervals of the setup parameters contain the truth."""
     problem, free = problem_of_trials(found.free_parameters, trials), found.free_parameters
     if problem.nuisance is None:
         return np.zeros(0, dtype=bool)
@@ -355,7 +351,7 @@ def _own_covered(
     for i in good.tolist():
         one = np.array([i])
         z, alone = free.deviation(found.values[one]), problem.take(one)
-        # how starts are found is proved elsewhere
+        # other tests cover the start values
         at = alone.linearize(z, alone.start(z, seek=False).with_nuisance(truth[None]))
         d, penalty = found.decomposition.take(one), found.penalty[one]
         local = estimate_nuisance(problem.nuisance, at, free.robot, d, penalty, 1.0)
@@ -364,24 +360,24 @@ def _own_covered(
     return np.concatenate(inside)
 
 
-def band(fits: int, p: float = 0.95) -> float:
-    """Four standard deviations of a share of as many draws as there are fits: intervals of one fit
+def coverage_band(fits: int, p: float = 0.95) -> float:
+    """Return four standard deviations of a share with one draw per fit, as the intervals of one fit
     are correlated.
     """
     return 4.0 * float(np.sqrt(p * (1.0 - p) / fits))
 
 
-def with_most_unknowns(robots: tuple[str, ...] = ROBOTS) -> tuple[Case, ...]:
-    """The last example of every kind, in which most is unknown."""
-    return tuple({(case.robot, case.kind.name): case for case in cases(robots)}.values())
+def select_most_unknown(robots: tuple[str, ...] = ROBOTS) -> tuple[Case, ...]:
+    """Return the last example of every kind, which has most unknowns."""
+    return tuple({(case.robot, case.kind.name): case for case in list_cases(robots)}.values())
 
 
 def _recovery_rows() -> list[list[object]]:
     """Return a row for each setting: rank and largest error on each robot, none if refused."""
     rows: dict[int, list[object]] = {}
-    each = len(cases(ROBOTS[:1]))
-    for i, case in enumerate(cases()):
-        found = recover(case)
+    each = len(list_cases(ROBOTS[:1]))
+    for i, case in enumerate(list_cases()):
+        found = recover_machine(case)
         row = rows.setdefault(i % each, [case.setting])
         worst = (
             float(np.nanmax([found.seen, found.pose, found.parameters]))
@@ -393,16 +389,19 @@ def _recovery_rows() -> list[list[object]]:
 
 
 def _coverage_rows() -> list[list[object]]:
-    """One row for each kind and robot, and one that must fail."""
+    """Return one row for each kind and robot, and one that must fail."""
     rows: list[list[object]] = []
-    loud = next(case for case in cases() if case.kind.name == "position")
-    for case, noise in [*((case, Gaussian) for case in with_most_unknowns()), (loud, Loud)]:
-        found = cover(case, noise=noise)
+    loud = next(case for case in list_cases() if case.kind.name == "position")
+    for case, noise in [
+        *((case, Gaussian) for case in select_most_unknown()),
+        (loud, DoubledNoise),
+    ]:
+        found = compute_coverage(case, noise=noise)
         shares = [
             part.mean() if part.size else None
-            for part in (found.directions, found.parameters, found.own)
+            for part in (found.directions, found.parameters, found.setup)
         ]
-        told = ", noise twice as large as stated" if noise is Loud else ""
+        told = ", noise twice as large as stated" if noise is DoubledNoise else ""
         rows.append(
             [
                 case.robot,
@@ -415,11 +414,11 @@ def _coverage_rows() -> list[list[object]]:
 
 
 def collect() -> dict:
-    """Every setting of every kind on every robot, and coverage of the one with most unknowns."""
+    """Collect the recovery of every setting on every robot, and coverage with most unknowns."""
     per_robot = [f"{robot}: {what}" for robot in ROBOTS for what in ("rank", "largest error")]
     holds = [
-        f"intervals of {what} that hold the truth [%]"
-        for what in ("known directions", "parameters", "own unknowns")
+        f"coverage of {what} [%]"
+        for what in ("determined directions", "parameters", "setup parameters")
     ]
     return {
         "seed": SEED,
@@ -430,12 +429,12 @@ def collect() -> dict:
         },
         "tables": {
             "recovery": {
-                "columns": ["kind, alone", *per_robot],
+                "columns": ["measurement kind", *per_robot],
                 "formats": ["", *["", ".0e"] * len(ROBOTS)],
                 "rows": _recovery_rows(),
             },
             "coverage": {
-                "columns": ["robot", "kind, alone", "fits", *holds],
+                "columns": ["robot", "measurement kind", "fits", *holds],
                 "formats": ["", "", "d", ".1f", ".1f", ".1f"],
                 "rows": _coverage_rows(),
             },

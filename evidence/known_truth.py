@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which method to trust when the truth is known: errors on unseen poses before and after, robots by
-noise by method.
+"""Methods compared with the known truth: errors at held-out poses before and after calibration, by
+robot, noise and method.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
 
 Array = NDArray[np.float64]
 
-SEED, MACHINES, POSES, UNSEEN, CHOSEN = 5, 40, 25, 60, 20
+SEED, MACHINES, POSES, HELD_OUT, MODEL_CHOICES = 5, 40, 25, 60, 20
 ROBOTS = ("hexapod-42", "3-prs", "ru-pus-prs", "linear-delta")
 NOISE = {
     "1 um, 5 urad": (1e-6, 5e-6),
@@ -53,58 +53,62 @@ METHODS: dict[str, Method] = {
 }
 
 
-def instrument(robot: Mechanism, length: float, angle: float) -> Instrument:
-    """Full poses, or positions where the platform does not turn."""
+def make_instrument(robot: Mechanism, length: float, angle: float) -> Instrument:
+    """Return an instrument of full poses, or of positions if the platform does not rotate."""
     if len(robot.freedoms) == 3:
         return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, length))),))
     return Instrument((Sensor(Pose(), Gaussian(np.array([angle] * 3 + [length] * 3))),))
 
 
-def errors(robot: Mechanism, values: Array, truth: Array, q: Array) -> Array:
-    """Root mean square position error (t,) [m] of poses predicted at unseen readings q (n, a)."""
+def position_errors(robot: Mechanism, values: Array, truth: Array, q: Array) -> Array:
+    """Return the rms position error (t,) [m] of poses predicted at held-out readings q (n, a)."""
     predicted, true = forward_trials(robot, values, q[None]), forward_trials(robot, truth, q[None])
     gap = geometry.pose_difference(predicted.T, true.T)[..., 3:]
     return np.sqrt((gap**2).sum(axis=2).mean(axis=1))
 
 
-def cell(name: str, noise: tuple[float, float], machines: int = MACHINES) -> dict[str, Array]:
-    """Error (t,) [m] before and after each method, for machines drawn from the tolerances."""
+def evaluate_cell(
+    name: str, noise: tuple[float, float], machines: int = MACHINES
+) -> dict[str, Array]:
+    """Return the errors (t,) [m] before and after each method, for drawn machines."""
     robot = load_robot(name)
     coordinates, q = (
         sample_workspace(robot, POSES, SEED).coordinates,
-        sample_workspace(robot, UNSEEN, SEED + 1).solution.q,
+        sample_workspace(robot, HELD_OUT, SEED + 1).solution.q,
     )
     truth = sample_truth(robot, machines, SEED)
-    trials = simulate_trials(robot, truth, coordinates, instrument(robot, *noise), SEED)
-    found = {"before": errors(robot, np.broadcast_to(robot.values, truth.shape), truth, q)}
+    trials = simulate_trials(robot, truth, coordinates, make_instrument(robot, *noise), SEED)
+    found = {"before": position_errors(robot, np.broadcast_to(robot.values, truth.shape), truth, q)}
     for title, method in METHODS.items():
-        found[title] = errors(robot, identify_trials(robot, trials, method).values, truth, q)
-    few = min(machines, CHOSEN)
-    chosen = np.array([simplest(robot, trials.trial(i)) for i in range(few)])
-    found["chosen model"] = errors(robot, chosen, truth[:few], q)
+        found[title] = position_errors(
+            robot, identify_trials(robot, trials, method).values, truth, q
+        )
+    few = min(machines, MODEL_CHOICES)
+    chosen = np.array([choose_values(robot, trials.trial(i)) for i in range(few)])
+    found["chosen model"] = position_errors(robot, chosen, truth[:few], q)
     return found
 
 
-def simplest(robot: Mechanism, data: Measurements) -> Array:
-    """Values (p,) [SI] of the simplest set of parameters that cross-validation finds enough."""
+def choose_values(robot: Mechanism, data: Measurements) -> Array:
+    """Return values (p,) [SI] of the simplest sufficient parameter set by cross-validation."""
     choice = choose_model(robot, data)
     return identify(choice.robot, data).robot.values if choice.chosen.parameters else robot.values
 
 
 def collect() -> dict:
-    """Every cell: medians, and how many machines the default made worse."""
+    """Collect every cell: medians, and the number of machines that the default made worse."""
     rows = []
     for name in ROBOTS:
         for title, noise in NOISE.items():
-            found = cell(name, noise)
+            found = evaluate_cell(name, noise)
             worse = int((found["default"] > found["before"]).sum())
             rows.append([name, title, *(1e6 * float(np.median(e)) for e in found.values()), worse])
-    columns = ["robot", "noise", "before", *METHODS, f"chosen model ({CHOSEN} machines)"]
+    columns = ["robot", "noise", "before", *METHODS, f"chosen model ({MODEL_CHOICES} machines)"]
     columns.append(f"default worse than before, of {MACHINES}")
     formats = ["", "", *[".3g"] * (2 + len(METHODS)), "d"]
     return {
         "seed": SEED,
         "machines": MACHINES,
-        "poses": [POSES, UNSEEN],
+        "poses": [POSES, HELD_OUT],
         "tables": {"median_error_um": {"columns": columns, "formats": formats, "rows": rows}},
     }

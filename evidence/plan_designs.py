@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of designs: 20 of 1000 candidates compared with the certified bound, even draws and plain
-exchange. Robots and measurements are those of `evidence.planned`.
+"""Quality of designs: 20 of 1000 candidates compared with the certified bound, random designs and
+plain exchange.
+
+Robots and measurements are those of `evidence.planned`.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from loopcal.planning.design import (
 
 CANDIDATES, POSES, STARTS, DRAWS, PREDICTED = 1000, 20, 20, 200, 200
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
-"""Of the simulated instrument: rotation [rad], position [m]."""
+"""Noise of the simulated instrument: rotation [rad], position [m]."""
 
 
 DESIGNS = (*((case, "D") for case in CASES[:4]), *((case, "I") for case in CASES[:3]))
@@ -76,9 +78,9 @@ def collect() -> dict:
         "measured",
         "criterion",
         "directions",
-        "even draws (median)",
-        "20 exchange starts (median)",
-        "best of them",
+        "random designs (median)",
+        "exchange, 20 starts (median)",
+        "exchange, best start",
         "certified design",
         "gap to the bound",
     ]

@@ -333,7 +333,7 @@ def collect() -> dict:
         "random poses as good",
         "poses saved [%]",
         "predicted",
-        "predicted, half of them at the boundary",
+        "predicted, half of the candidates at the boundary",
     ]
     ratios = [f"error / predicted error: {which}" for which in ("planned", "random")]
     noise = [

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of tsvd-2016 on many RU-PUS-PRS machines; fewer than for the 3-PRS, as fits that
-diverge take long.
+"""The comparison of tsvd-2016 on many RU-PUS-PRS machines; fewer than for the 3-PRS, because
+diverging fits take long.
 """
 
 from __future__ import annotations
@@ -13,5 +13,5 @@ DRAWS, SEED = 60, 0
 
 
 def collect() -> dict[str, Any]:
-    """Medians with bootstrap intervals, ratios, and curves over lambda and k."""
+    """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
     return to_document(draw_machines("RU-PUS-PRS", SEED, DRAWS), SEED)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts of unknown frames, targets and surfaces, sought without a guess, from a machine that is a
-millimetre off.
+"""Start values of unknown frames, targets and surfaces, computed without a guess, for a machine
+that is a millimeter off.
 
-Frames are drawn from the whole group of rotations and up to metres away; a start is found when it
-explains the rows at least as well as the truth does at the poses that the nominal machine would
-stand in.
+Frames are drawn from all rotations and up to meters away. A start is successful if it explains the
+rows at least as well as the truth does at the poses of the nominal machine.
 """
 
 from __future__ import annotations
@@ -42,34 +41,30 @@ from loopcal.measure import (
 Array = NDArray[np.float64]
 
 DRAWS, POSES = 1000, 12
-"""Frames drawn of each kind, and poses in which it is seen."""
+"""Draws of each kind, and measured poses."""
 
-OFF = 1e-3
-"""By how much the believed poses are off, one standard deviation [m], [rad]."""
+POSE_ERROR = 1e-3
+"""Error of the nominal poses, one standard deviation [m], [rad]."""
 
 SIGMA = 1e-5
-"""Noise that is stated, one standard deviation [m], [rad]; none comes."""
+"""Stated noise, one standard deviation [m], [rad]; the draws are zero."""
 
-AS_GOOD = 1.05
-"""Residual of a start that is found, as a share of that at the truth: a start is sought to a few
-digits only.
-"""
+RESIDUAL_LIMIT = 1.05
+"""Largest residual of a successful start over that at the truth: a few digits are enough."""
 
-TURNED = 0.05
-"""Error of orientation of a frame that is found, at most [rad]: a millimetre over a tenth of a
-metre is 0.01.
-"""
+ROTATION_LIMIT = 0.05
+"""Largest rotation error of a successful frame [rad]: 1 mm over 0.1 m is 0.01."""
 
 POINT = np.array([[0.03, -0.02, 0.05]])
-NOWHERE, NOWHERE_3 = np.zeros((1, 3)), np.zeros((3, 3))
+NO_PLACE, NO_PLACES = np.zeros((1, 3)), np.zeros((3, 3))
 ONE = np.eye(4)
 FIVE = ("x", "y", "z", "phi", "theta")
 KINDS: dict[str, Kind] = {
     "targets in a frame": Position(
-        targets=("a", "b", "c"), places=NOWHERE_3, unknown=("frame", "targets")
+        targets=("a", "b", "c"), places=NO_PLACES, unknown=("frame", "targets")
     ),
     "a frame": Position(places=POINT, unknown=("frame",)),
-    "targets": Position(targets=("a", "b", "c"), places=NOWHERE_3, unknown=("targets",)),
+    "targets": Position(targets=("a", "b", "c"), places=NO_PLACES, unknown=("targets",)),
     "frame and tool of poses": Pose(unknown=("frame", "tool"), T_platform_tool=ONE),
     "frame of poses": Pose(unknown=("frame",), T_platform_tool=ONE),
     "frame of five coordinates": Component(
@@ -80,9 +75,9 @@ KINDS: dict[str, Kind] = {
     ),
     "point of distances": Distance(places=POINT, unknown=("anchor",)),
     "point and zero of a wire": Distance(places=POINT, unknown=("anchor", "offset")),
-    "both ends of a wire": Distance(places=NOWHERE, unknown=("anchor", "targets")),
+    "both ends of a wire": Distance(places=NO_PLACE, unknown=("anchor", "targets")),
     "theodolite": Bearing(places=POINT, unknown=("frame",)),
-    "theodolite and its target": Bearing(places=NOWHERE, unknown=("frame", "targets")),
+    "theodolite and its target": Bearing(places=NO_PLACE, unknown=("frame", "targets")),
     "camera": Bearing(places=POINT, unknown=("frame",), form="camera"),
     "frame and axis": Direction(unknown=("frame", "axis")),
     "gravity and mounting": Inclination(unknown=("gravity", "mounting")),
@@ -90,10 +85,10 @@ KINDS: dict[str, Kind] = {
     "plane": Plane(places=POINT, unknown=("surface",)),
     "line": Line(places=POINT, unknown=("surface",)),
     "sphere": Sphere(places=POINT, unknown=("surface",)),
-    "point and zero of a ball-bar": Separation(places=NOWHERE, unknown=("targets", "offset")),
+    "point and zero of a ball-bar": Separation(places=NO_PLACE, unknown=("targets", "offset")),
 }
-FAR = ("frame", "anchor", "sphere")
-AT_FULL_SIZE = (
+DISTANT_SETUPS = ("frame", "anchor", "sphere")
+FULL_SIZE_KINDS = (
     "targets in a frame",
     "frame and tool of poses",
     "point and zero of a ball-bar",
@@ -102,15 +97,13 @@ AT_FULL_SIZE = (
 
 
 def draw_poses(rng: np.random.Generator, n: int) -> Array:
-    """Poses (n, 4, 4) within a decimetre and a quarter of a radian of one 0.8 m above the base."""
+    """Draw poses (n, 4, 4) within 0.1 m and 0.25 rad of one 0.8 m above the base."""
     x = rng.uniform(-1, 1, (n, 6)) * [0.1, 0.1, 0.1, 0.25, 0.25, 0.25] + [0, 0, 0.8, 0, 0, 0]
     return geometry.make_pose(geometry.euler_to_matrix(x[:, 3:], "xyz"), x[:, :3])
 
 
-def truth_of(local: NuisanceParameters, rng: np.random.Generator) -> Array:
-    """Values anywhere: rotations over the whole group, frames up to metres off, targets and
-    surfaces by centimetres.
-    """
+def draw_truth(local: NuisanceParameters, rng: np.random.Generator) -> Array:
+    """Draw true values: any rotation, frames up to 2 m off, targets and surfaces up to 0.1 m."""
     values = local.values()
     for i, name in enumerate(local.table.names):
         owner, axis = name.rsplit(".", 1)
@@ -119,7 +112,7 @@ def truth_of(local: NuisanceParameters, rng: np.random.Generator) -> Array:
         elif axis == "radius":
             values[i] += rng.uniform(0.0, 0.02)
         elif axis not in ("rx", "ry", "rz"):
-            reach = 2.0 if owner in FAR else 0.1
+            reach = 2.0 if owner in DISTANT_SETUPS else 0.1
             values[i] += rng.uniform(-reach, reach)
     for owner in {name[:-3] for name in local.table.names if name.endswith(".rx")}:
         quaternion = rng.normal(size=4)
@@ -131,10 +124,10 @@ def truth_of(local: NuisanceParameters, rng: np.random.Generator) -> Array:
     return values
 
 
-def measured_at(
+def simulate_rows(
     kind: Kind, T: Array, rng: np.random.Generator
 ) -> tuple[Measurements, NuisanceParameters, Array]:
-    """Noise-free rows at random true values, and these values."""
+    """Simulate noise-free rows at random true values; return both."""
     n, m = len(T), len(kind.noise_columns)
     poses_seen = (
         np.arange(n)
@@ -146,73 +139,75 @@ def measured_at(
     )
     data = Measurements("toy", np.zeros((n, 1)), (empty,))
     local = collect_nuisance_parameters(data.observations, data.labels)
-    truth = truth_of(local, rng)
+    truth = draw_truth(local, rng)
     seen = kind.measure(T[None, poses_seen], np.zeros((1, n, m)), local.select(0, truth[None]))
     return replace(data, observations=(replace(empty, measured=seen[0]),)), local, truth
 
 
-def residuals(data: Measurements, T: Array, local: NuisanceParameters, values: Array) -> Array:
-    """Whitened residuals of all rows at poses T (n, 4, 4)."""
+def whitened_residuals(
+    data: Measurements, T: Array, local: NuisanceParameters, values: Array
+) -> Array:
+    """Return the whitened residuals of all rows at poses T (n, 4, 4)."""
     return whiten_rows(
         evaluate_measurements(data, T[None], values[None], local), np.zeros((1, len(T), 6, 0))
     )[0, :, -1]
 
 
 @dataclass(frozen=True)
-class Start:
-    """What a search without a guess gave.
+class StartResult:
+    """Result of a search without a guess.
 
-    residual : root mean square at the start, as a share of that at the truth. turned : error of
-    orientation of the frame
-    [rad]; None where none is unknown.
+    residual : root mean square at the start over that at the truth.
+    rotation_error : of the frame [rad]; None if no frame is unknown.
     """
 
     residual: float
-    turned: float | None
+    rotation_error: float | None
 
     @property
-    def found(self) -> bool:
-        """Whether the start explains the rows as well as the truth does, its frame turned as it
-        should be.
-        """
-        return self.residual < AS_GOOD and (self.turned is None or self.turned < TURNED)
+    def is_successful(self) -> bool:
+        """Return whether residual and rotation are within their limits."""
+        return self.residual < RESIDUAL_LIMIT and (
+            self.rotation_error is None or self.rotation_error < ROTATION_LIMIT
+        )
 
 
-def start(name: str, seed: int) -> Start | None:
-    """Seek the unknowns of one draw of a kind; None where the truth drawn cannot be measured, such
+def compute_start(name: str, seed: int) -> StartResult | None:
+    """Compute start values for one draw of a kind; None if the drawn truth cannot be measured, such
     as a length below zero.
     """
     rng = np.random.default_rng(seed)
     T = draw_poses(rng, POSES)
     try:
-        data, local, truth = measured_at(KINDS[name], T, rng)
+        data, local, truth = simulate_rows(KINDS[name], T, rng)
     except DataError:
         return None
-    believed = geometry.apply_twist(T, rng.normal(size=(POSES, 6)) * OFF)
+    believed = geometry.apply_twist(T, rng.normal(size=(POSES, 6)) * POSE_ERROR)
     found = guess_nuisance_values(data, believed, local)
     left, best = (
-        float(np.linalg.norm(residuals(data, believed, local, values))) for values in (found, truth)
+        float(np.linalg.norm(whitened_residuals(data, believed, local, values)))
+        for values in (found, truth)
     )
-    turned = None
+    rotation_error = None
     if "frame.rx" in local.table.names:
         first = local.table.index("frame.rx")
         turn, right = (geometry.exp_so3(values[first : first + 3]) for values in (found, truth))
-        turned = float(np.linalg.norm(geometry.log_so3(turn @ right.T)))
-    return Start(left / best, turned)
+        rotation_error = float(np.linalg.norm(geometry.log_so3(turn @ right.T)))
+    return StartResult(left / best, rotation_error)
 
 
 def collect() -> dict:
-    """Draw frames, targets and zeros of the kinds at full size."""
+    """Collect the starts of the full-size kinds."""
     rows = []
-    for name in AT_FULL_SIZE:
-        drawn = [one for seed in range(DRAWS) if (one := start(name, seed)) is not None]
-        turns = [1e3 * one.turned for one in drawn if one.turned is not None]
+    for name in FULL_SIZE_KINDS:
+        drawn = [one for seed in range(DRAWS) if (one := compute_start(name, seed)) is not None]
+        turns = [1e3 * one.rotation_error for one in drawn if one.rotation_error is not None]
         share = max(one.residual for one in drawn)
         rows.append(
             [
                 name,
                 len(drawn),
-                sum(one.found for one in drawn),
+                sum(one.is_successful for one in drawn),
                 share,
                 max(turns) if turns else None,
             ]
@@ -220,11 +215,12 @@ def collect() -> dict:
     return {
         "seeds": [0, DRAWS],
         "poses": POSES,
-        "off": {"length [mm]": 1e3 * OFF, "angle [mrad]": 1e3 * OFF},
+        "off": {"length [mm]": 1e3 * POSE_ERROR, "angle [mrad]": 1e3 * POSE_ERROR},
         "tables": {
             "found": {
                 "columns": [
-                    "unknown", "draws", "found", "largest residual / that of the truth",
+                    "unknown setup", "draws", "successful",
+                    "largest residual / residual at the truth",
                     "largest error of orientation [mrad]",
                 ],
                 "formats": ["", "d", "d", ".2f", ".1f"],

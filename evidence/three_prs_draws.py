@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of tsvd-2016 on many 3-PRS machines: raw LS, RE and TSVD at their best, and the
-library's methods.
+"""The comparison of tsvd-2016 on many 3-PRS machines: LS, RE and TSVD of the paper at their best,
+and loopcal's methods.
 """
 
 from __future__ import annotations
@@ -13,5 +13,5 @@ DRAWS, SEED = 120, 0
 
 
 def collect() -> dict[str, Any]:
-    """Medians with bootstrap intervals, ratios, and curves over lambda and k."""
+    """Collect medians with bootstrap intervals, ratios, and curves over lambda and k."""
     return to_document(draw_machines("3-PRS", SEED, DRAWS), SEED)

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from evidence.coverage import CASES, FITS, judge
+from evidence.coverage import CASES, FITS, evaluate_case
 
 FEW_FITS = 240
 CORRECT_NOISE_CASES = [case for case in CASES if case.noise == 1.0]
@@ -23,7 +23,7 @@ def binomial_band(p, n, sigmas=4.0):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CORRECT_NOISE_CASES, ids=lambda case: case.name)
 def test_95_percent_intervals_contain_the_truth_in_95_percent_of_few_fits(case):
-    found = judge(case, FEW_FITS)
+    found = evaluate_case(case, FEW_FITS)
     # intervals of one fit are correlated: the band is that of as many draws as there are fits, at
     # four standard deviations
     assert found["coverage"] == pytest.approx(0.95, abs=binomial_band(0.95, FEW_FITS))
@@ -36,7 +36,7 @@ def test_95_percent_intervals_contain_the_truth_in_95_percent_of_few_fits(case):
 @pytest.mark.slow
 def test_intervals_fail_if_the_stated_noise_is_half_the_true_noise():
     (case,) = (case for case in CASES if case.noise == 2.0)
-    found = judge(case, FEW_FITS)
+    found = evaluate_case(case, FEW_FITS)
     # half the width: a normal value lies within 0.98 sd in 67 % of the draws
     assert found["coverage"] == pytest.approx(0.673, abs=binomial_band(0.673, FEW_FITS))
     assert found["rejected"] > 0.99

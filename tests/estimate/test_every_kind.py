@@ -18,17 +18,17 @@ from evidence.kinds import (
     ROBOTS,
     SEED,
     Coverage,
-    Loud,
-    Silent,
-    along_gauge,
-    band,
-    cases,
-    cover,
-    instrument,
-    machine,
+    DoubledNoise,
+    NoNoise,
+    compare_along_gauge,
+    compute_coverage,
+    coverage_band,
+    list_cases,
+    load_machine,
+    make_instrument,
     pose_error,
-    recover,
-    with_most_unknowns,
+    recover_machine,
+    select_most_unknown,
 )
 from loopcal import geometry
 from loopcal.diagnose import identifiability
@@ -65,12 +65,12 @@ readings, cannot show.
 
 RECOVERED_CASES = [
     case
-    for case in with_most_unknowns()
+    for case in select_most_unknown()
     if case.robot != "linear-delta" or case.kind.name not in KINDS_BLIND_ON_A_DELTA
 ]
 BLIND_CASES = [
     case
-    for case in with_most_unknowns(("linear-delta",))
+    for case in select_most_unknown(("linear-delta",))
     if case.kind.name in KINDS_BLIND_ON_A_DELTA
 ]
 
@@ -85,7 +85,7 @@ stand in the base, whose orientation they see."""
 
 
 def test_every_registered_kind_has_a_case_on_every_robot():
-    assert {(case.robot, case.kind.name) for case in cases()} == {
+    assert {(case.robot, case.kind.name) for case in list_cases()} == {
         (robot, name) for robot in ROBOTS for name in KINDS
     }
 
@@ -93,7 +93,7 @@ def test_every_registered_kind_has_a_case_on_every_robot():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", RECOVERED_CASES, ids=str)
 def test_noise_free_rows_of_one_kind_recover_the_robot_up_to_its_gauge(case):
-    found = recover(case)
+    found = recover_machine(case)
     assert not found.refused
     assert found.machine == 0, "only motions of frames stay open"
     assert found.before > 1e4 * EXACT
@@ -106,11 +106,11 @@ def test_noise_free_rows_of_one_kind_recover_the_robot_up_to_its_gauge(case):
 
 @pytest.mark.parametrize("case", BLIND_CASES, ids=str)
 def test_kinds_blind_on_a_delta_have_rank_zero_and_a_finding(case):
-    robot = machine(case)
+    robot = load_machine(case)
     data = simulate(
         robot,
         sample_workspace(robot, POSES, SEED).coordinates,
-        instrument(case.kind, POSES, Silent),
+        make_instrument(case.kind, POSES, NoNoise),
         SEED,
     )
     fit = identify(robot, data, LeastSquares(), options=FitOptions(allow_fewer_equations=True))
@@ -127,20 +127,20 @@ def pool_coverage(found: list[Coverage], what: str) -> float:
 
 @pytest.mark.slow
 def test_intervals_of_a_hexapod_and_setup_parameters_have_95_percent_coverage():
-    found = [cover(case, 10) for case in with_most_unknowns(("hexapod-42",))]
+    found = [compute_coverage(case, 10) for case in select_most_unknown(("hexapod-42",))]
     total = sum(one.fits for one in found)
     assert total == 10 * len(found), "every fit converged"
-    for what in ("directions", "parameters", "own"):
-        assert pool_coverage(found, what) == pytest.approx(0.95, abs=band(total)), what
+    for what in ("directions", "parameters", "setup"):
+        assert pool_coverage(found, what) == pytest.approx(0.95, abs=coverage_band(total)), what
 
 
 @pytest.mark.slow
 def test_coverage_is_too_low_if_the_stated_noise_is_half_the_true_noise():
-    case = next(case for case in cases() if case.kind.name == "position")
-    found = cover(case, 60, Loud)
+    case = next(case for case in list_cases() if case.kind.name == "position")
+    found = compute_coverage(case, 60, DoubledNoise)
     # half the width: a normal value lies within 0.98 sd in 67 % of the draws; the prior holds the
     # weaker directions
-    assert found.directions.mean() < 0.95 - band(60)
+    assert found.directions.mean() < 0.95 - coverage_band(60)
 
 
 STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
@@ -207,7 +207,7 @@ def test_unknown_frame_gives_the_robot_of_the_known_frame_up_to_its_gauge(kind):
         sample_workspace(robot, 15, SEED + 1).solution.q,
     )
     known = identify(
-        robot, simulate(truth, poses, instrument(Pose(), 50, Silent), SEED), LeastSquares()
+        robot, simulate(truth, poses, make_instrument(Pose(), 50, NoNoise), SEED), LeastSquares()
     )
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -223,7 +223,9 @@ def test_unknown_frame_gives_the_robot_of_the_known_frame_up_to_its_gauge(kind):
                 strict=True,
             )
         )
-        data = simulate(truth, poses, instrument(kind, 50, Silent), SEED, nuisance_values=true)
+        data = simulate(
+            truth, poses, make_instrument(kind, 50, NoNoise), SEED, nuisance_values=true
+        )
         fit = identify(robot, data, LeastSquares())
         assert fit.converged
         assert pose_error(fit.robot, known.robot, elsewhere, ("base", "platform")) < EXACT, seed
@@ -271,7 +273,7 @@ def test_joints_locked_at_unknown_values_recover_a_tripod_up_to_its_frames():
         kind = Locked(joints=(joint,), measures="angle")
         group = np.repeat(["at0", "at1", "at2"], 12)
         sensors.append(
-            Sensor(kind, Silent(np.full(1, 5e-6)), rows=36 * i + np.arange(36), group=group)
+            Sensor(kind, NoNoise(np.full(1, 5e-6)), rows=36 * i + np.arange(36), group=group)
         )
     data = simulate(
         truth,
@@ -285,7 +287,7 @@ def test_joints_locked_at_unknown_values_recover_a_tripod_up_to_its_frames():
     assert max(np.abs(o.measured).max() for o in data.observations) < 1e-12
     fit = identify(robot, data, LeastSquares(), options=FitOptions(allow_fewer_equations=True))
     assert fit.rank == 21
-    assert along_gauge(fit, data, truth.values) < EXACT
+    assert compare_along_gauge(fit, data, truth.values) < EXACT
     assert (
         pose_error(
             fit.robot, truth, sample_workspace(robot, 15, SEED).solution.q, ("base", "platform")
@@ -305,7 +307,7 @@ def evidence_tables(root):
 
 @pytest.mark.evidence
 def test_published_recovery_of_every_kind_and_robot_is_exact(evidence_tables):
-    assert len(evidence_tables["recovery"]) == len(cases(("linear-delta",)))
+    assert len(evidence_tables["recovery"]) == len(list_cases(("linear-delta",)))
     for row in evidence_tables["recovery"]:
         assert all(error is None or error < EXACT for error in row[2::2]), row[0]
     refused = [row[0] for row in evidence_tables["recovery"] if None in row[1::2]]
@@ -321,5 +323,8 @@ def test_published_coverage_of_every_kind_is_within_its_band(evidence_tables):
     for robot, setting, fits, *shares in true:
         assert fits == FITS, setting
         for share in shares:
-            assert share is None or abs(share / 100.0 - 0.95) < band(fits), (robot, setting)
-    assert loud[3] / 100.0 < 0.95 - band(FITS)
+            assert share is None or abs(share / 100.0 - 0.95) < coverage_band(fits), (
+                robot,
+                setting,
+            )
+    assert loud[3] / 100.0 < 0.95 - coverage_band(FITS)

@@ -9,14 +9,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from evidence.starts import (
-    AT_FULL_SIZE,
     DRAWS,
+    FULL_SIZE_KINDS,
     KINDS,
-    NOWHERE,
+    NO_PLACE,
+    compute_start,
     draw_poses,
-    measured_at,
-    residuals,
-    start,
+    simulate_rows,
+    whitened_residuals,
 )
 from loopcal import geometry
 from loopcal.errors import DataError
@@ -44,21 +44,23 @@ def test_start_values_of_every_unknown_explain_exact_data(name):
         rng = np.random.default_rng(seed)
         T = poses(rng)
         try:
-            data, local, _ = measured_at(KINDS[name], T, rng)
+            data, local, _ = simulate_rows(KINDS[name], T, rng)
         except DataError:  # a truth that cannot be measured, such as a sensor upside down
             continue
         found = guess_nuisance_values(data, T, local)
         # [sigma] noise-free rows with sigma 1e-5 m or rad: 1e-8 m
-        assert_allclose(residuals(data, T, local, found), 0.0, atol=1e-3, err_msg=f"seed {seed}")
+        assert_allclose(
+            whitened_residuals(data, T, local, found), 0.0, atol=1e-3, err_msg=f"seed {seed}"
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["targets in a frame", "frame and tool of poses"])
 def test_start_values_are_found_for_150_random_frames_and_machine_errors(name):
     for seed in range(150):
-        one = start(name, seed)
+        one = compute_start(name, seed)
         assert one is not None
-        assert one.found, (seed, one)
+        assert one.is_successful, (seed, one)
 
 
 @pytest.mark.evidence
@@ -67,7 +69,7 @@ def test_evidence_every_frame_and_99_5_percent_of_others_are_found(root):
     if not path.exists():
         pytest.skip("docs/evidence/starts.json is made by `make evidence`")
     rows = json.loads(path.read_text())["tables"]["found"]["rows"]
-    assert [name for name, *_ in rows] == list(AT_FULL_SIZE)
+    assert [name for name, *_ in rows] == list(FULL_SIZE_KINDS)
     for name, draws, found, _, turned in rows:
         if turned is not None:
             assert found == draws == DRAWS, name
@@ -79,8 +81,8 @@ def test_evidence_every_frame_and_99_5_percent_of_others_are_found(root):
 def test_kinds_that_share_a_frame_get_one_start_value():
     rng = np.random.default_rng(0)
     T = poses(rng)
-    balls = Position(targets=("ball",), places=NOWHERE, unknown=("frame", "targets"))
-    data, _, truth = measured_at(balls, T, rng)
+    balls = Position(targets=("ball",), places=NO_PLACE, unknown=("frame", "targets"))
+    data, _, truth = simulate_rows(balls, T, rng)
     axis = Direction(unknown=("frame",))
     seen = axis.measure(T[None], np.zeros((1, N, 2)), truth[None, None, :3])[0]
     both = replace(
@@ -90,7 +92,7 @@ def test_kinds_that_share_a_frame_get_one_start_value():
     local = collect_nuisance_parameters(both.observations, both.labels)
     assert len(local) == 9
     assert_allclose(
-        residuals(both, T, local, guess_nuisance_values(both, T, local)), 0.0, atol=1e-3
+        whitened_residuals(both, T, local, guess_nuisance_values(both, T, local)), 0.0, atol=1e-3
     )
 
 
@@ -98,7 +100,7 @@ def test_sessions_get_separate_start_values():
     rng = np.random.default_rng(1)
     T = poses(rng)
     parts = [
-        measured_at(KINDS["targets in a frame"], T[half], rng)[0].observations[0]
+        simulate_rows(KINDS["targets in a frame"], T[half], rng)[0].observations[0]
         for half in (slice(0, 15), slice(15, N))
     ]
     kind = parts[0].kind
@@ -110,14 +112,14 @@ def test_sessions_get_separate_start_values():
     local = collect_nuisance_parameters(data.observations, data.labels)
     assert len(local) == 2 * 15
     assert_allclose(
-        residuals(data, T, local, guess_nuisance_values(data, T, local)), 0.0, atol=1e-3
+        whitened_residuals(data, T, local, guess_nuisance_values(data, T, local)), 0.0, atol=1e-3
     )
 
 
 def test_fixed_values_are_kept_and_priors_change_start_values():
     rng = np.random.default_rng(2)
     T = poses(rng)
-    data, local, truth = measured_at(KINDS["a frame"], T, rng)
+    data, local, truth = simulate_rows(KINDS["a frame"], T, rng)
     held = local.with_nominal(truth + np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0]))
     found = guess_nuisance_values(data, T, held.with_fixed("frame.x"))
     assert found[3] == truth[3] + 1e-3
@@ -131,7 +133,7 @@ def test_points_in_one_plane_need_a_stated_side():
     rng = np.random.default_rng(3)
     T = poses(rng)
     T[:, 2, 3] = 0.8
-    data, local, truth = measured_at(Distance(places=NOWHERE, unknown=("anchor",)), T, rng)
+    data, local, truth = simulate_rows(Distance(places=NO_PLACE, unknown=("anchor",)), T, rng)
     with pytest.raises(
         DataError,
         match=r"'anchor' were measured from points in one plane, so it can be on either side",
@@ -139,7 +141,7 @@ def test_points_in_one_plane_need_a_stated_side():
         guess_nuisance_values(data, T, local)
     side = np.array([0.0, 0.0, 0.8 + np.sign(truth[2] - 0.8)])
     rows = replace(
-        data.observations[0], kind=Distance(places=NOWHERE, unknown=("anchor",), anchor=side)
+        data.observations[0], kind=Distance(places=NO_PLACE, unknown=("anchor",), anchor=side)
     )
     found = guess_nuisance_values(replace(data, observations=(rows,)), T)
     assert_allclose(found, truth, atol=1e-7)
@@ -149,7 +151,7 @@ def test_collinear_points_with_an_unknown_frame_are_refused():
     rng = np.random.default_rng(3)
     T = poses(rng)
     T[:, :3, 3] = np.array([0.1, 0.2, 0.3]) * np.linspace(0, 1, N)[:, None]
-    data, local, _ = measured_at(Position(places=NOWHERE, unknown=("frame",)), T, rng)
+    data, local, _ = simulate_rows(Position(places=NO_PLACE, unknown=("frame",)), T, rng)
     with pytest.raises(
         DataError, match=r"the 30 positions are collinear, so the rotation of the frame 'frame'"
     ):
