@@ -266,3 +266,27 @@ def test_unreachable_poses_are_reported_without_held_out_poses(robot, data) -> N
     (finding,) = [f for f in report.findings if f.code == "validation.unreachable-poses"]
     assert finding.data["names"] == (f"pose {data.labels[3]}",)
     assert report.verdict is Verdict.UNDECIDED
+
+
+def test_a_limit_that_no_error_can_be_compared_with_is_refused() -> None:
+    with pytest.raises(DataError, match="limit_position is nan; give a number of metres"):
+        CalibrationOptions(hold_out=0.25, limit_position=float("nan"))
+
+
+def test_held_out_poses_without_a_value_that_counts_are_refused(robot, data) -> None:
+    excluded = replace(CalibrationOptions().fit, excluded_poses=("1",))
+    with pytest.raises(DataError, match="held-out poses have no measured value, or are excluded"):
+        calibrate(robot, data, CalibrationOptions(held_out=("1",), fit=excluded))
+
+
+def test_errors_on_fitted_poses_are_not_called_a_validation(robot, data) -> None:
+    text = str(calibrate(robot, data))
+    assert "Errors on the fitted poses (rms), which are optimistic:\n  position: " in text
+    assert "Validation" not in text
+
+
+def test_readings_without_a_finite_sigma_leave_no_equation(robot, data) -> None:
+    unread = replace(data, reading_sigma=np.full(data.readings.shape, np.inf))
+    with pytest.raises(lc.EstimationError, match="because the readings are uncertain") as error:
+        calibrate(robot, unread)
+    assert error.value.code == "fit.no-equation-left"

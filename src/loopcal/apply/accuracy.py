@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.diagnose import NO_MOTION, FrameMotions, find_frame_motions, twist_weights
 from loopcal.errors import EstimationError
+from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -148,6 +149,7 @@ def pose_uncertainty(
             raise EstimationError(
                 f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(allowed)))}"
             )
+    check_argument(fit, "fit", Identification, Posterior)
     posterior = fit.posterior if isinstance(fit, Identification) else fit
     robot = posterior.robot
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
@@ -312,6 +314,7 @@ def accuracy_map(
     ------
     MechanismError : poses are to be drawn, and the robot states no workspace.
     """
+    check_argument(fit, "fit", Identification, Posterior)
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     coordinates = resolve_poses(robot, poses, seed)
     return AccuracyMap(

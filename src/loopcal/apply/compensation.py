@@ -21,6 +21,7 @@ from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.diagnose import twist_weights
 from loopcal.errors import DataError
+from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -182,6 +183,7 @@ def compensate(
     ------
     DataError : unknown mode, no step, targets of another shape.
     """
+    check_argument(fit, "fit", Identification, Posterior, Mechanism)
     _check_settings(mode, steps)
     source = fit.posterior if isinstance(fit, Identification) else fit
     robot = source if isinstance(source, Mechanism) else source.robot

@@ -22,6 +22,7 @@ import numpy as np
 from loopcal.apply.validation_findings import (
     DIMENSIONS,
     QUANTITIES,
+    check_limit,
     check_limits,
     group_setup,
     owner_of,
@@ -38,7 +39,7 @@ from loopcal.diagnose import (
     compute_row_errors,
 )
 from loopcal.errors import DataError, suggest_names
-from loopcal.estimate.fit_input import check_types
+from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements, Observations, check_actuators
@@ -153,7 +154,13 @@ class Validation:
 
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
-        lines = [f"Validation on {len(self.poses)} rows (rms):"]
+        rows = "row" if len(self.poses) == 1 else "rows"
+        lines = [f"Validation on {len(self.poses)} {rows} (rms):", *self.describe_rms()]
+        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
+
+    def describe_rms(self) -> list[str]:
+        """Return one line for each quantity: its rms before and after, and the noise floor."""
+        lines = []
         for quantity in self.quantities:
             shown = self.units[quantity]
             values = [
@@ -166,7 +173,7 @@ class Validation:
                 f"  {quantity}: {before} {shown} before, {after} {shown} after calibration "
                 f"(noise floor {floor} {shown})"
             )
-        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
+        return lines
 
     __repr__ = __str__
 
@@ -215,10 +222,14 @@ def validate(
 
     Raises
     ------
-    DataError : the data belong to another robot, contain no row, or every pose is unreachable.
+    ArgumentTypeError, DataError : an argument of another type, a limit below 0; the data belong to
+        another robot, contain no row, or every pose is unreachable.
     """
+    check_argument(fit, "fit", Identification, Mechanism)
+    check_argument(data, "data", Measurements)
+    check_limit("limit_position", limit_position)
+    check_limit("limit_angle", limit_angle)
     robot = fit.robot if isinstance(fit, Identification) else fit
-    check_types(robot, data)
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
     values_before, values = _choose_setup(fit, before, nuisance_values_before, nuisance_values)

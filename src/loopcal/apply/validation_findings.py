@@ -17,6 +17,7 @@ from loopcal.diagnose import (
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
+from loopcal.measure.array_checks import check_number
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray
 from loopcal.units import Dimension, Unit
@@ -115,6 +116,15 @@ def report_moved_setup(
     if moved is None:
         return []
     return [report_finding("validation.setup-moved", names=moved.names, times=moved.times)]
+
+
+def check_limit(name: str, limit: float | None) -> None:
+    """Refuse a limit that is no number, or below 0: no error could keep it, or exceed it."""
+    if limit is None:
+        return
+    check_number(limit, name, "a number of metres or radians, 0 or more")
+    if not limit >= 0.0:
+        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
 
 
 def check_limits(

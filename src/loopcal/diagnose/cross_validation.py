@@ -25,7 +25,7 @@ from loopcal.diagnose.prediction_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adapt_method
@@ -149,6 +149,7 @@ def cross_validate(
         As `draw_folds` and `identify`; or the options have nuisance parameters, which belong to all
         rows together.
     """
+    check_types(robot, data)
     options = merge_options(options, method)
     if options.nuisance is not None:
         raise EstimationError(

@@ -14,7 +14,7 @@ import numpy as np
 
 from loopcal.diagnose.frame_motions import interpret_combinations
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_input import check_types
+from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import (
     Combination,
@@ -25,7 +25,6 @@ from loopcal.estimate.inference.null_space import (
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
-from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, decompose
 from loopcal.serialization import json_fields
@@ -264,11 +263,13 @@ def identifiability(
     MechanismError
         Poses are to be drawn, but the robot states no workspace.
     """
+    check_argument(robot, "robot", Mechanism)
+    if not 0.0 < rank_tolerance < 1.0:
+        raise EstimationError(f"rank_tolerance is {rank_tolerance}; it must be above 0 and below 1")
     if isinstance(data, Instrument):
-        check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
         coordinates = sample_workspace(robot, poses, seed).coordinates
         data = simulate(robot, coordinates, data, seed=0, controller=robot)
-    check_types(robot, data)
+    check_argument(data, "data", Measurements)
     check_actuators(data, robot)
     free = select_free_parameters(robot)
     if not len(free):
@@ -276,6 +277,10 @@ def identifiability(
         finding = report_finding("fit.no-free-parameter", robot=robot.name, total=total)
         raise EstimationError(finding)
     count = count_equations(robot, data)
+    if not count and data.n_rows:
+        raise EstimationError(
+            report_finding("fit.no-equation-left", poses=data.n_poses, unknowns=len(free))
+        )
     if not count:
         raise EstimationError(report_finding("fit.no-measured-value"))
     factor, reached = collect_information(free, data)

@@ -26,6 +26,7 @@ import numpy as np
 from loopcal.diagnose.cross_validation import CrossValidation, cross_validate
 from loopcal.diagnose.identifiable_parameters import Identifiability
 from loopcal.errors import EstimationError
+from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import NEGLIGIBLE
 from loopcal.estimate.methods.penalties import Method
@@ -33,6 +34,7 @@ from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.measure import Measurements
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import LinearMap, Mechanism
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
@@ -200,6 +202,9 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
 
     The result has as many free parameters as the rank, and does not depend on the machine.
     """
+    check_type(
+        identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
+    )
     free, null = identifiability.free_parameters, identifiability.null_space()
     places = _choose_fixed(free, null)
     kept = np.setdiff1d(np.arange(len(free)), places)
@@ -260,6 +265,7 @@ def choose_model(
         The sets are not nested. A set that the data cannot determine by this method is refused as
         by `identify`.
     """
+    check_types(robot, data)
     nested = nest_parameter_sets(robot) if nested is None else nested
     named = [(NOTHING, ()), *((name, tuple(names)) for name, names in nested.items())]
     for (small, inner), (large, outer) in pairwise(named):

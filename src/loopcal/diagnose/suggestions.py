@@ -35,6 +35,7 @@ from loopcal.measure import (
     Observations,
     Sensor,
 )
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -123,6 +124,9 @@ def suggest_measurements(
     -------
     One suggestion for each of `identifiability.unidentifiable`, in order.
     """
+    check_type(
+        identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
+    )
     combinations, factor = identifiability.unidentifiable, identifiability.factor
     if not combinations:
         return ()

@@ -16,7 +16,7 @@ from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.descent import StepControl
 from loopcal.measure import NuisanceParameters
-from loopcal.measure.array_checks import check_type
+from loopcal.measure.array_checks import check_number, check_type, describe
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray
 
@@ -90,6 +90,11 @@ class FitOptions:
             )
         if self.prior is not None:
             check_type(self.prior, Prior, "prior", "as from prior_from(fit.posterior)")
+        check_type(self.control, StepControl, "control", "such as StepControl(iterations=100)")
+        if self.nuisance is not None:
+            wanted = "such as measurements.nuisance_parameters"
+            check_type(self.nuisance, NuisanceParameters, "nuisance", wanted)
+        check_number(self.rank_tolerance, "rank_tolerance", "a number above 0 and below 1")
         if not 0.0 < self.rank_tolerance < 1.0:
             raise EstimationError(
                 f"rank_tolerance is {self.rank_tolerance}; it must be above 0 and below 1"
@@ -98,7 +103,13 @@ class FitOptions:
             self, "excluded_poses", check_labels("excluded_poses", self.excluded_poses)
         )
         if self.start is not None:
-            start = np.array(self.start, dtype=np.float64)
+            try:
+                start = np.array(self.start, dtype=np.float64)
+            except (TypeError, ValueError):
+                raise ArgumentTypeError(
+                    f"start: got {describe(self.start)}; give an array of values, such as "
+                    "robot.values"
+                ) from None
             start.setflags(write=False)
             object.__setattr__(self, "start", start)
 
@@ -137,7 +148,10 @@ def check_labels(option: str, labels: Sequence[str]) -> tuple[str, ...]:
         raise ArgumentTypeError(
             f"{option} is the text {labels!r}; give a sequence of labels, such as [{labels!r}]"
         )
-    return tuple(labels)
+    given = tuple(labels)
+    for label in given:
+        check_type(label, str, option, f"the label of a pose, such as '{label}'")
+    return given
 
 
 def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

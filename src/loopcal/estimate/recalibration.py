@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.inference.posterior import Posterior
@@ -110,6 +111,7 @@ def recalibrate(
     EstimationError : an unknown limb, other parameters, an earlier calibration without uncertainty,
         or options with another method, a loss or a prior.
     """
+    check_types(robot, data)
     options = _check_options(merge_options(options))
     prior = prior_from(earlier)
     _check_names(robot, prior)

@@ -2,6 +2,7 @@
 """Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
 
 from collections.abc import Iterable, Sequence
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,6 +108,20 @@ def check_type(value: object, wanted: type, what: str, hint: str) -> None:
     accepted = (float, int) if wanted is float else wanted
     if not isinstance(value, accepted):
         raise ArgumentTypeError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
+
+
+def check_number(value: object, what: str, allowed: str) -> None:
+    """Raise an ArgumentTypeError that says what is allowed unless a value is a number."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise ArgumentTypeError(f"{what}: got {describe(value)}; give {allowed}")
+
+
+def check_seed(seed: object) -> None:
+    """Raise an error unless the seed of a random stream is a whole number, 0 or more."""
+    if not isinstance(seed, Integral):
+        raise ArgumentTypeError(f"seed: got {describe(seed)}; give a whole number, 0 or more")
+    if seed < 0:
+        raise DataError(f"seed is {seed}; give a whole number, 0 or more")
 
 
 def set_fields(instance: object, **values: object) -> None:

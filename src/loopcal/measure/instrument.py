@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
+from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
 from loopcal.measure.kinds import Kind
 from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism import Mechanism
@@ -102,6 +102,7 @@ def make_random_stream(seed: int, trial: int, purpose: int = 0) -> np.random.Gen
     -------
     generator : numpy.random.Generator
     """
+    check_seed(seed)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(trial, purpose)))
 
 

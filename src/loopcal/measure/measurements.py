@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
+from loopcal.measure.array_checks import (
+    check_array,
+    check_number,
+    check_seed,
+    check_type,
+    describe,
+    set_fields,
+)
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
@@ -187,6 +194,8 @@ class Measurements:
         DataError
             If the share is not between 0 and 1, or all poses are in one block.
         """
+        check_number(hold_out, "hold_out", "the share of the poses that is not fitted")
+        check_seed(seed)
         if not 0.0 < hold_out < 1.0:
             raise DataError(
                 f"cannot hold out a share of {hold_out}; give the share of the poses that is not "

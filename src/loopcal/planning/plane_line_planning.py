@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.fit_input import check_argument
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Gaussian, Instrument, Line, Plane, Sensor
 from loopcal.mechanism import POSITION, Mechanism, inverse
@@ -189,6 +190,7 @@ def plan_surfaces(
         Fewer equations than the groups can determine unknowns, too few points, or no group that
         satisfies the constraints.
     """
+    check_argument(robot, "robot", Mechanism)
     options = options or SurfaceOptions()
     groups = PlaneLineGroups(robot, options.points, options.sigma)
     checker = build_checker(robot, options.constraints)

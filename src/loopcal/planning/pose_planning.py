@@ -15,7 +15,6 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument
-from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.planning.design import (
     A,
@@ -81,8 +80,6 @@ def plan(
     MechanismError
         The constraints exclude the whole workspace.
     """
-    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
-    check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
     if n_poses is not None:
         options = replace(options, n_poses=n_poses)

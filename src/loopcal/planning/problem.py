@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.findings import report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.planning.candidates import Candidates, check_listed_poses, draw_candidates
@@ -220,7 +222,10 @@ def prepare_problem(
     MechanismError, DataError
         See `draw_candidates`, `linearize_candidate_groups`.
     """
+    check_argument(robot, "robot", Mechanism)
+    check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
+    check_type(options, PlanOptions, "options", "such as PlanOptions(n_poses=30)")
     free = select_free_parameters(robot)
     if not len(free):
         raise EstimationError(report_finding("plan.no-free-parameter", robot=robot.name))

@@ -89,6 +89,10 @@ def calibrate(
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
     if not split.fitted.n_rows:
         raise DataError("the data hold no measured value; fill in what the instrument showed")
+    if split.held_out is not None and not split.held_out.n_rows:
+        raise DataError(
+            "the held-out poses have no measured value, or are excluded; hold out other poses"
+        )
     result = _fit(robot, split.fitted, options, count)
     return _report(result, split, conventions, options, count)
 

@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from loopcal.apply.validation_findings import check_limit
 from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, Posterior
+from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_type
+from loopcal.measure.array_checks import check_number, check_seed, check_type
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ class CalibrationOptions:
     allow_still: bool = False
 
     def __post_init__(self) -> None:
-        check_type(self.hold_out, float, "hold_out", "such as 0.25")
+        check_type(self.fit, FitOptions, "fit", "such as FitOptions(method=MAP())")
+        check_number(self.hold_out, "hold_out", "a share of the poses, from 0 to below 1")
+        check_seed(self.seed)
         if not 0.0 <= self.hold_out < 1.0:
             raise DataError(
                 f"hold_out is {self.hold_out}; it is a share of the poses, from 0 to below 1"
@@ -60,6 +64,8 @@ class CalibrationOptions:
                 f"hold_out is {self.hold_out} and held_out names {len(self.held_out)} poses; give "
                 "one of the two"
             )
+        check_limit("limit_position", self.limit_position)
+        check_limit("limit_angle", self.limit_angle)
         has_limit = self.limit_position is not None or self.limit_angle is not None
         if has_limit and not self.hold_out and not self.held_out:
             raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
@@ -69,7 +75,8 @@ class CalibrationOptions:
             self._check_prior()
 
     def _check_prior(self) -> None:
-        """Refuse options that cannot be combined with an earlier calibration."""
+        """Refuse what is no earlier calibration, and options that cannot be combined with it."""
+        check_argument(self.prior, "prior", Posterior)
         chosen = {
             "method": self.fit.method is not None,
             "loss": self.fit.loss is not None,

@@ -31,6 +31,9 @@ from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
 TOP = 3
 """Findings that a summary shows."""
 
+FITTED_ERRORS = "Errors on the fitted poses (rms), which are optimistic:"
+"""Heading of the errors where no pose was held out."""
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -141,7 +144,8 @@ class CalibrationReport:
         errors = self.validation or self.fitted_errors
         lines = [self.headline]
         if errors is not None:
-            lines += str(errors).splitlines()[: 1 + len(errors.quantities)]
+            lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]
+            lines += errors.describe_rms()
         lines += [f"{finding.severity.value}: {finding}" for finding in self.top_findings]
         return "\n".join([*lines, f"Next: {self.next_step}"])
 

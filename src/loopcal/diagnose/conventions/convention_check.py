@@ -38,6 +38,7 @@ from loopcal.diagnose.conventions.selection import (
 )
 from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_contradiction
 from loopcal.errors import DataError
+from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
@@ -140,6 +141,7 @@ def check_conventions(
     DataError
         With the files of the data and the evidence; its code is that of the finding.
     """
+    check_types(robot, data)
     try:
         return _check_conventions(robot, data, allow_still, allow_implausible)
     except DataError as error:
@@ -179,6 +181,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     DataError
         The readings have another number of actuators.
     """
+    check_types(robot, data)
     check_actuators(data, robot)
     free, known = select_free_parameters(robot), _select_known_readings(data)
     if known is None:

@@ -9,6 +9,7 @@ from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_corre
 from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimate_calibration_gain
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit, check_lack_of_fit
+from loopcal.estimate.fit_input import check_fitted_data
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.measure import Measurements
@@ -63,6 +64,7 @@ def examine_fit(
     fit : an identification. data : the measurements it was made from.
     progress : receives the progress of the search for outliers, which takes longest.
     """
+    check_fitted_data(fit, data)
     return FitExamination(
         find_outliers(fit, data, progress=progress),
         check_lack_of_fit(fit, data),

@@ -24,7 +24,7 @@ from loopcal.diagnose.fit_checks.outlier_search import (
     list_suspected_in_turn,
     search_suspects,
 )
-from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
@@ -155,6 +155,7 @@ def find_outliers(
     level : probability of naming any block where none is wrong.
     progress : receives the rounds of the search.
     """
+    check_fitted_data(fit, data)
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     problem = problem_of(fit.free_parameters, data)
     numbers, member = np.unique(linked_blocks(data), return_inverse=True)

@@ -23,6 +23,7 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.problem import Problem
 from loopcal.findings import report_finding
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray, IntArray
@@ -158,6 +159,7 @@ def prior_from(earlier: Posterior) -> Prior:
     ------
     EstimationError : the earlier calibration has no intervals.
     """
+    check_type(earlier, Posterior, "earlier", "as identify(robot, data).posterior")
     if np.isnan(earlier.variance).any():
         raise EstimationError(report_finding("prior.no-uncertainty"))
     known = np.isfinite(earlier.variance)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Protocol, Self
 
 import numpy as np
@@ -19,6 +20,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
+from loopcal.measure.array_checks import check_number, check_type
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
@@ -118,11 +120,14 @@ class StepControl:
     damping: float = 0.0
 
     def __post_init__(self) -> None:
+        check_type(self.iterations, Integral, "iterations", "a whole number, 0 or more")
         for name in ("relative", "absolute"):
+            check_number(getattr(self, name), name, "a finite number above 0")
             if not 0.0 < getattr(self, name) < np.inf:
                 raise EstimationError(
                     f"{name} is {getattr(self, name)}; give a finite number above 0"
                 )
+        check_number(self.damping, "damping", "0 or a finite number above it")
         if self.iterations < 0:
             raise EstimationError(f"iterations is {self.iterations}; give 0 or more")
         if not 0.0 <= self.damping < np.inf:

@@ -154,9 +154,11 @@ def sample_workspace(
     Raises
     ------
     MechanismError
-        The robot states no range for a controlled coordinate, or almost nothing of its workspace
-        can be reached.
+        n is below 1, the robot states no range for a controlled coordinate, or almost nothing of
+        its workspace can be reached.
     """
+    if n < 1:
+        raise MechanismError(f"{n} positions to draw; give 1 or more")
     rng = np.random.default_rng(seed)
     wanted = workspace_ranges(robot)
     rejected: Counter[str] = Counter()
