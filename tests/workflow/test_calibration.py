@@ -85,7 +85,10 @@ def test_parts_of_a_report_and_its_run_folder_print_on_a_screen(report, tmp_path
     [
         (lambda robot, data: lc.identifiability(data, robot), "robot: got a Measurements"),
         (lambda robot, _data: lc.identifiability(robot, "data.csv"), "data: got the text"),
-        (lambda _robot, data: lc.validate("run", data), "robot: got the text 'run'"),
+        (
+            lambda _robot, data: lc.validate("run", data),
+            "fit: got the text 'run'; give Identification",
+        ),
         (lambda robot, _data: lc.plan(robot, "position"), "instrument: got the text 'position'"),
         (lambda _robot, _data: lc.CalibrationOptions(hold_out="0.25"), "hold_out: got the text"),
         (lambda _robot, _data: lc.load_robot(3), "not int; pass text or a Path"),
