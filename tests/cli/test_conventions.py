@@ -79,7 +79,7 @@ def test_wrong_length_unit_is_refused_without_allow_implausible(folder_and_run) 
 def test_target_that_never_moves_is_refused_without_allow_still(folder_and_run) -> None:
     folder, run = folder_and_run
 
-    def frozen(text: str) -> str:
+    def freeze_target(text: str) -> str:
         lines = text.splitlines()
         first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
         tail = lines[first].split(",")[7:]
@@ -93,7 +93,7 @@ def test_target_that_never_moves_is_refused_without_allow_still(folder_and_run) 
             + "\n"
         )
 
-    write_simulated_data(folder / "data.csv", Pose(), change=frozen)
+    write_simulated_data(folder / "data.csv", Pose(), change=freeze_target)
     code, out, err = run("calibrate hexapod-42 data.csv -o run")
     assert (code, out) == (1, "")
     assert "'pose' of kind 'pose' never moves: its readings stay within 0" in err
@@ -146,7 +146,7 @@ def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(folde
     write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
     text = (folder / "data.csv").read_text()
 
-    def said(statement: str) -> tuple[int, str, str]:
+    def run_with_statement(statement: str) -> tuple[int, str, str]:
         (folder / "stated.csv").write_text(f"# unknowns: {{{statement}}}\n{text}")
         return run("identifiability hexapod-42 stated.csv")
 
@@ -157,14 +157,14 @@ def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(folde
         ),
         ("frame.x: fixed", "not at 0 mm (fixed)"),
     ):
-        code, out, err = said(statement)
+        code, out, err = run_with_statement(statement)
         assert (code, out) == (1, "")
         assert err.startswith("loopcal: stated.csv: ")
         assert "frame.x at " in err
         assert shown in " ".join(err.split())
         assert "--allow-implausible" in err
-    assert said("frame.x: {start: 101 mm, sd: 1 mm}")[0] == 0
-    code, out, err = said(
+    assert run_with_statement("frame.x: {start: 101 mm, sd: 1 mm}")[0] == 0
+    code, out, err = run_with_statement(
         "frame.x: {start: 105 mm, sd: 10 um}"
     )  # noted: a robot far off its tolerances shows the same
     assert code == 0

@@ -66,6 +66,7 @@ def test_every_suggestion_has_a_known_kind_and_lowers_the_uncertainty():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     before = {v.name: v.left for v in found.parameters}
     (remedy,) = suggest_measurements(found)
+    assert remedy.measurements
     for cure in remedy.measurements:
         assert cure.kind in KINDS
         assert cure.left < before[remedy.combination.names[0]]

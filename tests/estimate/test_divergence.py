@@ -11,7 +11,7 @@ from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.inference.prior import prior_from
 from loopcal.estimate.minimization.descent import StepControl
 from tests.estimate.problems import hexapod, hexapod_data
-from tests.findings.reported import codes_of, one_of, refused
+from tests.findings.expectations import expect_refusal, get_finding, list_codes
 
 ONE_STEP = StepControl(iterations=1)
 
@@ -29,7 +29,7 @@ def test_fit_without_convergence_has_no_noise_test_and_no_intervals(method, nois
         assert np.isnan(fit.interval()).all()
         assert np.isnan(fit.residual_test.p_value)
         assert not fit.residual_test.failed
-        codes = codes_of(fit.findings)
+        codes = list_codes(fit.findings)
         assert {"fit.out-of-iterations", "noise.not-tested"} <= codes
         assert not {code for code in codes if code.startswith("noise.")} - {"noise.not-tested"}
         assert bool(codes & {"fit.no-prior", "fit.beyond-tolerance"}) == (method == LeastSquares())
@@ -38,7 +38,7 @@ def test_fit_without_convergence_has_no_noise_test_and_no_intervals(method, nois
 
 
 def test_fit_without_convergence_cannot_be_a_prior():
-    with refused("prior.no-uncertainty"):
+    with expect_refusal("prior.no-uncertainty"):
         prior_from(
             identify(hexapod(), hexapod_data(12), options=FitOptions(control=ONE_STEP)).posterior
         )
@@ -54,8 +54,8 @@ def test_estimate_far_outside_its_tolerance_is_reported():
     wrong = replace(robot, parameters=replace(robot.parameters, entries=tuple(entries)))
     fit = identify(wrong, data, LeastSquares())
     assert fit.converged
-    far = one_of(fit.findings, "fit.beyond-tolerance")
+    far = get_finding(fit.findings, "fit.beyond-tolerance")
     assert far.data["names"][0] == "leg1.length"
     assert far.data["factor"] > 10.0
     calm = identify(robot, data, LeastSquares()).findings + identify(wrong, data, MAP()).findings
-    assert "fit.beyond-tolerance" not in codes_of(calm)
+    assert "fit.beyond-tolerance" not in list_codes(calm)

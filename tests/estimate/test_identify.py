@@ -35,7 +35,7 @@ from tests.estimate.problems import (
     tracker,
     with_tolerance,
 )
-from tests.findings.reported import codes_of, one_of, refused
+from tests.findings.expectations import expect_refusal, get_finding, list_codes
 
 MM = 1e-3
 
@@ -96,13 +96,15 @@ def test_closure_start_is_not_used_for_incomplete_poses():
     a = identify(hexapod(), heights, MAP())
     b = identify(hexapod(), heights, MAP(), options=FitOptions(begin="closure"))
     assert np.array_equal(a.estimate, b.estimate)
-    assert codes_of(b.findings) - codes_of(a.findings) == {"poses.closure-start-incomplete-poses"}
+    assert list_codes(b.findings) - list_codes(a.findings) == {
+        "poses.closure-start-incomplete-poses"
+    }
 
 
 def test_closure_start_is_not_used_for_uncertain_readings(data):
     few = replace(data.take(np.arange(10)), reading_sigma=2e-6)
     fit = identify(hexapod(), few, MAP(), options=FitOptions(begin="closure"))
-    assert "poses.closure-start-uncertain-readings" in codes_of(fit.findings)
+    assert "poses.closure-start-uncertain-readings" in list_codes(fit.findings)
 
 
 def test_weight_zero_equals_removing_the_poses(data):
@@ -198,7 +200,7 @@ def test_unidentifiable_combination_is_named_and_has_infinite_uncertainty():
     assert {
         n for n, sd in zip(fit.names, fit.standard_deviations, strict=True) if np.isinf(sd)
     } == set(turn.names)
-    assert one_of(fit.findings, "fit.unidentifiable").data["names"] == turn.names
+    assert get_finding(fit.findings, "fit.unidentifiable").data["names"] == turn.names
     assert np.isnan(
         fit.covariance[np.isinf(fit.standard_deviations)][:, np.isfinite(fit.standard_deviations)]
     ).all()
@@ -218,15 +220,17 @@ def test_unidentifiable_combination_is_named_and_has_infinite_uncertainty():
 
 def test_assumed_tolerances_are_reported(data):
     fit = identify(zoo.hexapod(), data, LeastSquares())
-    assumed = one_of(fit.findings, "fit.default-tolerances").data
+    assumed = get_finding(fit.findings, "fit.default-tolerances").data
     assert (assumed["count"], assumed["total"]) == (42, 42)
     stated = identify(hexapod(), data, LeastSquares()).findings
-    assert "fit.default-tolerances" not in codes_of(stated)
+    assert "fit.default-tolerances" not in list_codes(stated)
 
 
 def test_too_few_equations_are_refused_without_a_prior_or_the_option(data):
     few = data.take(np.arange(5))
-    with refused("fit.too-few-equations", equations=30, poses=5, unknowns=42, poses_needed=7):
+    with expect_refusal(
+        "fit.too-few-equations", equations=30, poses=5, unknowns=42, poses_needed=7
+    ):
         identify(hexapod(), few, LeastSquares())
     forced = identify(
         hexapod(), few, LeastSquares(), options=FitOptions(allow_fewer_equations=True)
@@ -247,7 +251,7 @@ def test_few_degrees_of_freedom_give_intervals_only_with_given_sigma():
         identify(some, data, LeastSquares()),
     )
     assert estimated.residual_test.dof == 1
-    few = one_of(estimated.findings, "noise.too-few-degrees")
+    few = get_finding(estimated.findings, "noise.too-few-degrees")
     assert few.data["dof"] == 1
     assert np.isnan(estimated.standard_deviations).all()
     assert np.isfinite(given.standard_deviations).all()
@@ -277,7 +281,7 @@ def test_unreachable_poses_are_refused_by_name_unless_their_weight_is_zero(data)
     readings = data.readings.copy()
     readings[4] = -0.2  # [m]
     broken = replace(data, readings=readings)
-    with refused("fit.poses-out-of-reach", count=1, total=30, poses=("5",)):
+    with expect_refusal("fit.poses-out-of-reach", count=1, total=30, poses=("5",)):
         identify(hexapod(), broken, LeastSquares())
     weight = np.ones(30)
     weight[4] = 0.0
@@ -305,10 +309,10 @@ def test_distant_start_converges_to_the_same_estimate(data, fit):
 
 
 def test_missing_rows_missing_parameters_and_unknown_noise_are_refused(data):
-    with refused("fit.no-measured-value"):
+    with expect_refusal("fit.no-measured-value"):
         identify(hexapod(), data.with_weights(np.zeros(30)), LeastSquares())
     fixed = replace(hexapod(), parameters=hexapod().parameters.with_free([]))
-    with refused("fit.no-free-parameter", total=42):
+    with expect_refusal("fit.no-free-parameter", total=42):
         identify(fixed, data, LeastSquares())
     with pytest.raises(EstimationError, match="'given' or 'estimated'"):
         identify(hexapod(), data, LeastSquares(), options=FitOptions(noise="guessed"))  # pyright: ignore[reportArgumentType]

@@ -20,7 +20,7 @@ from loopcal.estimate import (
 )
 from loopcal.measure import sample_truth, simulate_trials
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracker
-from tests.findings.reported import one_of, refused
+from tests.findings.expectations import expect_refusal, get_finding
 
 
 @pytest.mark.parametrize(
@@ -62,13 +62,13 @@ def test_huge_measured_value_is_refused_with_its_pose() -> None:
     (pose,) = data.observations
     values = pose.measured.copy()
     values[3, 5] = 1e300
-    with refused("fit.residuals-not-finite", poses=(data.labels[3],)):
+    with expect_refusal("fit.residuals-not-finite", poses=(data.labels[3],)):
         identify(hexapod(), replace(data, observations=(replace(pose, measured=values),)))
 
 
 def test_directions_determined_by_tolerances_alone_are_counted() -> None:
     fit = identify(hexapod(), hexapod_data(5))
-    few = one_of(fit.findings, "fit.few-equations")
+    few = get_finding(fit.findings, "fit.few-equations")
     assert few.data == {"equations": 30, "parameters": 42, "directions": 12}
 
 

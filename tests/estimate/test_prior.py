@@ -16,7 +16,7 @@ from loopcal.measure import simulate
 from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 
 LEG3 = slice(14, 21)
 
@@ -159,12 +159,12 @@ def test_posterior_of_another_robot_or_without_uncertainty_is_refused():
     fixed = replace(
         hexapod(), parameters=ParameterTable((replace(entries[0], free=False), *entries[1:]))
     )
-    with refused("prior.other-parameters", name="leg1.base.x", place="the earlier run"):
+    with expect_refusal("prior.other-parameters", name="leg1.base.x", place="the earlier run"):
         recalibrate(fixed, hexapod_data(20, seed=2), first.posterior)
     with pytest.raises(EstimationError, match=r"no limb 'leg33' .*\(did you mean 'leg3'"):
         recalibrate(hexapod(), hexapod_data(20, seed=2), first.posterior, "leg33")
     unsure = replace(first.posterior, variance=np.full(42, np.nan))
-    with refused("prior.no-uncertainty"):
+    with expect_refusal("prior.no-uncertainty"):
         prior_from(unsure)
-    with refused("prior.no-posterior"):
+    with expect_refusal("prior.no-posterior"):
         posterior_from_arrays(first.robot, {})

@@ -29,7 +29,7 @@ from tests.estimate.problems import (
     tracker,
     with_tolerance,
 )
-from tests.findings.reported import one_of, refused
+from tests.findings.expectations import expect_refusal, get_finding
 
 COARSE_TRACKER = tracker(20e-6, 100e-6)  # a prior of 35 um matters to an instrument this poor
 
@@ -85,7 +85,7 @@ def test_narrow_tolerances_are_reported_and_inflated_by_the_default_method(narro
         assert conflict.inflation > 1.5
         assert conflict.finding.code == "prior.tolerances-inflated"
     held = identify(believed, measured.trial(0), MAP())
-    narrow_prior = one_of(held.findings, "prior.tolerances-too-narrow")
+    narrow_prior = get_finding(held.findings, "prior.tolerances-too-narrow")
     assert narrow_prior.data["ratio"] > 1.5
 
     def error(method):
@@ -127,7 +127,7 @@ def test_default_method_without_tolerances_is_least_squares():
     a, b = identify(zoo.hexapod(), data), identify(zoo.hexapod(), data, LeastSquares())
     np.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=1e-14)
     np.testing.assert_allclose(a.standard_deviations, b.standard_deviations, rtol=1e-9)
-    with refused("fit.too-few-equations", unknowns=42, has_prior=False):
+    with expect_refusal("fit.too-few-equations", unknowns=42, has_prior=False):
         identify(zoo.hexapod(), data.take(np.arange(5)))
 
 

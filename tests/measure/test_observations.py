@@ -15,14 +15,14 @@ POINT = Component(("x", "y", "z"), T_platform_tool=np.eye(4))
 POSE = Pose(T_platform_tool=np.eye(4))
 
 
-def covariances(r, m, seed=0):
+def draw_covariances(r, m, seed=0):
     A = np.random.default_rng(seed).normal(size=(r, m, m))
     scale = 10.0 ** np.linspace(-6, -3, m)  # mixed units: micrometres beside millimetres
     return (A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(m)) * np.outer(scale, scale)
 
 
 def test_whitener_is_the_inverse_lower_cholesky_factor():
-    C = covariances(20, 6)
+    C = draw_covariances(20, 6)
     data = Observations(POSE, np.arange(20), np.zeros((20, 6)), C)
     W = data.whitener
     expected = np.tril(np.linalg.inv(np.linalg.cholesky(C)))
@@ -36,7 +36,7 @@ def test_whitener_is_the_inverse_lower_cholesky_factor():
 @given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(0, 1000))
 def test_missing_components_are_removed_from_the_covariance(is_present, seed):
     present = np.flatnonzero(is_present)
-    C = covariances(1, 3, seed)
+    C = draw_covariances(1, 3, seed)
     measured = np.where(is_present, np.random.default_rng(seed).normal(size=3), np.nan)[None]
     data = Observations(POINT, np.array([0]), measured, C)
     T = geometry.apply_twist(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
@@ -53,7 +53,7 @@ def test_missing_components_are_removed_from_the_covariance(is_present, seed):
 
 
 def test_covariance_entries_of_missing_components_are_ignored():
-    C = covariances(1, 3)
+    C = draw_covariances(1, 3)
     measured = np.array([[1.0, np.nan, 2.0]])
     broken = C.copy()
     broken[:, 1, :] = broken[:, :, 1] = np.nan
@@ -62,7 +62,7 @@ def test_covariance_entries_of_missing_components_are_ignored():
 
 
 def test_weight_multiplies_the_square_and_zero_removes_a_row():
-    C = covariances(3, 3)
+    C = draw_covariances(3, 3)
     one = Observations(POINT, np.arange(3), np.zeros((3, 3)), C)
     weighed = one.with_weights([1.0, 0.25, 0.0])
     assert_allclose(

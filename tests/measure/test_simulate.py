@@ -81,7 +81,9 @@ def test_nominal_machine_is_measured_at_the_commanded_poses_within_noise(robot):
 
 def test_true_machine_is_measured_at_the_poses_of_its_geometry(robot, truth):
     trials = simulate_trials(robot, truth.values, COMMANDED, TRACKER, seed=1)
-    white = (trials.trial(0).observations[0].whitener @ _residual(trials)[..., None])[..., 0]
+    white = (trials.trial(0).observations[0].whitener @ _evaluate_first_sensor(trials)[..., None])[
+        ..., 0
+    ]
     assert np.abs(white).max() < 5.0
     moved = geometry.pose_difference(trials.T[0], COMMANDED)
     assert np.abs(moved[:, 3:]).max() > 20 * SIGMA[-1]
@@ -89,7 +91,7 @@ def test_true_machine_is_measured_at_the_poses_of_its_geometry(robot, truth):
     assert_allclose(inverse(truth, trials.T[0]).q, trials.readings, atol=1e-12)
 
 
-def _residual(trials):
+def _evaluate_first_sensor(trials):
     return trials.trial(0).observations[0].evaluate(trials.T[:1]).residual[0]
 
 

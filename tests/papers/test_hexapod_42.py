@@ -139,16 +139,21 @@ def test_table_6_contains_residuals_and_a_common_shift_leaves_none(results) -> N
     legs = LegForm.at(study.truth, forward(study.truth, study.commanded.q, study.commanded))
     actual = compute_actual_poses(study)
 
-    def explained(errors: np.ndarray) -> np.ndarray:
+    def compute_explained_share(errors: np.ndarray) -> np.ndarray:
         return legs.explain(to_twists(errors, actual, study.order))
 
     printed = results.printed.pose_errors_after.values * np.array([MM] * 3 + [1.0] * 3)
-    assert explained(printed).max() < 0.1
-    assert explained(np.random.default_rng(0).normal(size=(10, 6)) * to_si(PRESUMED)).mean() > 0.7
+    assert compute_explained_share(printed).max() < 0.1
+    assert (
+        compute_explained_share(
+            np.random.default_rng(0).normal(size=(10, 6)) * to_si(PRESUMED)
+        ).mean()
+        > 0.7
+    )
     offset = recover_noise(results).mean(axis=0)
     np.testing.assert_allclose(offset[:3] / MM, [3.1e-5, -1.1e-5, -1.0e-5], atol=1e-6)  # [mm]
     # what is left, 3 % of 3e-5 mm at most in a leg, hides below the residuals
-    assert explained(np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
+    assert compute_explained_share(np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
 
 
 def test_method_of_the_paper_fails_for_the_rounded_poses_of_table_4(results) -> None:

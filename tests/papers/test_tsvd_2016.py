@@ -89,14 +89,16 @@ def compute_identification_matrix(measured: Study) -> np.ndarray:
     nominal, scale = robot.parameters.nominal, list_scales(robot)
     shifts = step * np.diag(scale)
 
-    def seen(values: np.ndarray) -> np.ndarray:
+    def compute_residuals(values: np.ndarray) -> np.ndarray:
         T = forward_trials(robot, values, measured.trials.readings[None], measured.commanded).T
         around = measured.kind.measure(
             measured.commanded.T, np.zeros((1, T.shape[1], 6))
         )  # nominal: phi does not wrap
         return (measured.kind.evaluate(T, around).residual * RAW).reshape(len(values), -1)
 
-    return (seen(nominal + shifts) - seen(nominal - shifts)).T / (2 * step)
+    return (compute_residuals(nominal + shifts) - compute_residuals(nominal - shifts)).T / (
+        2 * step
+    )
 
 
 def test_appendix_1_is_read_as_printed() -> None:

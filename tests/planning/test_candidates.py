@@ -11,7 +11,7 @@ from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import analyze_singularity, check_limits, workspace_ranges
 from loopcal.planning.candidates import check_listed_poses, draw_candidates
 from loopcal.planning.constraints import Constraints, LineOfSight
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 
 STATION = np.array([0.5, -0.3, 0.6])
 
@@ -82,7 +82,7 @@ def test_workspace_without_an_allowed_pose_is_refused_with_the_counts():
     nobody_sees = Constraints(
         sight=LineOfSight(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 1.0]), np.radians(20.0))
     )
-    with refused("plan.workspace-excluded", MechanismError, allowed=0) as data:
+    with expect_refusal("plan.workspace-excluded", MechanismError, allowed=0) as data:
         draw_candidates(load_robot("hexapod-42"), nobody_sees, 200)
     assert "target-faces-away" in {reason["code"] for reason in data["reasons"]}
 
@@ -94,7 +94,7 @@ def test_home_pose_that_violates_a_constraint_is_refused(tmp_path):
         .replace("home: {z: 200}", "home: {z: 200, roll: 10}")
     )
     (tmp_path / "leaning.yaml").write_text(text)
-    with refused("plan.home-excluded", MechanismError) as data:
+    with expect_refusal("plan.home-excluded", MechanismError) as data:
         draw_candidates(
             load_robot(tmp_path / "leaning.yaml"), Constraints(max_tilt=np.radians(5.0)), 50
         )
@@ -109,7 +109,7 @@ def test_listed_poses_outside_the_limits_are_excluded_with_the_reason():
     found = check_listed_poses(robot, poses)
     assert len(found) == 1
     assert any("stroke" in dict(v.data).get("limit", "") for v in found.excluded)
-    with refused("plan.listed-poses-excluded", MechanismError, total=1):
+    with expect_refusal("plan.listed-poses-excluded", MechanismError, total=1):
         check_listed_poses(robot, poses[1:])
 
 

@@ -27,7 +27,7 @@ from tests.planning.design_problems import Array, draw_rows
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 
 
-def pose_rows(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
+def linearize_drawn_poses(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
     """Whitened rows (count, r, p) of poses drawn from a shipped robot's workspace."""
     free = select_free_parameters(load_robot(robot))
     twists = observe_poses(free, sample_workspace(free.robot, count, 0).solution.q).twists[0]
@@ -36,7 +36,7 @@ def pose_rows(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
 
 @pytest.mark.slow
 def test_efficiency_of_20_out_of_1000_hexapod_poses_exceeds_95_percent() -> None:
-    rows = pose_rows("hexapod-42", 1000)
+    rows = linearize_drawn_poses("hexapod-42", 1000)
     start = PriorInformation.none(rows.shape[2])
     found = choose_design(rows, 20, D(), start)
     assert found.relaxed.converged
@@ -56,7 +56,7 @@ def test_efficiency_of_20_out_of_1000_hexapod_poses_exceeds_95_percent() -> None
 def test_certified_design_is_no_worse_than_the_best_of_20_exchange_starts(
     robot: str, components: slice
 ) -> None:
-    rows = pose_rows(robot, 250, components)
+    rows = linearize_drawn_poses(robot, 250, components)
     start = PriorInformation.none(rows.shape[2])
     found = choose_design(rows, 20, D(), start)
     best = fedorov_exchange(rows, 20, D(), start, starts=20)
@@ -70,7 +70,7 @@ def test_tolerance_prior_changes_the_design_only_for_coarse_data() -> None:
     cut, prior = PriorInformation.none(42), PriorInformation.from_tolerances(42)
     kept = []
     for precision in (1.0, 1e3):
-        rows = precision * pose_rows(
+        rows = precision * linearize_drawn_poses(
             "hexapod-42", 150, slice(3, 6)
         )  # position only: three directions that no pose shows
         plain, bayes = (
@@ -148,6 +148,7 @@ def test_evidence_certified_designs_are_no_worse_than_exchange(root: Path) -> No
     best, certified = (
         table["columns"].index(name) for name in ("exchange, best start", "certified design")
     )
+    assert table["rows"]
     for row in table["rows"]:
         assert row[certified] >= row[best] - 1e-6, row  # to a millionth of the efficiency
         assert row[:3] != ["hexapod-42", "full pose", "D"] or row[certified] >= 0.95

@@ -18,7 +18,7 @@ from loopcal.planning.design import (
     evaluate_criterion,
     factor_design,
 )
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import Array, Places, polynomial_rows
 
 LEVELS = [np.linspace(-1.0, 1.0, 5)]
@@ -51,12 +51,14 @@ def test_points_that_start_at_one_place_are_separated() -> None:
 
 
 def test_forbidden_levels_are_never_chosen() -> None:
-    def half(which: Places, x: Array) -> Array:
+    def forbid_left_end(which: Places, x: Array) -> Array:
         rows = parabola(which, x)
         rows[(x[:, 0] < -0.9) & (which % 2 == 0)] = np.nan
         return rows
 
-    found = coordinate_exchange(half, np.full((6, 1), 0.25), LEVELS, D(), PriorInformation.none(3))
+    found = coordinate_exchange(
+        forbid_left_end, np.full((6, 1), 0.25), LEVELS, D(), PriorInformation.none(3)
+    )
     assert (found.design[::2, 0] > -0.9).all()
     assert (found.design[1::2, 0] < -0.9).any()
 
@@ -64,12 +66,12 @@ def test_forbidden_levels_are_never_chosen() -> None:
 def test_rows_of_all_levels_of_a_coordinate_are_evaluated_in_one_call() -> None:
     asked = []
 
-    def counted(which: Places, x: Array) -> Array:
+    def count_rows(which: Places, x: Array) -> Array:
         asked.append(len(which))
         return parabola(which, x)
 
     found = coordinate_exchange(
-        counted, np.linspace(-1, 1, 7)[:, None], LEVELS, D(), PriorInformation.none(3)
+        count_rows, np.linspace(-1, 1, 7)[:, None], LEVELS, D(), PriorInformation.none(3)
     )
     sweeps = len(found.history) - 1
     assert asked[0] == 7
@@ -90,18 +92,20 @@ def test_forbidden_first_design_and_too_few_points_are_refused() -> None:
         coordinate_exchange(
             parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, D(), PriorInformation.none(3)
         )
-    with refused("plan.design-too-small", needed=3):
+    with expect_refusal("plan.design-too-small", needed=3):
         coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, D(), PriorInformation.none(3))
 
 
 def test_design_that_stays_singular_is_refused() -> None:
-    def only_the_first(which: Places, x: Array) -> Array:
+    def fix_all_but_the_first(which: Places, x: Array) -> Array:
         rows = parabola(which, x)
         rows[(which > 0) & (x[:, 0] != 0.0)] = np.nan
         return rows
 
-    with refused("plan.design-singular", unknowns=3):
-        coordinate_exchange(only_the_first, np.zeros((4, 1)), LEVELS, D(), PriorInformation.none(3))
+    with expect_refusal("plan.design-singular", unknowns=3):
+        coordinate_exchange(
+            fix_all_but_the_first, np.zeros((4, 1)), LEVELS, D(), PriorInformation.none(3)
+        )
 
 
 def test_exchange_of_hexapod_poses_halves_the_parameter_uncertainty() -> None:

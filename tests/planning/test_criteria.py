@@ -16,7 +16,7 @@ from loopcal.planning.design import (
     find_observable_space,
 )
 from loopcal.planning.design.design_space import require_enough
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import compute_covariance, draw_rows
 
 CLOSE = 1e-10  # relative: rounding of inverses of well-conditioned 6 x 6 matrices
@@ -119,7 +119,7 @@ def test_design_that_cannot_determine_the_parameters_is_refused(
     n: int, rows: np.ndarray, code: str, data: dict
 ) -> None:
     start = PriorInformation.none(4, rows.shape[2] - 4)
-    with refused(code, **data):
+    with expect_refusal(code, **data):
         require_enough(n, rows, start, find_observable_space(rows, start), repeats=False)
 
 

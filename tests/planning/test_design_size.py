@@ -10,7 +10,7 @@ from loopcal.planning.design.certified_design import (
     find_smallest_design,
     search_size,
 )
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import draw_rows, polynomial_rows
 
 PARABOLA = polynomial_rows(np.linspace(-1, 1, 21), 2)
@@ -57,9 +57,9 @@ def test_earlier_measurements_reduce_the_design_size() -> None:
 
 
 def test_unreachable_target_is_refused_with_the_largest_possible_size() -> None:
-    with refused("plan.target-impossible", size=12, available=12, target=0.001):
+    with expect_refusal("plan.target-impossible", size=12, available=12, target=0.001):
         find_smallest_design(draw_rows(), 0.001, A(), PriorInformation.none(4))
-    with refused("plan.target-impossible", size=5, available=12):
+    with expect_refusal("plan.target-impossible", size=5, available=12):
         find_smallest_design(draw_rows(), 0.2, A(), PriorInformation.none(4), most=5)
 
 

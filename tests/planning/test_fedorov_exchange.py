@@ -19,7 +19,7 @@ from loopcal.planning.design import (
     factor_design,
     fedorov_exchange,
 )
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import draw_rows, make_grid, polynomial_rows
 
 L = np.random.default_rng(1).normal(size=(9, 4))
@@ -126,7 +126,7 @@ def test_exchange_that_stays_singular_is_refused() -> None:
     rows[3:, 1] = rows[3:, 0]
     rows[4:, :, 2:] = rows[3, :, 2:]
     rows[5, :, 3] += 1.0
-    with refused("plan.design-singular", chosen=2, available=6):
+    with expect_refusal("plan.design-singular", chosen=2, available=6):
         fedorov_exchange(rows, 2, D(), PriorInformation.none(4), starts=3)
 
 

@@ -27,7 +27,7 @@ from loopcal.planning.pose_groups import (
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import prepare_problem
 from loopcal.planning.sample_size import find_sample_size
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 
 UM, URAD = 1e-6, 1e-6
 
@@ -202,7 +202,7 @@ def test_sample_size_reaches_the_goal_and_has_a_lower_bound():
     plan = plan_poses(made)
     assert plan.errors.after.position <= goal
     assert plan.n_poses < 1.5 * needed.at_least
-    with refused("plan.goal-unreachable", target="position", counted="poses") as data:
+    with expect_refusal("plan.goal-unreachable", target="position", counted="poses") as data:
         plan_poses(made.with_options(goal=0.05 * UM))
     assert data["goal"].value < data["bound"].value <= data["best"].value
 
@@ -218,7 +218,7 @@ def test_sample_size_reaches_the_goal_and_has_a_lower_bound():
 def test_impossible_numbers_of_poses_are_refused_with_the_reason(
     tracker_problem, options, code, data
 ):
-    with refused(code, **data):
+    with expect_refusal(code, **data):
         plan_poses(tracker_problem.with_options(**options))
 
 

@@ -16,7 +16,7 @@ from loopcal.planning.plane_line_groups import (
     eliminate_surfaces,
     linearize_surfaces,
 )
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 
 MM = 1e-3
 
@@ -151,7 +151,7 @@ def test_invalid_group_settings_are_refused(robot) -> None:
         given: dict[str, Any] = {"robot": robot, "points": 5, "sigma": MM} | settings
         with pytest.raises(EstimationError, match=words):
             PlaneLineGroups(**given)
-    with refused("plan.surfaces-out-of-reach", points=5):
+    with expect_refusal("plan.surfaces-out-of-reach", points=5):
         PlaneLineGroups(robot, 5, MM, shortest=3.0).draw(1)
 
 

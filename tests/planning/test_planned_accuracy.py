@@ -82,6 +82,7 @@ def test_planned_poses_have_smaller_errors_on_every_robot_at_every_number(tables
 
 @pytest.mark.evidence
 def test_plan_saves_a_quarter_of_the_poses_as_predicted(tables):
+    assert tables["saving"]["rows"]
     for _, _, n, equal, saved, predicted, boundary, *ratios in tables["saving"]["rows"]:
         assert saved > 25.0
         # medians of 100 machines with 9 or more degrees of freedom: 3 % of an error, 6 % of a
@@ -94,6 +95,7 @@ def test_plan_saves_a_quarter_of_the_poses_as_predicted(tables):
 
 @pytest.mark.evidence
 def test_plan_saves_poses_at_any_noise_and_fewer_at_high_noise(tables):
+    assert tables["noise"]["rows"]
     for _, _, n, *numbers in tables["noise"]["rows"]:
         assert min(numbers) > n
         # 3 %: interpolation, and the last percent of efficiency that a plan does not look for

@@ -17,7 +17,7 @@ from loopcal.planning import PlanOptions
 from loopcal.planning.problem import prepare_problem
 from loopcal.planning.result import round_shortfall
 from loopcal.planning.sample_size import find_sample_size
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 
 UM, URAD = 1e-6, 1e-6
 FEW = PlanOptions(n_candidates=20)
@@ -70,7 +70,7 @@ def test_prediction_poses_are_spread_over_a_long_list_of_poses():
 
 @pytest.mark.parametrize("kind", ["locked", "joint", "inclination"])
 def test_instrument_without_information_is_refused(kind):
-    with refused("plan.nothing-observable", kinds=(kind,), parameters=9):
+    with expect_refusal("plan.nothing-observable", kinds=(kind,), parameters=9):
         prepare_problem(load_robot("linear-delta"), build_instrument(kind), FEW)
 
 
@@ -84,7 +84,7 @@ def test_earlier_equations_are_counted_less_their_setup_parameters():
 
 def test_orientation_goal_for_a_robot_without_rotation_is_refused():
     options = replace(FEW, goal=10 * URAD, target="orientation")
-    with refused("plan.target-unobservable", target="orientation", robot="linear-delta"):
+    with expect_refusal("plan.target-unobservable", target="orientation", robot="linear-delta"):
         lc.plan(load_robot("linear-delta"), build_instrument("position"), options=options)
 
 

@@ -16,7 +16,7 @@ from loopcal.planning.design import (
     factor_design,
     relax_design,
 )
-from tests.findings.reported import refused
+from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import Array, draw_rows, make_grid, polynomial_rows
 
 GAP = 1e-7
@@ -136,5 +136,5 @@ def test_forbidden_candidates_have_zero_weight() -> None:
 def test_unobservable_prediction_is_refused() -> None:
     rows = draw_rows()
     rows[:, :, 3] = 0.0
-    with refused("plan.prediction-unobservable"):
+    with expect_refusal("plan.prediction-unobservable"):
         relax_design(rows, 5, I(np.array([[0.0, 0.0, 0.0, 1.0]])), PriorInformation.none(4))

@@ -6,7 +6,7 @@ import pytest
 from tools.check_types import list_incomplete_types
 
 
-def symbol(name, known=True, ambiguous=False, message=None):
+def build_symbol(name, known=True, ambiguous=False, message=None):
     problems = [] if message is None else [{"message": message}]
     return {
         "name": name,
@@ -16,19 +16,19 @@ def symbol(name, known=True, ambiguous=False, message=None):
     }
 
 
-def report(*symbols):
+def build_report(*symbols):
     return {"typeCompleteness": {"symbols": list(symbols)}}
 
 
 def test_complete_types_are_not_reported():
-    assert list_incomplete_types(report(symbol("loopcal.identify"))) == []
+    assert list_incomplete_types(build_report(build_symbol("loopcal.identify"))) == []
 
 
-def test_unknown_and_ambiguous_types_are_reported_with_pyrights_words():
+def test_unknown_and_ambiguous_types_are_reported_with_the_text_of_pyright():
     lines = list_incomplete_types(
-        report(
-            symbol("loopcal.identify", known=False, message='Type of "fit" is\nunknown'),
-            symbol("loopcal.Plan.quality", ambiguous=True),
+        build_report(
+            build_symbol("loopcal.identify", known=False, message='Type of "fit" is\nunknown'),
+            build_symbol("loopcal.Plan.quality", ambiguous=True),
         )
     )
     assert lines == [
@@ -37,10 +37,15 @@ def test_unknown_and_ambiguous_types_are_reported_with_pyrights_words():
     ]
 
 
-def test_types_of_the_program_are_left_to_click():
-    assert list_incomplete_types(report(symbol("loopcal.cli.options.Quantity", known=False))) == []
+def test_types_of_the_command_line_are_not_checked():
+    assert (
+        list_incomplete_types(
+            build_report(build_symbol("loopcal.cli.options.Quantity", known=False))
+        )
+        == []
+    )
 
 
-def test_a_report_without_symbols_is_refused():
+def test_report_without_symbols_is_refused():
     with pytest.raises(ValueError, match="no symbol of loopcal"):
-        list_incomplete_types(report())
+        list_incomplete_types(build_report())

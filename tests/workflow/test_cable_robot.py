@@ -116,7 +116,7 @@ def test_estimate_and_covariance_agree_with_the_reference(fit, reference_fit):
     )  # [mm]
 
 
-def distance_from_published(fit: Identification) -> tuple[np.ndarray, float]:
+def compare_with_published(fit: Identification) -> tuple[np.ndarray, float]:
     """Return published minus estimated anchor coordinates: each divided by its standard deviation
     (12,), and their joint chi-square.
     """
@@ -131,7 +131,7 @@ def test_published_anchors_agree_individually_but_not_jointly(fit, printer):
     """Chi-square of 12 is below 32.9 in 99.9 % of cases; the published anchors belong to another
     model of the spools.
     """
-    each, together = distance_from_published(fit)
+    each, together = compare_with_published(fit)
     assert (
         np.abs(each).max() < 2.0
     )  # the largest of 12 standard normal numbers is below 2.9 in 95 % of cases
@@ -286,7 +286,7 @@ def test_fits_of_the_spool_models_give_the_numbers_of_the_page(fits, root):
         if fit.residual_test.failed:
             assert joint == "-"
         else:
-            assert distance_from_published(fit)[1] == pytest.approx(float(joint), abs=0.6)
+            assert compare_with_published(fit)[1] == pytest.approx(float(joint), abs=0.6)
 
 
 def test_data_support_a_separate_build_up_for_line_d_only(fits):
@@ -297,17 +297,21 @@ def test_data_support_a_separate_build_up_for_line_d_only(fits):
     one of the models.
     """
 
-    def fall(small: Any, large: Any) -> float:
+    def compare_chi_square(small: Any, large: Any) -> float:
         after = fits[large]
         return (fits[small].chi_square - after.chi_square) / (
             after.chi_square / after.residual_test.dof
         )
 
-    assert fall(((), 1), (("ABCD",), 1)) > 200.0
-    assert fall((("ABCD",), 1), (("ABC", "D"), 1)) > 50.0  # D differs
-    assert fall((("ABC", "D"), 1), (tuple("ABCD"), 1)) < 5.99  # A, B and C do not
-    assert fall((("ABC", "D"), 1), (("ABC", "D"), 4)) < 7.81  # nor is a radius for each asked for
-    assert fall((("ABCD",), 4), (("ABC", "D"), 4)) > 10.0  # with a radius for each D differs, too
+    assert compare_chi_square(((), 1), (("ABCD",), 1)) > 200.0
+    assert compare_chi_square((("ABCD",), 1), (("ABC", "D"), 1)) > 50.0  # D differs
+    assert compare_chi_square((("ABC", "D"), 1), (tuple("ABCD"), 1)) < 5.99  # A, B and C do not
+    assert (
+        compare_chi_square((("ABC", "D"), 1), (("ABC", "D"), 4)) < 7.81
+    )  # nor is a radius for each asked for
+    assert (
+        compare_chi_square((("ABCD",), 4), (("ABC", "D"), 4)) > 10.0
+    )  # with a radius for each D differs, too
     shared, own = fits[("ABC", "D"), 1], fits[tuple("ABCD"), 1]
     values, half = (
         {n: v * 1e3 for n, v in zip(shared.names, x, strict=True)}
@@ -329,7 +333,7 @@ def test_data_support_a_separate_build_up_for_line_d_only(fits):
 def test_published_anchors_agree_only_with_one_build_up_and_four_radii(fits):
     """95 % of chi-square of 12 are below 21.0."""
     together = {
-        model: distance_from_published(fit)[1]
+        model: compare_with_published(fit)[1]
         for model, fit in fits.items()
         if not fit.residual_test.failed
     }
@@ -439,7 +443,7 @@ def test_known_positions_at_the_edge_reduce_uncertainty_more_than_high_ones(prin
     assert fit.poses is not None
     at = fit.poses.poses[:, :3, 3]
 
-    def half_of(further: np.ndarray) -> np.ndarray:
+    def predict_intervals(further: np.ndarray) -> np.ndarray:
         cells = np.full((44, 3), np.nan)
         cells[:9], cells[further] = seen.measured, at[further]
         told = Observations.from_sigma(seen.kind, np.arange(44), cells, SIGMA * 1e-3)
@@ -453,9 +457,11 @@ def test_known_positions_at_the_edge_reduce_uncertainty_more_than_high_ones(prin
 
     outermost = 9 + np.argsort(-np.linalg.norm(at[9:, :2], axis=1))[:3]
     highest = 9 + np.argsort(-at[9:, 2])[:3]
-    np.testing.assert_allclose(half_of(outermost), [15.3, 15.4, 15.5, 14.6], rtol=0.02)
-    assert (half_of(outermost) < half_of(highest)).all()
-    np.testing.assert_allclose(half_of(np.arange(9, 44)), [9.5, 9.4, 8.8, 10.9], rtol=0.02)
+    np.testing.assert_allclose(predict_intervals(outermost), [15.3, 15.4, 15.5, 14.6], rtol=0.02)
+    assert (predict_intervals(outermost) < predict_intervals(highest)).all()
+    np.testing.assert_allclose(
+        predict_intervals(np.arange(9, 44)), [9.5, 9.4, 8.8, 10.9], rtol=0.02
+    )
 
 
 def test_truth_of_the_example_lies_within_its_intervals(tmp_path, root):

@@ -94,7 +94,7 @@ def test_parts_of_a_report_and_its_run_folder_print_on_a_screen(report, tmp_path
         (lambda _robot, _data: lc.load_robot(3), "not int; pass text or a Path"),
     ],
 )
-def test_argument_of_the_wrong_type_says_what_to_pass(call, words, report, data):
+def test_wrong_argument_type_of_a_public_function_is_refused(call, words, report, data):
     with pytest.raises(lc.ArgumentTypeError, match=words):
         call(report.robot, data)
 

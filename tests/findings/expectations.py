@@ -13,19 +13,19 @@ from loopcal.errors import EstimationError, LoopcalError
 from loopcal.findings import Finding
 
 
-def codes_of(findings: Iterable[Finding]) -> set[str]:
+def list_codes(findings: Iterable[Finding]) -> set[str]:
     """Return the codes of findings."""
     return {finding.code for finding in findings}
 
 
-def one_of(findings: Iterable[Finding], code: str) -> Finding:
+def get_finding(findings: Iterable[Finding], code: str) -> Finding:
     """Return the only finding with this code."""
     (finding,) = (finding for finding in findings if finding.code == code)
     return finding
 
 
 @contextmanager
-def refused(
+def expect_refusal(
     code: str, error: type[LoopcalError] = EstimationError, **data: object
 ) -> Iterator[dict[str, Any]]:
     """Expect an error made from the finding with this code and, among others, these data.
