@@ -293,3 +293,18 @@ def test_readings_without_a_finite_sigma_leave_no_equation(robot, data) -> None:
     with pytest.raises(lc.EstimationError, match="because the readings are uncertain") as error:
         calibrate(robot, unread)
     assert error.value.code == "fit.no-equation-left"
+
+
+def test_held_out_poses_that_determine_nothing_but_their_own_frames_leave_the_verdict_open(
+    robot, data
+) -> None:
+    rows = data.observations[0]
+    kind = replace(rows.kind, unknown=("frame",))
+    halves = np.where(np.arange(len(rows)) < 32, "first", [f"day{i}" for i in range(len(rows))])
+    moved = replace(data, observations=(replace(rows, kind=kind, session=halves),))
+    options = CalibrationOptions(held_out=data.labels[32:], check_conventions=False)
+    report = calibrate(robot, moved, options)
+    assert report.verdict is Verdict.UNDECIDED
+    (finding,) = [f for f in report.findings if f.code == "workflow.held-out-setup"]
+    assert finding.data == {"values": 48, "setup": 48}
+    assert report.next_step.code == "workflow.next-hold-out-more"

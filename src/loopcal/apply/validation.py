@@ -82,6 +82,7 @@ class Validation:
     findings : limits that are exceeded (failures), and notes.
     alignment : names of frames, targets and surfaces: `kept` from the fit, `fitted` to these rows.
     kinds : prediction errors divided by sigma, of each kind and, last, of all.
+    setup_count : number of setup parameters that were fitted to these rows.
     """
 
     poses: tuple[str, ...]
@@ -100,6 +101,7 @@ class Validation:
         default_factory=lambda: {"kept": (), "fitted": ()}
     )
     kinds: tuple[KindErrors, ...] = ()
+    setup_count: int = 0
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -127,6 +129,13 @@ class Validation:
     def n_judged(self) -> int:
         """Largest number of rows that measure one quantity."""
         return max((self.after.statistics(q).count for q in self.quantities), default=0)
+
+    @property
+    def values_left(self) -> int:
+        """Measured values that are left to check the geometry: all, less one for each setup
+        parameter that was fitted to them. With none left every geometry predicts these rows.
+        """
+        return self.kinds[-1].count - self.setup_count
 
     def improvement(self, index: str = "position", statistic: str = "rms") -> float:
         """Return how many times smaller a statistic of the prediction error became."""
@@ -267,6 +276,7 @@ def validate(
         ),
         alignment=group_setup(compared.after),
         kinds=compute_kind_errors(rows, errors_before, errors_after),
+        setup_count=compared.after.fitted_count,
     )
 
 

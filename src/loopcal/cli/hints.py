@@ -71,6 +71,7 @@ HINTS = {
     "workflow.no-held-out-poses": "use --hold-out 0.25",
     "workflow.undetermined-combinations": "see loopcal identifiability ROBOT DATA",
     "workflow.few-held-out-poses": "use a larger --hold-out, or the column 'use'",
+    "workflow.held-out-setup": "choose them with the column 'use'",
     "workflow.free-limb-needs-prior": "add --prior RUN",
     "workflow.option-excludes-prior": "leave out --method, --loss and --choose-model",
     "workflow.too-few-equations": "use --method map to let the tolerances decide",

@@ -126,6 +126,11 @@ class PosePredictions:
     values: FloatArray
     kept: tuple[str, ...]
 
+    @property
+    def fitted_count(self) -> int:
+        """Number of setup parameters that were fitted to the measurements."""
+        return sum(p.free and p.name not in self.kept for p in self.setup.table.entries)
+
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [

@@ -32,6 +32,7 @@ IMPORTANCE = (
     "outliers.conflict",
     "workflow.no-held-out-poses",
     "workflow.few-held-out-poses",
+    "workflow.held-out-setup",
     "workflow.undetermined-combinations",
     "validation.setup-moved",
     "prior.machine-changed",

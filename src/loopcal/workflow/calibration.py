@@ -239,6 +239,10 @@ def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Fin
         findings.append(
             report_finding("workflow.few-held-out-poses", count=errors.n_judged, needed=FEW_ROWS)
         )
+    elif errors.values_left < FEW_ROWS:
+        values, setup = errors.kinds[-1].count, errors.setup_count
+        held_out_setup = report_finding("workflow.held-out-setup", values=values, setup=setup)
+        return [*findings, held_out_setup]  # such errors may grow from rounding to rounding
     for quantity, smaller in errors.improvements().items():
         larger = 1.0 / smaller if smaller > 0.0 else float("inf")
         if larger > GREW:

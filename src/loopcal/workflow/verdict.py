@@ -8,7 +8,10 @@ from enum import Enum
 
 from loopcal.findings import Finding, Severity, report_finding
 
-TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", "workflow.few-held-out-poses")
+TOO_FEW_HELD_OUT = ("workflow.few-held-out-poses", "workflow.held-out-setup")
+"""Findings that ask for more or other held-out poses."""
+
+TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT)
 """Findings that leave the verdict open."""
 
 
@@ -32,7 +35,8 @@ def decide_verdict(findings: Iterable[Finding]) -> Verdict:
     1. Not calibrated: any failure. Failures are a fit that did not converge, a geometry that
        reaches no held-out pose, residuals that contradict the stated noise, errors on held-out
        poses that grew by more than 10 %, and a limit that is exceeded.
-    2. Undecided: no pose was held out, or too few to judge an error.
+    2. Undecided: no pose was held out, or too few to judge an error, or the setup parameters that
+       were fitted to them leave no measured value to check.
     3. Calibrated with reservations: any warning, such as outliers, a prior that the data
        contradict, or undetermined parameter combinations that change poses.
     4. Calibrated: everything else.
@@ -61,7 +65,7 @@ def choose_next_step(
     if verdict is Verdict.CALIBRATED:
         return report_finding("workflow.next-use-result")
     if verdict is Verdict.UNDECIDED:
-        if any(finding.code == "workflow.few-held-out-poses" for finding in findings):
+        if any(finding.code in TOO_FEW_HELD_OUT for finding in findings):
             return report_finding("workflow.next-hold-out-more")
         return report_finding("workflow.next-hold-out")
     if outliers:
