@@ -48,8 +48,8 @@ def find_benchmarks(chosen: list[str]) -> list[Benchmark]:
 
 def measure(benchmark: Benchmark) -> list[Metric]:
     """Run one benchmark."""
-    found = benchmark()
-    return [found] if isinstance(found, Metric) else found
+    result = benchmark()
+    return [result] if isinstance(result, Metric) else result
 
 
 def measure_for_gate(benchmark: Benchmark, baseline: dict[str, dict]) -> list[Metric]:

@@ -173,17 +173,17 @@ class Problem:
         is_equal = t > 1 and bool((deviation == deviation[0]).all())
         if exact is not None and exact.is_single_block and is_equal:
             shared = exact.solve_single_block(deviation[:1], self.trials, start)
-        together = max(1, BLOCK // self.poses.block_size)
-        parts = []
-        for first in range(0, t, together):
-            chosen = np.arange(first, min(first + together, t))
+        batch = max(1, BLOCK // self.poses.block_size)
+        linearizations = []
+        for first in range(0, t, batch):
+            chosen = np.arange(first, min(first + batch, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
             if shared is not None and exact is not None:
                 solution = exact.solve(z, trials, begin, self.control, shared=shared)
             else:
                 solution = self.poses.solve(z, trials, begin, self.control)
-            parts.append(self._eliminate(solution, z, trials, begin))
-        return Linearization.join(parts)
+            linearizations.append(self._eliminate(solution, z, trials, begin))
+        return Linearization.join(linearizations)
 
     def solve(
         self, deviation: FloatArray, start: Start, nuisance: FloatArray | None = None
@@ -205,39 +205,42 @@ class Problem:
             for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
                 if not len(numbers):
                     continue
-                at, white = evaluate_rows(rows, poses, self.trials, solution.nuisance)
+                evaluated, white = evaluate_rows(rows, poses, self.trials, solution.nuisance)
                 ok = np.all(poses.is_reached[:, rows.poses_by_link], axis=2, keepdims=True)
-                raw = np.where(ok, at.residual, np.nan)
+                raw = np.where(ok, evaluated.residual, np.nan)
                 kind.raw[:, numbers], kind.whitened[:, numbers] = raw, whiten(white, raw)
         return tuple(kinds)
 
-    def leverage_rows(self, at: Linearization) -> Iterator[list[LeverageRows]]:
+    def leverage_rows(self, linearization: Linearization) -> Iterator[list[LeverageRows]]:
         """Give, block by block, the rows by everything that they determine (one trial).
 
-        `at` is a linearization of this problem, or of the same one with other weights: nuisance
+        `linearization` is one of this problem, or of the same one with other weights: nuisance
         parameters and their elimination are taken from it. Uncertain poses are where the rows of
         this problem put them at these nuisance parameters.
         """
-        p, z = self.parameters, at.deviation
-        fixed = None if at.nuisance is None else at.nuisance.values
-        solution = self.poses.solve(z, self.trials, at.next_start, self.control, fixed)
+        p, z = self.parameters, linearization.deviation
+        fixed = None if linearization.nuisance is None else linearization.nuisance.values
+        solution = self.poses.solve(z, self.trials, linearization.next_start, self.control, fixed)
         wide = 0 if self.nuisance is None else len(self.nuisance)
         rows_of_blocks = self.poses.iterate_rows(solution, z, self.trials)
         for block, (parts, _) in zip(self.poses.blocks, rows_of_blocks, strict=True):
-            given = []
+            of_block = []
             for part in parts:
-                own = part.rows[0]
-                w = own.shape[-1] - p - 1
-                rows = np.zeros((*own.shape[:2], wide + p + 1))
-                rows[..., -p - 1 :] = own[..., w:]
-                if at.nuisance is not None and part.structure >= 0:
-                    path, root, slope = at.nuisance.elimination.at_nodes(part.nodes)
-                    rows[..., -p - 1 : -1] += own[..., :w] @ slope
-                    k, m = np.arange(len(own))[:, None, None], np.arange(own.shape[1])[:, None]
-                    rows[k, m, path[:, None, :]] = own[..., :w] @ root
+                whitened = part.rows[0]
+                w = whitened.shape[-1] - p - 1
+                rows = np.zeros((*whitened.shape[:2], wide + p + 1))
+                rows[..., -p - 1 :] = whitened[..., w:]
+                if linearization.nuisance is not None and part.structure >= 0:
+                    path, root, slope = linearization.nuisance.elimination.at_nodes(part.nodes)
+                    rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
+                    k, m = (
+                        np.arange(len(whitened))[:, None, None],
+                        np.arange(whitened.shape[1])[:, None],
+                    )
+                    rows[k, m, path[:, None, :]] = whitened[..., :w] @ root
                 poses = self.poses.poses_of(block, part)
-                given.append(LeverageRows(poses, rows, part.kind, part.numbers))
-            yield given
+                of_block.append(LeverageRows(poses, rows, part.kind, part.numbers))
+            yield of_block
 
     def count_leverage_rows(self, member: IntArray, count: int) -> IntArray:
         """Return how many rows `leverage_rows` gives of each of `count` blocks of poses.

@@ -36,20 +36,22 @@ has no row."""
 
 
 def problem_of(
-    free: FreeParameters, data: Measurements, local: NuisanceParameters | None = None
+    free: FreeParameters, data: Measurements, stated: NuisanceParameters | None = None
 ) -> Problem:
     """Return the problem of one machine's measurements.
 
-    Where readings have a sigma above 0, poses are unknowns, too. `local` are the nuisance
+    Where readings have a sigma above 0, poses are unknowns, too. `stated` are the nuisance
     parameters of the measurements, default as stated there.
     """
-    own = data.nuisance_parameters if local is None else local
+    nuisance = data.nuisance_parameters if stated is None else stated
     rows = tuple(
         ObservationRows(o.kind, o.rows, o.measured[None], o.whitener[None], places)
-        for o, places in zip(data.observations, own.indices, strict=True)
+        for o, places in zip(data.observations, nuisance.indices, strict=True)
         if len(o)
     )
-    return make_problem(free, data.readings[None], data.reading_sigma, rows, 1, own, lambda _: data)
+    return make_problem(
+        free, data.readings[None], data.reading_sigma, rows, 1, nuisance, lambda _: data
+    )
 
 
 def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
@@ -91,20 +93,20 @@ def make_problem(
     if believed is None:
         nuisance = plan_elimination(local, rows)
         return Problem(free, recorded[:1], rows, numbers, nuisance, data)
-    every = (*rows, _reading_rows(free, recorded, believed))
-    names = list_sensed_joints(r.kind for r in every)
+    all_rows = (*rows, _reading_rows(free, recorded, believed))
+    names = list_sensed_joints(r.kind for r in all_rows)
     if robot.program.sigma is None:
         unit = [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
         scale = np.where(np.isinf(believed), UNKNOWN_READING * np.array(unit), believed)
         coordinates: PoseCoordinates = ReadingCoordinates(free, scale, names)
     else:
         coordinates = TwistCoordinates(free, names)
-    member = find_components(recorded.shape[1], every, coordinates.freedoms)
+    member = find_components(recorded.shape[1], all_rows, coordinates.freedoms)
     nuisance = plan_elimination(local, rows, member)
     return Problem(
         free,
         recorded,
-        every,
+        all_rows,
         numbers,
         nuisance,
         data,

@@ -245,9 +245,9 @@ def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Obse
     return groups
 
 
-def _have_equal_settings(one: Kind, other: Kind) -> bool:
+def _have_equal_settings(first: Kind, second: Kind) -> bool:
     """Return whether two kinds are of one class and all their settings are equal."""
-    settings = [field.name for field in fields(cast(Any, one)) if field.init]
-    return type(one) is type(other) and all(
-        np.array_equal(getattr(one, s), getattr(other, s)) for s in settings
+    settings = [field.name for field in fields(cast(Any, first)) if field.init]
+    return type(first) is type(second) and all(
+        np.array_equal(getattr(first, s), getattr(second, s)) for s in settings
     )

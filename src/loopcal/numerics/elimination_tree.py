@@ -182,32 +182,32 @@ def _measure_nodes(node: IntArray, parent: IntArray) -> tuple[IntArray, IntArray
 
     Parents have smaller numbers.
     """
-    own = np.bincount(node[node >= 0], minlength=len(parent))
-    width, depth = own.copy(), np.zeros(len(parent), dtype=np.int64)
+    unknowns = np.bincount(node[node >= 0], minlength=len(parent))
+    width, depth = unknowns.copy(), np.zeros(len(parent), dtype=np.int64)
     for _ in SCOPES:
-        width = own + np.where(parent >= 0, width[parent], 0)
+        width = unknowns + np.where(parent >= 0, width[parent], 0)
         depth = np.where(parent >= 0, depth[parent] + 1, 0)
-    return own, width, depth
+    return unknowns, width, depth
 
 
 def _count_multiplications(assignment: tuple[IntArray, IntArray]) -> int:
     """Return about how many multiplications an elimination takes: u w^2, summed over nodes."""
-    own, width, _ = _measure_nodes(*assignment)
-    return int((own * width**2).sum())
+    unknowns, width, _ = _measure_nodes(*assignment)
+    return int((unknowns * width**2).sum())
 
 
 def _sort_by_structure(node: IntArray, parent: IntArray, cluster: IntArray) -> EliminationTree:
     """Number the nodes by structure, from the outermost inwards."""
-    own, width, depth = _measure_nodes(node, parent)
+    unknowns, width, depth = _measure_nodes(node, parent)
     structure, place = np.full(len(parent), -1), np.zeros(len(parent), dtype=np.int64)
     order, structures, column = [], [], np.zeros(len(node), dtype=np.int64)
     by_node = np.argsort(node, kind="stable")[int((node < 0).sum()) :]
-    start = np.cumsum(own) - own
+    start = np.cumsum(unknowns) - unknowns
     for d in range(int(depth.max()) + 1):
         level = np.flatnonzero(depth == d)
         outer = np.where(parent[level] >= 0, structure[parent[level]], -1)
-        for key in np.unique(np.column_stack([outer, own[level]]), axis=0):
-            chosen = level[(outer == key[0]) & (own[level] == key[1])]
+        for key in np.unique(np.column_stack([outer, unknowns[level]]), axis=0):
+            chosen = level[(outer == key[0]) & (unknowns[level] == key[1])]
             columns = by_node[start[chosen][:, None] + np.arange(key[1])]
             above = place[parent[chosen]] if d else np.full(len(chosen), -1)
             path = (

@@ -160,8 +160,8 @@ class TreeElimination(TrialBatch):
         """
         variance = np.zeros(self.shift.shape)
         for structure, root in zip(self.tree.structures, self.roots, strict=True):
-            own = root[:, :, : structure.unknowns.shape[1]]
-            variance[:, structure.unknowns] = (own**2).sum(axis=-1)
+            columns = root[:, :, : structure.unknowns.shape[1]]
+            variance[:, structure.unknowns] = (columns**2).sum(axis=-1)
         return variance
 
 
@@ -239,12 +239,12 @@ def _remove_unobservable(
     node's children along their best values. All directions that begin in one cluster are made
     orthonormal together. Those of the innermost nodes have no part in any best value.
     """
-    part = np.zeros(length.shape)
+    share = np.zeros(length.shape)
     for i, (structure, node) in enumerate(zip(tree.structures, nodes, strict=True)):
         if i not in tree.parents:
-            part[:, structure.unknowns] = (node.unobservable**2).sum(axis=2)
+            share[:, structure.unknowns] = (node.unobservable**2).sum(axis=2)
     if not any(nodes[i].unobservable.any() for i in tree.parents):
-        return np.sqrt(part) > NULL_COMPONENT, values
+        return np.sqrt(share) > NULL_COMPONENT, values
     values = values.copy()
     carried, clusters = _carry_inwards(tree, nodes, length)
     for c in clusters:
@@ -254,8 +254,8 @@ def _remove_unobservable(
         scaled = values[:, inside] * length[:, inside, None]
         along = np.matmul(basis, np.matmul(basis.swapaxes(-1, -2), scaled))
         values[:, inside] = (scaled - along) / length[:, inside, None]
-        part[:, inside] += (basis**2).sum(axis=-1)
-    return np.sqrt(part) > NULL_COMPONENT, values
+        share[:, inside] += (basis**2).sum(axis=-1)
+    return np.sqrt(share) > NULL_COMPONENT, values
 
 
 def _carry_inwards(

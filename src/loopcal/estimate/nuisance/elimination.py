@@ -217,21 +217,23 @@ def divide_among_nodes(
 ) -> list[NodeRows]:
     """Return the rows of a kind by nodes, [nuisance | machine | residual]."""
     rows = np.concatenate([kind.by_parameters, kind.residual[..., None]], axis=-1)
-    parts = []
+    divided = []
     for structure, numbers, nodes, columns in members:
         chosen = rows if len(numbers) == rows.shape[1] else rows[:, numbers]
         if structure >= 0 and kind.by_nuisance is not None and tree is not None:
             width = tree.structures[structure].width
-            own = spread_columns(kind.by_nuisance[:, numbers], columns, width)
-            chosen = np.concatenate([own, chosen], axis=-1)
-        parts.append(NodeRows(structure, nodes, numbers, chosen))
-    return parts
+            by_path = spread_columns(kind.by_nuisance[:, numbers], columns, width)
+            chosen = np.concatenate([by_path, chosen], axis=-1)
+        divided.append(NodeRows(structure, nodes, numbers, chosen))
+    return divided
 
 
-def spread_columns(own: FloatArray, columns: IntArray, width: int) -> FloatArray:
+def spread_columns(derivatives: FloatArray, columns: IntArray, width: int) -> FloatArray:
     """Return derivatives (a, k, m, width) by a path from those (a, k, m, u) at columns (k, u)."""
-    wide = np.zeros((*own.shape[:3], width + 1))
-    np.put_along_axis(wide, np.broadcast_to(columns[:, None, :], own.shape), own, axis=-1)
+    wide = np.zeros((*derivatives.shape[:3], width + 1))
+    np.put_along_axis(
+        wide, np.broadcast_to(columns[:, None, :], derivatives.shape), derivatives, axis=-1
+    )
     return wide[..., :width]
 
 

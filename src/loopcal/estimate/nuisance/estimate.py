@@ -118,7 +118,7 @@ def empty_nuisance_estimate(parameters: int) -> NuisanceEstimate:
 
 def estimate_nuisance(
     nuisance: NuisanceElimination,
-    at: Linearization,
+    linearization: Linearization,
     robot: Mechanism,
     decomposition: Decomposition,
     penalty: FloatArray,
@@ -129,22 +129,22 @@ def estimate_nuisance(
 
     Parameters
     ----------
-    nuisance : of the problem. at : the linearization at the estimate (t = 1).
+    nuisance : of the problem. linearization : at the estimate (t = 1).
     robot : for its units. decomposition, penalty : of the fit (t = 1).
     noise : variance of the whitened rows; NaN where no interval is given.
     start : (U,) values with which the fit began; default: those of the warm start.
     """
     table = nuisance.local.table
-    begin = at.next_start.first_nuisance[0] if start is None else start
+    begin = linearization.next_start.first_nuisance[0] if start is None else start
     shown = tuple(_display_unit(robot, p) for p in table.entries)
     U, p = len(table), len(decomposition.scale)
-    if at.nuisance is None or not np.isfinite(at.cost[0]):
-        estimate, nothing = at.next_start.nuisance[0].copy(), np.zeros(U)
+    if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):
+        estimate, nothing = linearization.next_start.nuisance[0].copy(), np.zeros(U)
         unobservable = np.zeros(U, dtype=bool)
         return NuisanceEstimate(
             table, begin, estimate, nothing, np.zeros((U, p)), unobservable, shown
         )
-    done, is_free = at.nuisance.elimination, nuisance.is_free
+    done, is_free = linearization.nuisance.elimination, nuisance.is_free
     known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
     slope, is_unobservable = done.slope[0], done.is_unobservable[0]
@@ -160,7 +160,13 @@ def estimate_nuisance(
         done.variances()[0, is_free] * noise + by_machine,
     )
     return NuisanceEstimate(
-        table, begin, at.nuisance.best[0], np.sqrt(variance), slope, is_unobservable, shown
+        table,
+        begin,
+        linearization.nuisance.best[0],
+        np.sqrt(variance),
+        slope,
+        is_unobservable,
+        shown,
     )
 
 

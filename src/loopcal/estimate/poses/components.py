@@ -100,8 +100,8 @@ def group_components(
 
     `nodes` and `structures` are those of all components, -1 without nuisance parameters.
     """
-    own = member[block.poses]
-    numbers, local, lengths = np.unique(own, return_inverse=True, return_counts=True)
+    component_of_pose = member[block.poses]
+    numbers, local, lengths = np.unique(component_of_pose, return_inverse=True, return_counts=True)
     heights, starts = np.zeros(len(numbers), dtype=np.int64), []
     for r in block.rows:
         m, component = r.whitener.shape[-1], local[r.first_poses]
@@ -121,11 +121,11 @@ def group_components(
         chosen = np.flatnonzero((key == alike).all(axis=1))
         number = np.full(len(numbers), -1)
         number[chosen] = np.arange(len(chosen))
-        parts = []
+        rows_of_kinds = []
         for r, start in zip(block.rows, starts, strict=True):
             rows = np.flatnonzero(number[local[r.first_poses]] >= 0)
             component = number[local[r.first_poses[rows]]]
-            parts.append((rows, component, start[rows], place[r.poses_by_link[rows]]))
+            rows_of_kinds.append((rows, component, start[rows], place[r.poses_by_link[rows]]))
         poses = np.flatnonzero(number[local] >= 0)
         ranked = np.empty((len(chosen), int(alike[0])), dtype=np.int64)
         ranked[number[local[poses]], place[poses]] = poses
@@ -136,7 +136,7 @@ def group_components(
                 height=int(heights[chosen].max()),
                 structure=int(alike[1]),
                 nodes=nodes[numbers[chosen]],
-                rows=tuple(parts),
+                rows=tuple(rows_of_kinds),
             )
         )
     return tuple(groups)
@@ -156,25 +156,27 @@ def stack_rows(
     -------
     rows : (a, C, height, L k + w + p + 1).
     """
-    given = next(kind for kind in kinds if kind is not None)
-    a, p, k = len(given.residual), given.by_parameters.shape[-1], freedoms
-    own = group.poses.shape[1] * k
-    out = np.zeros((a, len(group.components), max(group.height, own), own + width + p + 1))
+    present = next(kind for kind in kinds if kind is not None)
+    a, p, k = len(present.residual), present.by_parameters.shape[-1], freedoms
+    n_coordinates = group.poses.shape[1] * k
+    out = np.zeros(
+        (a, len(group.components), max(group.height, n_coordinates), n_coordinates + width + p + 1)
+    )
     for kind, (rows, component, start, links) in zip(kinds, group.rows, strict=True):
         if kind is None or not len(rows):
             continue
         m = kind.residual.shape[-1]
-        at = (slice(None), component[:, None], start[:, None] + np.arange(m))
-        out[(*at, -1)] = kind.residual[:, rows]
+        cells = (slice(None), component[:, None], start[:, None] + np.arange(m))
+        out[(*cells, -1)] = kind.residual[:, rows]
         if p:
-            out[(*at, slice(own + width, -1))] = kind.by_parameters[:, rows]
+            out[(*cells, slice(n_coordinates + width, -1))] = kind.by_parameters[:, rows]
         if width and kind.by_nuisance is not None:
-            out[(*at, slice(own, own + width))] = kind.by_nuisance[:, rows]
+            out[(*cells, slice(n_coordinates, n_coordinates + width))] = kind.by_nuisance[:, rows]
         if kind.by_coordinates is None:
             continue
         for i in range(links.shape[1]):
             columns = (links[:, i, None] * k + np.arange(k))[:, None, :]
-            where = (slice(None), component[:, None, None], at[2][:, :, None], columns)
+            where = (slice(None), component[:, None, None], cells[2][:, :, None], columns)
             out[where] = kind.by_coordinates[:, rows, i]
     return out
 

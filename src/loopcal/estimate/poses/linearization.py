@@ -146,8 +146,8 @@ def linearize_closure(
     begin = replace(robot.home_state, T=T)
     state = engine.solve(robot.program, e, joints, begin, max_iterations=1)
     step = geometry.pose_difference(state.T, T)
-    at = replace(state, T=T, status=np.zeros_like(state.status))
-    D = differentiate_pose(robot, values, readings, at).parameters
+    given_state = replace(state, T=T, status=np.zeros_like(state.status))
+    D = differentiate_pose(robot, values, readings, given_state).parameters
     ok = np.asarray(np.isfinite(step).all(axis=2) & np.isfinite(D).all(axis=(2, 3)))
     step, D = np.where(ok[..., None], step, 0.0), np.where(ok[..., None, None], D, 0.0)
     return LinearizedPoses(T, ok, scale_parameters(free, D), closure_step=step)
@@ -238,11 +238,11 @@ def evaluate_rows(
         T = T[:, rows.poses]
     T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
     used = nuisance is not None and rows.nuisance.shape[1]
-    own = nuisance[:, rows.nuisance] if nuisance is not None and used else None
+    nuisance_values = nuisance[:, rows.nuisance] if nuisance is not None and used else None
     joints = rows.kind.stack_joints(poses.joints, rows.poses)
     if joints is not None:
         joints = np.broadcast_to(joints, (len(trials), *joints.shape[1:]))
-    return rows.kind.evaluate(T, measured, own, joints), white
+    return rows.kind.evaluate(T, measured, nuisance_values, joints), white
 
 
 def linearize_rows(
@@ -253,24 +253,26 @@ def linearize_rows(
     by_parameters: bool = True,
 ) -> KindRows:
     """Return the whitened rows of a kind at linearized poses; arguments as of `evaluate_rows`."""
-    at, white = evaluate_rows(rows, poses, trials, nuisance)
-    residual = at.residual
+    evaluated, white = evaluate_rows(rows, poses, trials, nuisance)
+    residual = evaluated.residual
     if poses.closure_step is not None:
         step = poses.closure_step[:, rows.poses, :, None]
-        residual = residual + np.matmul(at.jacobian, step)[..., 0]
+        residual = residual + np.matmul(evaluated.jacobian, step)[..., 0]
     a, r, m = residual.shape
-    own = None
-    if at.nuisance is not None:
-        own = np.matmul(white, np.broadcast_to(at.nuisance, (a, r, m, at.nuisance.shape[-1])))
+    by_nuisance = None
+    if evaluated.nuisance is not None:
+        by_nuisance = np.matmul(
+            white, np.broadcast_to(evaluated.nuisance, (a, r, m, evaluated.nuisance.shape[-1]))
+        )
     return KindRows(
         residual=whiten(white, residual),
-        by_parameters=_parameter_columns(rows, at, white, poses)
+        by_parameters=_parameter_columns(rows, evaluated, white, poses)
         if by_parameters
         else np.zeros((a, r, m, 0)),
-        by_nuisance=own,
+        by_nuisance=by_nuisance,
         by_coordinates=None
         if poses.by_coordinates is None
-        else _coordinate_columns(rows, at, white, poses, poses.by_coordinates),
+        else _coordinate_columns(rows, evaluated, white, poses, poses.by_coordinates),
     )
 
 
@@ -288,42 +290,49 @@ def coordinate_derivative(jacobian: FloatArray, Y: FloatArray) -> FloatArray:
 
 
 def _parameter_columns(
-    rows: ObservationRows, at: Evaluation, white: FloatArray, poses: LinearizedPoses
+    rows: ObservationRows, evaluated: Evaluation, white: FloatArray, poses: LinearizedPoses
 ) -> FloatArray:
     """Return whitened derivatives (a, r, m, p) of a kind by the scaled parameters."""
     D = poses.by_parameters
     if rows.kind.poses_per_row > 1:
         linked = (
-            at.jacobian[:, :, i] @ D[:, rows.poses[:, i]] for i in range(rows.kind.poses_per_row)
+            evaluated.jacobian[:, :, i] @ D[:, rows.poses[:, i]]
+            for i in range(rows.kind.poses_per_row)
         )
         return np.matmul(white, sum(linked, start=np.zeros(1)))
     if not _is_every_pose(rows, D.shape[1]):
         D = D[:, rows.poses]
     # one order of the products for any number of trials: each trial equals its own fit bit for bit
-    columns = np.matmul(white, np.matmul(at.jacobian, D))
+    columns = np.matmul(white, np.matmul(evaluated.jacobian, D))
     for j, name in enumerate(rows.kind.sensed_joints):
-        if name in poses.joints_by_parameters and at.joints is not None:
+        if name in poses.joints_by_parameters and evaluated.joints is not None:
             slope = poses.joints_by_parameters[name][:, rows.poses, None, :]
-            columns = columns + np.matmul(white, at.joints[..., j, None] * slope)
+            columns = columns + np.matmul(white, evaluated.joints[..., j, None] * slope)
     return columns
 
 
 def _coordinate_columns(
-    rows: ObservationRows, at: Evaluation, white: FloatArray, poses: LinearizedPoses, Y: FloatArray
+    rows: ObservationRows,
+    evaluated: Evaluation,
+    white: FloatArray,
+    poses: LinearizedPoses,
+    Y: FloatArray,
 ) -> FloatArray:
     """Return whitened derivatives (a, r, links, m, k) of a kind by the coordinates of its poses."""
     if rows.kind.poses_per_row > 1:
         linked = [
-            np.matmul(white, coordinate_derivative(at.jacobian[:, :, i], Y[:, rows.poses[:, i]]))
+            np.matmul(
+                white, coordinate_derivative(evaluated.jacobian[:, :, i], Y[:, rows.poses[:, i]])
+            )
             for i in range(rows.kind.poses_per_row)
         ]
         return np.stack(linked, axis=2)
-    columns = coordinate_derivative(at.jacobian, Y[:, rows.poses])
-    if at.joints is not None and rows.kind.sensed_joints:
+    columns = coordinate_derivative(evaluated.jacobian, Y[:, rows.poses])
+    if evaluated.joints is not None and rows.kind.sensed_joints:
         turns = [
             poses.joints_by_coordinates[name][:, rows.poses] for name in rows.kind.sensed_joints
         ]
-        columns = columns + np.matmul(at.joints, np.stack(turns, axis=2))
+        columns = columns + np.matmul(evaluated.joints, np.stack(turns, axis=2))
     return np.matmul(white, columns)[:, :, None]
 
 

@@ -72,8 +72,8 @@ def sum_squares_at(
     rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray, T: FloatArray
 ) -> FloatArray:
     """Return the sum of whitened squares (k,) of the rows of k poses, platform at T (k, 4, 4)."""
-    parts = [_whitened_rows(r, places, trial, T)[0] for r, places in _usable_rows(rows, pose)]
-    return sum(((part**2).sum(axis=1) for part in parts), start=np.zeros(len(pose)))
+    residuals = [_whitened_rows(r, places, trial, T)[0] for r, places in _usable_rows(rows, pose)]
+    return sum(((residual**2).sum(axis=1) for residual in residuals), start=np.zeros(len(pose)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,11 +230,13 @@ def _whitened_rows(
         array[np.where(len(array) > 1, trial, 0)[:, None], np.maximum(rows, 0)]
         for array in (observed.measured, observed.whitener)
     )
-    at = observed.kind.evaluate(np.repeat(T, c, axis=0)[None], measured.reshape(1, k * c, -1))
+    evaluated = observed.kind.evaluate(
+        np.repeat(T, c, axis=0)[None], measured.reshape(1, k * c, -1)
+    )
     white = np.where(rows[..., None, None] >= 0, white, 0.0)
     m = white.shape[-1]
-    residual = whiten(white, at.residual.reshape(k, c, m))
-    jacobian = np.matmul(white, at.jacobian.reshape(k, c, m, 6))
+    residual = whiten(white, evaluated.residual.reshape(k, c, m))
+    jacobian = np.matmul(white, evaluated.jacobian.reshape(k, c, m, 6))
     return residual.reshape(k, c * m), jacobian.reshape(k, c * m, 6)
 
 

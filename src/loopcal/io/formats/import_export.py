@@ -26,11 +26,11 @@ def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> 
     """
     if name is not None:
         return FORMATS[name]
-    for one in FORMATS.values():
-        if path.suffix.lower() in one.endings:
-            return one
+    for entry in FORMATS.values():
+        if path.suffix.lower() in entry.endings:
+            return entry
     names = tuple(
-        one for one, known in FORMATS.items() if (known.write if is_written else known.read)
+        entry for entry, known in FORMATS.items() if (known.write if is_written else known.read)
     )
     raise FileError(report_finding("files.format-unknown", formats=names), path)
 

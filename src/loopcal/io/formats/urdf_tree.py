@@ -216,11 +216,11 @@ def _build_joint(joint: _OpenJoint, raw: bytes, path: Path) -> UrdfJoint:
 
 def _parse_three(text: str, what: str, path: Path, line: int) -> FloatArray:
     """Return three numbers."""
-    parts = text.split()
-    if len(parts) != 3:
+    numbers = text.split()
+    if len(numbers) != 3:
         sentence = f"{what} is {text!r}, but three numbers are needed; correct it"
         raise FileError(sentence, path, line)
-    return np.array([parse_number(part, what, path, line) for part in parts])
+    return np.array([parse_number(number, what, path, line) for number in numbers])
 
 
 def _build_tree(text: str, path: Path, links: list[str], joints: dict[str, UrdfJoint]) -> Urdf:
@@ -264,7 +264,7 @@ def read_joint_graph(urdf: Urdf, closures: Path) -> JointGraph:
     if not motors:
         raise file.error("no motor is named; list the driven joints in 'name_mot:'")
     tree = _list_tree_joints(urdf, ends)
-    pins = tuple(_build_pin(urdf, one, other) for one, other in pairs)
+    pins = tuple(_build_pin(urdf, first, second) for first, second in pairs)
     values = {joint.name: 0.0 for joint in tree}
     try:
         return find_home(JointGraph(urdf.root, tree, pins, motors, values))
