@@ -33,7 +33,7 @@ NORMAL_95 = 1.959963984540054
 """97.5 % point of the normal distribution: half-width of a 95 % interval in standard deviations."""
 
 SIGMA_LENGTH, SIGMA_ANGLE = 5e-6, 25e-6
-"""Noise of the simulated instrument, one standard deviation: 5 micrometres and 25 microradians."""
+"""Noise of the simulated instrument, one standard deviation: 5 micrometers and 25 microradians."""
 
 
 @dataclass(frozen=True)

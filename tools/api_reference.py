@@ -37,7 +37,7 @@ HEAD = """\
 # Python API
 
 `import loopcal as lc` gives these names, and no other name is public. Inside, all numbers are SI:
-metres and radians. Arrays have the poses first; `T` has shape (n, 4, 4) and maps platform
+meters and radians. Arrays have the poses first; `T` has shape (n, 4, 4) and maps platform
 coordinates to base coordinates. Terms are in the [glossary](glossary.md). `help(lc.NAME)` shows
 shapes, units and errors. This page is made from the code by `make docs`.
 """

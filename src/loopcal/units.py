@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units of files and tables. Inside loopcal everything is in SI (metre, radian).
+"""Units of files and tables. Inside loopcal everything is in SI (meter, radian).
 
 A record annotates its numbers with `Length`, `Angle` or `Ratio`; the reader of files multiplies
 them by the factor of the stated unit, the writer divides by it.

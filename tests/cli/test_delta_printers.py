@@ -233,7 +233,7 @@ def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
     assert main(["identifiability", "nine.yaml", "heights.csv", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["rank"], document["n_parameters"], document["n_equations"]) == (7, 9, 7)
-    suggestion = "distances between two poses (ball bar; callipers on a printed part)"
+    suggestion = "distances between two poses (ball bar; calipers on a printed part)"
     assert len(document["unidentifiable"]) == 2
     assert [cure["cures"][0]["words"] for cure in document["remedies"]] == [suggestion, suggestion]
     # calibrate refuses by default, and says the same

@@ -106,7 +106,7 @@ def test_heights_leave_two_of_nine_parameters_undetermined_and_distances_are_sug
         for remedy in suggest_measurements(found):
             assert (
                 remedy.measurements[0].words
-                == "distances between two poses (ball bar; callipers on a printed part)"
+                == "distances between two poses (ball bar; calipers on a printed part)"
             ), name
 
 

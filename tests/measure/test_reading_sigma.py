@@ -24,9 +24,9 @@ def simulate_positions(name, n=20, sigma=None):
 
 @pytest.mark.parametrize("given", ["5 um", 1j, np.array([1j]), [[1.0], "a"]])
 def test_sigma_that_is_not_a_number_is_refused(given):
-    with pytest.raises(DataError, match="give numbers, in metres and radians"):
+    with pytest.raises(DataError, match="give numbers, in meters and radians"):
         Measurements("r", [[0.0, 0.0]], (), reading_sigma=given)  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="give numbers, in metres and radians"):
+    with pytest.raises(DataError, match="give numbers, in meters and radians"):
         simulate_positions("linear-delta", 1, given)
 
 

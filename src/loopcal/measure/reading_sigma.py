@@ -48,7 +48,7 @@ def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArra
         given = np.asarray(sigma, dtype=float)
     except (TypeError, ValueError):
         raise DataError(
-            f"reading_sigma is {sigma!r}; give numbers, in metres and radians"
+            f"reading_sigma is {sigma!r}; give numbers, in meters and radians"
         ) from None
     try:
         return np.array(np.broadcast_to(given, readings.shape))

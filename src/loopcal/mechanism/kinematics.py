@@ -198,7 +198,7 @@ def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
 
 @dataclass(frozen=True, repr=False)
 class Jacobian:
-    """Derivatives of n poses in parameters and readings, labelled.
+    """Derivatives of n poses in parameters and readings, labeled.
 
     The platform's twist has the rows `components`: rotation (rx, ry, rz) [rad] about base axes,
     then the translation (x, y, z) [m] of its origin.

@@ -131,7 +131,7 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
     assert "with 45 rows of motor angles" in notes
     for words in ("stiffness", "weight", "lengths at the origin", "the key 'colour' is unknown"):
         assert words in notes
-    assert "1 mm is assumed for lines" in notes
+    assert "1 mm is used for lines" in notes
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def read_gcode(path: Path, one_in_a_line: bool = False) -> GcodeFile:
     if "M665" not in file.commands:
         raise FileError("no M665, the geometry of a delta, in this file; print it by M503", path)
     if "G20" in file.commands:
-        sentence = "G20 selects inches; write the geometry in millimetres"
+        sentence = "G20 selects inches; write the geometry in millimeters"
         raise FileError(sentence, path, file.commands["G20"][0] + 1)
     return file
 

@@ -22,7 +22,7 @@ HEIGHT_SIGMA = 20e-6
 """Standard deviation of a probed height where the probe is unknown [m]."""
 
 DISTANCE_SIGMA = 0.1e-3
-"""Standard deviation of a distance on a printed part, by callipers [m]."""
+"""Standard deviation of a distance on a printed part, by calipers [m]."""
 
 LINE_SIGMA = POSITION_SIGMA = 1e-3
 """Standard deviations of line lengths and of known positions of a cable robot [m]."""

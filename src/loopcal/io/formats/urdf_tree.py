@@ -2,7 +2,7 @@
 """A URDF file as a tree of links and joints, and its loop closures.
 
 A joint's frame is its parent link's frame moved by `<origin xyz rpy>`, rpy about fixed axes (R = Rz
-Ry Rx); the child turns about, or slides along, `<axis>` in that frame. Lengths are metres, angles
+Ry Rx); the child turns about, or slides along, `<axis>` in that frame. Lengths are meters, angles
 radians. Source: the specification of URDF's joint element (ROS wiki).
 
 A second file closes the loops: `closed_loop: [[A, B]]` with `type: ['6d']` makes one pin of two

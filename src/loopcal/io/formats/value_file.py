@@ -23,7 +23,7 @@ from loopcal.io.formats.program_format import (
 )
 
 DECIMALS = 6
-"""Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometre."""
+"""Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometer."""
 
 Name = tuple[str, str]
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Distance of poses from singularities, and warnings along a path.
 
-Closure without passive joints reads A y + Q dq = 0: rows in metres, columns of A for a translation
-in metres and for a rotation in radians times the robot's size, so that the singular values of A
-are metres per metre. The smallest one, the margin, is zero where the platform can move although
+Closure without passive joints reads A y + Q dq = 0: rows in meters, columns of A for a translation
+in meters and for a rotation in radians times the robot's size, so that the singular values of A
+are meters per meter. The smallest one, the margin, is zero where the platform can move although
 every actuator is locked (a parallel singularity). The smallest one of Q, columns of rotary
 actuators per size too, is zero where an actuator moves nothing (a serial singularity). A margin has
 no absolute scale, so it is compared with its median over the workspace. Derivation:

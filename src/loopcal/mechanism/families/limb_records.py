@@ -287,7 +287,7 @@ class MapEntry:
     the name of a drive, `element` is `transmission` and `axis` one of its terms. The displacement
     is coefficient * change, or arm * change for an angle or ratio that moves a length [arm per
     radian]. `lead` is a screw's advance in one turn (`pitch`, the advance in a radian, is refused);
-    a `curve` counts per radian or metre.
+    a `curve` counts per radian or meter.
     """
 
     limb: str

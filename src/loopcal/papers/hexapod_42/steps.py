@@ -169,7 +169,7 @@ def integrate_errors(errors: FloatArray) -> FloatArray:
     """Return the largest integrated error dQint (k,) [mm + rad] of errors (k, n, 6) [m, rad].
 
     Equations (15) to (17): dQint = |(dx, dy, dz)| [mm] + |(dalpha, dbeta, dgamma)| [rad]. The index
-    adds millimetres and radians as they are, so it exists in this paper only.
+    adds millimeters and radians as they are, so it exists in this paper only.
     """
     lengths, angles = (np.linalg.norm(part, axis=2) for part in (errors[..., :3], errors[..., 3:]))
     return (lengths / MM + angles).max(axis=1)

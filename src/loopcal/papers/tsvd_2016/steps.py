@@ -11,7 +11,7 @@
  8 e + de; again from step 5 unless |de| is small     `iterate`
  9 save e
 
-Raw numbers as in the paper: millimetres and radians, every equation and every parameter of weight
+Raw numbers as in the paper: millimeters and radians, every equation and every parameter of weight
 one, and the filter acts on the step. With H = U S V' and s_i = S_ii the step is de = sum f_i (u_i'D
 / s_i) v_i, where f_i = 1 for LS, s_i^2 / (s_i^2 + lambda) for RE, and 1 for i <= k, else 0, for
 TSVD.
@@ -40,7 +40,7 @@ LIMIT = 20
 """Iterations at most; ridge steps shorten slowly."""
 
 LOST = 1e4
-"""A step of more than this [mm, rad] has diverged: ten metres."""
+"""A step of more than this [mm, rad] has diverged: ten meters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,5 +151,5 @@ def linearize(
 
 
 def list_scales(robot: Mechanism) -> FloatArray:
-    """Return the paper's units (p,) in SI: millimetres and radians."""
+    """Return the paper's units (p,) in SI: millimeters and radians."""
     return np.where([d is Dimension.LENGTH for d in robot.parameters.dimensions], MM, 1.0)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `separation`: the distance between the places of a point at two poses, by a ball bar or by
-callipers on a printed part.
+calipers on a printed part.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Separation(LengthKind):
 
     Parameters
     ----------
-    See `TargetKind`; "targets" and "offset" (the zero of the callipers, the width of a printed
+    See `TargetKind`; "targets" and "offset" (the zero of the calipers, the width of a printed
     line) may be unknown.
 
     Examples
@@ -39,7 +39,7 @@ class Separation(LengthKind):
     name: ClassVar[str] = "separation"
     poses_per_row: ClassVar[int] = 2
     description: ClassVar[str] = (
-        "distances between two poses (ball bar; callipers on a printed part)"
+        "distances between two poses (ball bar; calipers on a printed part)"
     )
     per_target: ClassVar[tuple[Column, ...]] = (Column("separation", Dimension.LENGTH),)
     allowed_unknown: ClassVar[tuple[str, ...]] = ("targets", "offset")
