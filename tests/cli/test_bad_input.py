@@ -112,7 +112,7 @@ def test_invalid_robot_file_is_refused_with_its_line(run_refused, case) -> None:
 
 
 def test_freedom_without_actuator_is_named(run_refused) -> None:
-    """All base centres in one point: the platform can turn about it, whatever the legs do."""
+    """All base centers are one point, so the platform can rotate about it with locked legs."""
     lines = ROBOT.split("\n")
     start, end = lines.index("base:"), lines.index("platform:")
     text = "\n".join([*lines[: start + 1], *["  - [0, 0, 0]"] * 6, *lines[end:]])
@@ -123,7 +123,7 @@ def test_freedom_without_actuator_is_named(run_refused) -> None:
 
 
 def test_missing_freedom_is_named(run_refused) -> None:
-    """A second limb that only slides along x takes y away from two motors."""
+    """A second limb that only slides along x prevents the motion along y."""
     limbs = [
         "  - name: a\n    ending: rigid\n    errors: [{of: s, shift: [y]}]",
         (

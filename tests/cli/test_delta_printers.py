@@ -203,7 +203,7 @@ def test_import_reports_a_factory_default_but_not_a_calibrated_printer(import_re
 def test_seven_contradictory_heights_fail_without_naming_an_outlier(
     import_record, capsys, name, height, times
 ) -> None:
-    """Two printers as probed, and one with 0.3 mm, 15 times the noise, added to a height."""
+    """Two printers as probed, and one with an error of 0.3 mm (15 sigma) in one height."""
     import_record(name)
     lines = Path("probes.csv").read_text().split("\n")
     for i, line in enumerate(lines):

@@ -221,9 +221,7 @@ def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(folder, capsys, dat
 def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
     folder, capsys, data_folder
 ) -> None:
-    """With its weighting; two of the arms that this printer's firmware stored are not the optimum
-    (cost 0.6477).
-    """
+    """The weights are those of the firmware. Two of its arms are not optimal (cost 0.6477)."""
     record = read_records(data_folder)[WITH_DISTANCES]
     (folder / "printer.cfg").write_text(format_printer_cfg(record))
     sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))

@@ -45,7 +45,7 @@ def test_two_unknown_frames_reduce_the_rank_of_the_hexapod_by_twelve(run, frames
 
 
 def test_json_gives_the_reason_for_a_number_that_is_not_finite(run):
-    """Nothing is cut at full rank: the gap of the singular values is infinite."""
+    """At full rank the gap of the singular values is infinite."""
     document = json.loads(run("hexapod-42 --json")[1])
     assert document["gap"] is None
     assert document["nulls"]["gap"].startswith("infinite")

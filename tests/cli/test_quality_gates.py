@@ -16,9 +16,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
 @pytest.fixture
 def folder_with_wrong_cell(tmp_path, monkeypatch) -> Path:
-    """Measurements of the example with rz of one fitted pose set to 12 degrees, in a folder of
-    their own.
-    """
+    """Return a folder with the example's measurements and a copy with one rz set to 12 degrees."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(EXAMPLE / "measurements.csv", tmp_path)
     lines = (tmp_path / "measurements.csv").read_text().split("\n")

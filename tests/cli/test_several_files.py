@@ -28,7 +28,7 @@ SD = "tracker.x: {start: 0 mm, sd: 1 mm}"
 
 @pytest.fixture(scope="module")
 def data() -> Measurements:
-    """A tracker whose frame is unknown, set up on two days, and an inclinometer, at 20 poses."""
+    """Measurements of 20 poses by a tracker with unknown frame on two days, and an inclinometer."""
     robot = load_robot("hexapod-42")
     poses = sample_workspace(robot, 20, 3).coordinates
     days = np.array(["monday"] * 11 + ["tuesday"] * 9)
@@ -56,9 +56,7 @@ def data() -> Measurements:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch, data):
-    """The same measurements as one file, as one file for each instrument, and as a table of poses
-    with values apart.
-    """
+    """Write the measurements as one file, as one file per instrument, and with separate poses."""
     monkeypatch.chdir(tmp_path)
     robot = load_robot("hexapod-42")
     save_measurements(data, "both.csv", robot)

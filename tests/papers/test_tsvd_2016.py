@@ -84,7 +84,7 @@ def results() -> Results:
 
 
 def compute_identification_matrix(measured: Study) -> np.ndarray:
-    """H (216, p) in mm and rad by central differences of the forward kinematics."""
+    """Return H (216, p) in mm and rad by central differences of the forward kinematics."""
     robot, step = measured.robot, 1e-4
     nominal, scale = robot.parameters.nominal, list_scales(robot)
     shifts = step * np.diag(scale)

@@ -18,7 +18,7 @@ STATION = np.array([0.5, -0.3, 0.6])
 
 @pytest.fixture(scope="module")
 def constrained():
-    """Candidates of a hexapod under every constraint at once."""
+    """Candidates of a hexapod that satisfy all constraints together."""
     sight = LineOfSight(STATION, np.array([0.0, 0.0, 2.0]), np.radians(60.0), 0.1, 2.0)
     return draw_candidates(
         load_robot("hexapod-42"), Constraints(0.6, np.radians(12.0), sight), 100, seed=3

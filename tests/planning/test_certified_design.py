@@ -28,7 +28,7 @@ SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 
 
 def linearize_drawn_poses(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
-    """Whitened rows (count, r, p) of poses drawn from a shipped robot's workspace."""
+    """Return whitened rows (count, r, p) of poses drawn from a shipped robot's workspace."""
     free = select_free_parameters(load_robot(robot))
     twists = observe_poses(free, sample_workspace(free.robot, count, 0).solution.q).twists[0]
     return (twists / SIGMA[:, None])[:, components]

@@ -26,7 +26,7 @@ SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 
 
 def parabola(_: Places, x: Array) -> Array:
-    """Rows of 1, x, x^2."""
+    """Return rows of 1, x, x^2."""
     return polynomial_rows(x[:, 0], 2)
 
 

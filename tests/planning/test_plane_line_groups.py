@@ -27,7 +27,7 @@ def robot() -> Mechanism:
 
 
 def compute_tool_origins(planned: PlaneLineGroups, design: np.ndarray) -> np.ndarray:
-    """Tool origins (u, k, 3) of designs."""
+    """Return tool origins (u, k, 3) of designs."""
     x = planned.place_points(design)
     T = inverse(planned.robot, x.reshape(-1, x.shape[2])).T @ planned.robot.tool
     return T[:, :3, 3].reshape(*x.shape[:2], 3)

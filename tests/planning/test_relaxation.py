@@ -78,7 +78,7 @@ def test_optimal_design_satisfies_the_equivalence_theorem() -> None:
 def find_best_value(
     rows: Array, n: int, criterion: Criterion, start: PriorInformation, found
 ) -> float:
-    """Best value of all subsets."""
+    """Return the best criterion value of all subsets."""
     values = [
         evaluate_criterion(
             criterion, factor_design(rows[list(chosen)], start, found.space), found.space.machine

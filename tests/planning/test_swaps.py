@@ -29,7 +29,7 @@ NAMES = [
 
 
 def build_random_scoring(criterion: Criterion, nuisance: int, prior: bool) -> tuple[Scoring, Array]:
-    """A random problem's scoring and rows."""
+    """Return scoring and scaled rows of a random problem."""
     rows = draw_rows(nuisance=nuisance)
     start = (
         PriorInformation.from_tolerances(4, nuisance)

@@ -80,7 +80,7 @@ def samples(data_folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def printer(samples, tmp_path_factory) -> tuple[Mechanism, Measurements]:
-    """The real machine before calibration, and what was measured."""
+    """The nominal robot of the real machine, and its measurements."""
     return build_machine(tmp_path_factory.mktemp("real"), samples, SIGMA)
 
 
@@ -290,8 +290,10 @@ def test_fits_of_the_spool_models_give_the_numbers_of_the_page(fits, root):
 
 
 def test_data_support_a_separate_build_up_for_line_d_only(fits):
-    """By how much chi-square falls; noise is below 3.84 (1 parameter), 5.99 (2), 7.81 (3) in 95 %,
-    10.8 (1) in 99.9 % of cases.
+    """Compare decreases of chi-square with its quantiles.
+
+    By noise alone they are below 3.84 (1 parameter), 5.99 (2), 7.81 (3) in 95 % and below 10.8 (1)
+    in 99.9 % of cases.
 
     Divided by chi-square per degree of freedom of the larger model, as the 0.6 mm were found with
     one of the models.

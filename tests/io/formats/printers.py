@@ -32,8 +32,9 @@ SAVED = """
 
 
 def format_printer_cfg(record: dict[str, Any], stop_offset: float = 0.0) -> str:
-    """Return the text; tower a's numbers in the main part, the others saved, and Klipper's defaults
-    left out.
+    """Return the text of a printer.cfg without Klipper's defaults.
+
+    The numbers of tower a are in the main part, the others in the saved block.
 
     Parameters
     ----------

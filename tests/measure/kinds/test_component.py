@@ -21,7 +21,7 @@ def make_poses(phi, theta, psi):
 
 
 def map_covariance(kind, T, measured, covariance):
-    """Covariance of the residuals (r, m, m) from that of rotation error and position (r, 6, 6)."""
+    """Return the covariance of the residuals (r, m, m) from that of full poses (r, 6, 6)."""
     rows = kind.evaluate(T, measured).jacobian[0]
     return rows @ covariance @ np.swapaxes(rows, -1, -2)
 

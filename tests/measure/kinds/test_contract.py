@@ -30,7 +30,7 @@ every_kind = pytest.mark.parametrize("kind", EXAMPLES)
 
 
 def platform_poses(kind, t, r, seed=0, spread=0.4):
-    """Random platform poses (t, r, 4, 4), with an axis of links where the kind has them."""
+    """Return random platform poses (t, r, 4, 4), or (t, r, 2, 4, 4) for kinds of pose pairs."""
     shape = (t, r, 6) if kind.poses_per_row == 1 else (t, r, kind.poses_per_row, 6)
     return geometry.apply_twist(
         np.eye(4), np.random.default_rng(seed).uniform(-spread, spread, shape)
