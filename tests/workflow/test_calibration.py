@@ -308,3 +308,10 @@ def test_held_out_poses_that_determine_nothing_but_their_own_frames_leave_the_ve
     (finding,) = [f for f in report.findings if f.code == "workflow.held-out-setup"]
     assert finding.data == {"values": 48, "setup": 48}
     assert report.next_step.code == "workflow.next-hold-out-more"
+
+
+def test_suggestions_use_the_rank_tolerance_of_the_fit(robot, data) -> None:
+    fit = replace(CalibrationOptions().fit, rank_tolerance=0.05)
+    report = calibrate(robot, data, CalibrationOptions(fit=fit))
+    assert report.identification.unidentifiable
+    assert report.suggestions

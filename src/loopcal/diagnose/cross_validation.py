@@ -37,6 +37,9 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import decompose
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
+NOTHING_LEFT = 1e-12
+"""Determinant of 1 - leverage of a block below which the other blocks do not determine its rows."""
+
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
@@ -226,7 +229,7 @@ def score_leave_one_out(
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))
         remaining = np.eye(A.shape[1]) - H
-        singular = np.linalg.det(remaining) <= 1e-12
+        singular = np.linalg.det(remaining) <= NOTHING_LEFT
         remaining = np.where(singular[..., None, None], np.eye(A.shape[1]), remaining)
         deleted = np.linalg.solve(remaining, residual[..., None])[..., 0]
         square += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)

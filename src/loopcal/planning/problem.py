@@ -31,6 +31,7 @@ from loopcal.planning.design import (
     factor_rows,
     find_observable_space,
     is_allowed,
+    is_full_rank,
 )
 from loopcal.planning.options import PlanOptions, Target
 from loopcal.planning.pose_groups import (
@@ -167,7 +168,7 @@ class PlanningProblem:
             rows = self.prior.rows[:, self.prior.n_nuisance :] @ self.space.machine
             factor = factor_rows(np.concatenate([rows, np.zeros((rows.shape[1], rows.shape[1]))]))
         s = np.linalg.svd(factor, compute_uv=False)
-        if not s[-1] > np.finfo(float).eps * len(s) * s[0]:
+        if not is_full_rank(s):
             return None
         k = len(self.prediction)
         rms = [

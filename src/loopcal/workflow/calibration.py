@@ -202,7 +202,7 @@ def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSugges
     """Return further measurements that determine open combinations; None where none is open."""
     if not fit.converged or not fit.unidentifiable:
         return None
-    return suggest_measurements(identifiability(fit.robot, data))
+    return suggest_measurements(identifiability(fit.robot, data, fit.options.rank_tolerance))
 
 
 def _report_conventions(check: ConventionCheck) -> list[Finding]:

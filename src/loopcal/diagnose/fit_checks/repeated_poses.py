@@ -30,6 +30,11 @@ from loopcal.typing import IntArray
 SAME_READING = 1e-9
 """Readings [m] or [rad] that differ by less belong to repeats of one pose."""
 
+UNMEASURED = 1e-12
+"""Singular values of the whiteners of repeats below this share of the largest belong to components
+that no repeat measured, which have no mean. Stated sigmas differ by less than that.
+"""
+
 LEVEL = 0.01
 """Probability below which the lack of fit exceeds the pure error."""
 
@@ -117,7 +122,7 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
             present = np.einsum("rii->ri", W) != 0.0
             A = W.reshape(-1, W.shape[-1])
             b = np.where(present, residual.whitened[0, chosen], 0.0).ravel()
-            mean, _, rank, _ = np.linalg.lstsq(A, b, rcond=1e-12)
+            mean, _, rank, _ = np.linalg.lstsq(A, b, rcond=UNMEASURED)
             total += float(((b - A @ mean) ** 2).sum())
             degrees += int(present.sum()) - int(rank)
     return total, degrees

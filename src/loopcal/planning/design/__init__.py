@@ -14,6 +14,7 @@ from loopcal.planning.design.criteria import E as E
 from loopcal.planning.design.criteria import I as I
 from loopcal.planning.design.criteria import compute_efficiency as compute_efficiency
 from loopcal.planning.design.criteria import evaluate_criterion as evaluate_criterion
+from loopcal.planning.design.criteria import is_full_rank as is_full_rank
 from loopcal.planning.design.design_space import Design as Design
 from loopcal.planning.design.design_space import ObservableSpace as ObservableSpace
 from loopcal.planning.design.design_space import PriorInformation as PriorInformation

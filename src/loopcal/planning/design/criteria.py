@@ -63,6 +63,16 @@ class E:
 Criterion = D | I | A | E
 
 
+def is_full_rank(singular_values: FloatArray) -> bool:
+    """Return whether a triangular factor with these descending singular values can be inverted.
+
+    The threshold is the rounding of the decomposition: a design that determines a direction barely
+    is poor, and the criterion says so, but it is not singular.
+    """
+    s = singular_values
+    return not s.size or bool(s[-1] > np.finfo(np.float64).eps * len(s) * s[0])
+
+
 def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatArray) -> float:
     """Return the value of a criterion.
 
@@ -76,7 +86,7 @@ def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatA
     value : -inf for D and inf for the others where R is singular.
     """
     s = np.linalg.svd(factor, compute_uv=False)
-    if s.size and not s[-1] > np.finfo(np.float64).eps * len(s) * s[0]:
+    if not is_full_rank(s):
         return -np.inf if isinstance(criterion, D) else np.inf
     match criterion:
         case D():
