@@ -150,10 +150,21 @@ class Measurements:
         Raises
         ------
         DataError
-            If a pose does not exist, is named twice, or none is left.
+            If a pose does not exist, is named twice, none is left, or `poses` is neither indices
+            nor a mask of all poses.
         """
         given = np.asarray(poses)
-        chosen = np.flatnonzero(given) if given.dtype == bool else given.astype(np.intp)
+        is_mask = given.dtype == bool
+        if given.size and not is_mask and not np.issubdtype(given.dtype, np.integer):
+            raise DataError(
+                f"poses: got an array of type {given.dtype}; give indices, or a mask of booleans"
+            )
+        if is_mask and given.shape != (self.n_poses,):
+            raise DataError(
+                f"the mask of poses has shape {given.shape}; give ({self.n_poses},), one for each "
+                "pose"
+            )
+        chosen = np.flatnonzero(given) if is_mask else given.astype(np.intp)
         outside = (chosen < 0) | (chosen >= self.n_poses)
         if np.any(outside) or len(np.unique(chosen)) < len(chosen) or not len(chosen):
             raise DataError(

@@ -37,7 +37,7 @@ class StatedValue:
     Raises
     ------
     DataError
-        If the standard deviation is negative or not finite.
+        If the standard deviation is negative, or a number is not finite.
     """
 
     name: str
@@ -50,6 +50,8 @@ class StatedValue:
                 f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, or "
                 "0 to fix the parameter"
             )
+        if self.nominal is not None and not np.isfinite(self.nominal):
+            raise DataError(f"the value of {self.name!r} is {self.nominal}; give a finite number")
 
     def apply_to(self, entry: Parameter) -> Parameter:
         """Return the parameter with this prior or fixed value."""

@@ -140,7 +140,8 @@ class Observations:
         Raises
         ------
         DataError
-            As the class, and if sigma does not have one number for each noise column.
+            As the class, and if sigma is negative or does not have one number for each noise
+            column.
         """
         check_type(kind, Kind, "kind", "such as loopcal.Pose()")
         try:
@@ -159,6 +160,8 @@ class Observations:
             )
         shape = (len(values), len(kind.noise_columns))
         sd = _broadcast(sigma, shape, "sigma", f"one number, or one for each of {names}")
+        if np.any(sd < 0.0):
+            raise DataError(f"sigma contains {np.nanmin(sd):.6g}; give numbers above 0")
         N = kind.linearize_noise(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
         of_session, of_group = np.asarray(session), np.asarray(group)

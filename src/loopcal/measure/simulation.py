@@ -152,11 +152,15 @@ def simulate_trials(
     Raises
     ------
     DataError
-        If the controller cannot reach a pose, or a setup parameter does not exist.
+        If the controller cannot reach a pose, a setup parameter does not exist, or `truth` has
+        another shape.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
-    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, None))
+    shape = (None, len(robot.parameters))
+    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", shape)
+    if not len(values):
+        raise DataError("truth has no row; give the parameter values of at least one machine")
     commanded = solve_commanded_poses(robot.nominal if controller is None else controller, poses)
     readings, n = commanded.q, len(commanded.q)
     assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))

@@ -124,7 +124,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     ArgumentTypeError
         Not a robot, not numbers, or not a Solution.
     """
-    begin = _check_arguments("forward", robot, start)
+    begin = check_arguments("forward", robot, start)
     a = len(robot.actuators)
     readings = np.atleast_2d(_as_numbers(q, f"readings, numbers of shape (n, {a})"))
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
@@ -159,7 +159,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     ArgumentTypeError
         Not a robot, not numbers, or not a Solution.
     """
-    begin = _check_arguments("inverse", robot, start)
+    begin = check_arguments("inverse", robot, start)
     c = len(robot.controlled)
     shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
     wanted = _as_numbers(target, shapes)
@@ -309,7 +309,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     return out
 
 
-def _check_arguments(function: str, robot: object, start: object) -> State | None:
+def check_arguments(function: str, robot: object, start: object = None) -> State | None:
     """Return the state of a start; refuse anything but a Mechanism and a Solution or None."""
     if not isinstance(robot, Mechanism):
         raise ArgumentTypeError(

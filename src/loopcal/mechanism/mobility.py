@@ -48,7 +48,7 @@ def check_mobility(robot: Mechanism) -> Mechanism:
     names = [AXES[f] for f in program.freedoms]
     _, s, V = np.linalg.svd(A, full_matrices=True)
     m, a = len(names), program.n_joints
-    rank = int((s > RANK * max(s[0], 1e-300)).sum()) if len(s) else 0
+    rank = _count_rank(s)
     if rank < m:
         finding = report_finding(
             "mechanism.free-platform",
@@ -61,7 +61,7 @@ def check_mobility(robot: Mechanism) -> Mechanism:
         raise MechanismError(finding)
     _, both, W = np.linalg.svd(np.concatenate([A, Q], axis=1), full_matrices=True)
     # motions with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
-    independent = int((both > RANK * both[0]).sum())
+    independent = _count_rank(both)
     motions = W[independent:, :m]
     movable = len(motions)
     if movable < min(a, m):
@@ -107,7 +107,7 @@ def _check_controlled(robot: Mechanism, movable: int, D: FloatArray) -> None:
     """
     columns = _differentiate_controlled(robot, robot.home)
     s = np.linalg.svd(columns @ D, compute_uv=False)
-    if (s > RANK * s.max(initial=1e-300)).sum() < movable:
+    if _count_rank(s) < movable:
         raise MechanismError(_word_dependent(robot, movable))
 
 
@@ -122,7 +122,7 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     columns = _differentiate_controlled(robot, state.T[0, 0])
     scale = 1 / robot.twist_scale[list(program.freedoms)]
     s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
-    if len(s) < len(scale) or (s <= RANK * s[0]).any():
+    if _count_rank(s) < len(scale):
         raise MechanismError(_word_dependent(robot, len(robot.controlled)))
 
 
@@ -174,12 +174,16 @@ def _find_dependent_columns(U: FloatArray) -> list[int]:
     while True:
         rest = [c for c in range(U.shape[1]) if c not in chosen]
         _, s, V = np.linalg.svd(U[:, rest])
-        rank = int((s > RANK * s.max(initial=1e-300)).sum())
-        if rank == len(rest):
+        if _count_rank(s) == len(rest):
             return chosen
         part = np.abs(V[-1])
         # of equal components the first, whatever their rounding errors
         chosen.append(rest[int(np.argmax(part > (1 - 1e-6) * part.max()))])
+
+
+def _count_rank(s: FloatArray) -> int:
+    """Return how many singular values are above RANK times the largest one."""
+    return int((s > RANK * s.max(initial=1e-300)).sum())
 
 
 def list_main_freedoms(names: Sequence[str], direction: FloatArray) -> list[str]:

@@ -23,7 +23,7 @@ from loopcal.mechanism.batch_kinematics import (
     compute_readings,
     inverse_trials,
 )
-from loopcal.mechanism.kinematics import Solution, make_solution
+from loopcal.mechanism.kinematics import Solution, check_arguments, make_solution
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
 from loopcal.mechanism.transmission import joints_from_readings
@@ -113,6 +113,7 @@ def find_assembly_modes(
     MechanismError
         New modes were still found after `max_starts` starts.
     """
+    check_arguments("find_assembly_modes", robot)
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):
         raise DataError(
@@ -152,6 +153,7 @@ def find_working_modes(
     Modes differ in their readings, and in their poses if the machine has fewer controlled
     coordinates than freedoms. Parameters, result and errors as for `find_assembly_modes`.
     """
+    check_arguments("find_working_modes", robot)
     wanted = np.asarray(target, dtype=float).reshape(-1)
     if len(wanted) != len(robot.controlled):
         raise DataError(
