@@ -157,10 +157,7 @@ def simulate_trials(
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
-    shape = (None, len(robot.parameters))
-    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", shape)
-    if not len(values):
-        raise DataError("truth has no row; give the parameter values of at least one machine")
+    values = _check_truth(robot, truth)
     commanded = solve_commanded_poses(robot.nominal if controller is None else controller, poses)
     readings, n = commanded.q, len(commanded.q)
     assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))
@@ -270,6 +267,14 @@ def replace_measured_values(
     )
     measured = simulate(robot, nominal.T, Instrument(sensors), seed, controller=robot.nominal)
     return replace(data, observations=measured.observations)
+
+
+def _check_truth(robot: Mechanism, truth: ArrayLike) -> FloatArray:
+    """Return true parameter values (t, p) of at least one machine, checked."""
+    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, len(robot.parameters)))
+    if not len(values):
+        raise DataError("truth has no row; give the parameter values of at least one machine")
+    return values
 
 
 def _measure_sensor(

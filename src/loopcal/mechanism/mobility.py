@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.errors import MechanismError
@@ -181,7 +183,7 @@ def _find_dependent_columns(U: FloatArray) -> list[int]:
         chosen.append(rest[int(np.argmax(part > (1 - 1e-6) * part.max()))])
 
 
-def _count_rank(s: FloatArray) -> int:
+def _count_rank(s: NDArray[np.floating[Any]]) -> int:
     """Return how many singular values are above RANK times the largest one."""
     return int((s > RANK * s.max(initial=1e-300)).sum())
 
