@@ -43,6 +43,19 @@ def test_narrow_table_breaks_headings_and_words_but_no_number(width):
     assert all(cell in text for cell in ("0.05", "1.25", "12.5", "[mm]"))
 
 
+def test_heading_of_numbers_and_caption_are_broken_between_words():
+    columns = (word_column("method"), Column("drop of chi-square"), Column("degrees of freedom"))
+    table = Table("Left out, one by one", columns, (("leg by leg", "1.373e+04", "12"),))
+    assert table.to_text(34).split("\n") == [
+        "Left out, one by one",
+        "method         drop of  degrees of",
+        "            chi-square     freedom",
+        "─" * 34,
+        "leg by leg   1.373e+04          12",
+    ]
+    assert table.to_text(12).startswith("Left out,\none by one\n")
+
+
 def test_csv_and_html_contain_the_same_cells():
     assert TABLE.to_csv().splitlines()[0] == "of,rms [mm],largest [mm]"
     assert TABLE.to_csv().splitlines()[2] == "x & y,12.5,-"

@@ -67,15 +67,16 @@ class Table:
 
         Parameters
         ----------
-        width : characters of a line. Columns that wrap are narrowed to keep to it; where that is
-            not enough the table is wider. Default: no limit.
+        width : characters of a line. Headings and columns that wrap are broken to keep to it; where
+            that is not enough the table is wider. Default: no limit.
         """
         headings = [column.heading for column in self.columns]
         widths = self._natural_widths(headings)
         if width is not None and _total(widths) > width:
             headings = [heading.replace(" [", "\n[") for heading in headings]
             widths = self._narrowed(self._natural_widths(headings), width)
-        lines = [self.caption] if self.caption else []
+        page = width or len(self.caption) or 1
+        lines = textwrap.wrap(self.caption, page, break_long_words=False)
         lines += self._lines(headings, widths)
         lines.append(RULE * _total(widths))
         for row in self.rows:
@@ -113,14 +114,24 @@ class Table:
         ]
 
     def _narrowed(self, widths: list[int], width: int) -> list[int]:
-        """Return the widths with wrapping columns narrowed, the widest first."""
-        wrapping = [i for i, column in enumerate(self.columns) if column.wraps]
+        """Return the widths with columns narrowed, the widest first: wrapping columns to
+        NARROWEST, all others to their widest cell or the longest word of their heading.
+        """
+        least = [
+            NARROWEST if column.wraps else self._widest_unbroken(i)
+            for i, column in enumerate(self.columns)
+        ]
         while _total(widths) > width:
-            widest = max(wrapping, key=lambda i: widths[i], default=None)
-            if widest is None or widths[widest] <= NARROWEST:
+            spare = [i for i in range(len(widths)) if widths[i] > least[i]]
+            if not spare:
                 break
-            widths[widest] -= 1
+            widths[max(spare, key=widths.__getitem__)] -= 1
         return widths
+
+    def _widest_unbroken(self, i: int) -> int:
+        """Return the characters that a column needs if only its heading may be broken."""
+        cells = [line for row in self.rows for line in row[i].split("\n")]
+        return max(map(len, [*cells, *self.columns[i].heading.split()]))
 
     def _lines(self, cells: Sequence[str], widths: Sequence[int]) -> list[str]:
         """Return the lines of one row."""
