@@ -169,6 +169,7 @@ def test_existing_file_is_replaced_only_with_force(folder, capsys, data_folder) 
         ("import no.cfg -o x.yaml", "no.cfg: this printer.cfg does not exist"),
         ("import a.txt -o x.yaml", "the format of this file is not known by its ending"),
         ("import a.csv -o x.yaml", "loopcal writes the format csv, but cannot read it"),
+        ("import a.csv -o x.yaml", "an instrument's export with a profile (--profile"),
         (
             "import a.cfg -o x.yaml --corrected y.cfg",
             "state where to write them, such as --data data.csv",

@@ -40,7 +40,7 @@ def test_measurement_template_lacks_only_rows(tmp_path, capsys) -> None:
     )
     assert "Optional columns: block, session, group, time" in template.read_text()
     assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 1
-    assert "has a header but no rows; add one row for each measured pose" in capsys.readouterr().err
+    assert "has a header but no rows; add one row for each pose" in capsys.readouterr().err
     rows = [f"p{i},{150 + 7 * i},{150 + i * i},{160 - 3 * i},100.0" for i in range(12)]
     template.write_text(template.read_text() + "\n".join(rows) + "\n")
     assert (

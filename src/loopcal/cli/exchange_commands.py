@@ -165,7 +165,8 @@ def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
     if source.read is None:
         raise DataError(
             f"loopcal writes the format {source.name}, but cannot read it; it reads "
-            f"{', '.join(READ_FORMATS)}"
+            f"{', '.join(READ_FORMATS)}, and an instrument's export with a profile (--profile, "
+            "docs/exports.md)"
         )
     return source.read
 

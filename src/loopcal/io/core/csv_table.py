@@ -166,7 +166,7 @@ def read_table(path: str | Path) -> Table:
     units = _parse_header(path, header_line, header)
     rows = tuple(_parse_row(path, line, text, len(units)) for line, text in numbered[1:])
     if not rows:
-        sentence = "this file has a header but no rows; add one row for each measured pose"
+        sentence = "this file has a header but no rows; add one row for each pose"
         raise FileError(sentence, path, header_line)
     return Table(path, settings, header_line, units, rows, tuple(line for line, _ in numbered[1:]))
 
