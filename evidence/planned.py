@@ -52,7 +52,7 @@ NOISE_FACTORS = (0.2, 1.0, 10.0)
 
 @dataclass(frozen=True)
 class Case:
-    """A robot, the measured part of its pose, and the error that the plan makes small."""
+    """A robot, the measured part of its pose, and the error that the plan minimizes."""
 
     robot: str
     measured: str

@@ -74,18 +74,18 @@ class ReferenceSolution:
 
 
 def load_real_samples(data_folder: Path) -> dict[str, Any]:
-    """The samples of a real machine."""
+    """Load the samples of a real machine."""
     return json.loads((data_folder / "cable_robot" / "hp_mark_adjusted.json").read_text("utf-8"))
 
 
 def gear_and_line_ratios(found: dict[str, Any]) -> tuple[float, Array]:
-    """Gear g, and line moved for line unwound (4,)."""
+    """Return the gear ratio g, and line moved over line unwound (4,)."""
     gear = found["motor_gear_teeth"] / found["spool_gear_teeth"]
     return gear, np.array(found["lines_per_spool"]) / np.array(found["mechanical_advantage"])
 
 
 def compute_paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Array:
-    """Line paid out at the motor angles (N, 4) [mm]."""
+    """Return the line paid out at the motor angles (N, 4) [mm]."""
     gear, s = gear_and_line_ratios(found)
     turn = gear * np.radians(found["motor_pos_samp"])
     return s * (radius * turn - buildup * turn**2 / 4)
@@ -94,7 +94,7 @@ def compute_paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Ar
 def compute_motor_angles(
     found: dict[str, Any], radius: float, buildup: Array, paid: Array
 ) -> tuple[Array, Array]:
-    """Motor angles (N, 4) [rad] that pay out this much, and the line's change per radian there."""
+    """Return motor angles (N, 4) [rad] for the line paid out, and the derivative of the line."""
     gear, s = gear_and_line_ratios(found)
     # r t - b t^2 / 4 = u has the root t = 2 u / (r + sqrt(r^2 - b u)), and dt/du = 1 / sqrt(r^2 - b
     # u)
@@ -164,13 +164,13 @@ def solve_reference(
 
 
 def _split(p: Array) -> tuple[Array, Array, float, Array]:
-    """Anchors (4, 3), lengths (4,), radius and build-ups (4,)."""
+    """Return anchors (4, 3), lengths (4,), radius and build-ups (4,)."""
     limbs = p[:16].reshape(4, 4)
     return limbs[:, :3], limbs[:, 3], float(p[16]), p[17:21]
 
 
 def _first_poses(found: dict[str, Any], start: Array) -> Array:
-    """Poses by least squares on the lines of each, from the known position or from above the
+    """Estimate poses by least squares on their lines, from the known position or from above the
     origin.
     """
     known = np.array(found["xyz_of_samp"])
@@ -186,9 +186,7 @@ def _first_poses(found: dict[str, Any], start: Array) -> Array:
 
 
 def simulate_example(seed: int = 11) -> dict[str, Any]:
-    """Samples of the example's machine: 9 known poses, 8 of them on the bed, and 36 unknown ones;
-    with noise.
-    """
+    """Simulate noisy samples of the example: 9 known poses (8 on the bed) and 36 unknown ones."""
     rng = np.random.default_rng(seed)
     ring = 0.25 * np.pi * np.arange(8)
     bed = np.column_stack([320 * np.cos(ring), 320 * np.sin(ring), np.zeros(8)])
@@ -212,13 +210,13 @@ def simulate_example(seed: int = 11) -> dict[str, Any]:
 
 
 def format_samples(found: dict[str, Any]) -> str:
-    """The file, one row of numbers on a line."""
+    """Return the text of a file of samples, one row of numbers on a line."""
     rows = [f'  "{key}": {_rows(value)}' for key, value in found.items()]
     return "{\n" + ",\n".join(rows) + "\n}\n"
 
 
 def _rows(value: Any) -> str:
-    """JSON of a value; lists of lists with one inner list on a line."""
+    """Return the JSON of a value; nested lists have one inner list on a line."""
     if isinstance(value, list) and value and isinstance(value[0], list):
         return "[\n    " + ",\n    ".join(json.dumps(row) for row in value) + "\n  ]"
     return json.dumps(value)

@@ -119,7 +119,7 @@ def hexapod() -> Mechanism:
 
 
 def hexapod_truth() -> Array:
-    """Its true values (42,), Tables 2 and 3 added."""
+    """Return the true values of `hexapod` (42,): Table 2 plus Table 3."""
     return hexapod().values + gough_values(
         HEXAPOD_ERRORS[:, :3] * MM, HEXAPOD_ERRORS[:, 4:] * MM, HEXAPOD_ERRORS[:, 3] * MM
     )
@@ -136,7 +136,7 @@ def nategh() -> Mechanism:
 
 
 def nategh_truth() -> Array:
-    """Its true values (42,), errors up to 5 mm."""
+    """Return the true values of `nategh` (42,), with errors up to 5 mm."""
     return gough_values(NATEGH_TRUE_BASE * MM, NATEGH_TRUE_PLATFORM * MM, NATEGH_TRUE_LENGTHS * MM)
 
 
@@ -170,7 +170,7 @@ def gough(
 
 
 def gough_values(base: Array, platform: Array, lengths: Array) -> Array:
-    """Values (42,) in the order of a hexapod's parameters: base, platform and length, leg by leg."""  # noqa: E501
+    """Return values (42,) in the order of parameters: base, platform and length, leg by leg."""
     return np.column_stack([base, platform, lengths]).ravel()
 
 
@@ -329,7 +329,7 @@ def mixed_hexapod() -> Mechanism:
 
 @cache
 def mixed_hexapod_assembly(seed: int = 7) -> Assembly:
-    """Axes and offsets are random about the legs of a hexapod, so that nothing is zero by symmetry."""  # noqa: E501
+    """Draw axes and offsets about the legs of a hexapod: no entry is zero by symmetry."""
     rng = np.random.default_rng(seed)
     home = geometry.make_pose(
         geometry.exp_so3(np.array([0.05, -0.08, 0.1])), np.array([0.01, -0.02, 0.25])
@@ -372,8 +372,7 @@ def random_limb(
     home: Array,
     motor: str,
 ) -> Limb:
-    """A limb that closes at `home`: joint frames at random about the line from foot to corner, H
-    for a screw.
+    """Draw a limb that closes at `home`: random joint frames from foot to corner (H: screw).
 
     `driven` is the joint that `motor` drives; -1 for the rod of a `distance` ending.
     """
@@ -422,7 +421,7 @@ def random_limb(
 
 
 def _frame(rng: np.random.Generator, leg: Array, kind: str) -> Array:
-    """A rotation whose z axis lies near the leg for P, across it for R and askew for H."""
+    """Draw a rotation with its z axis near the leg for P, across it for R and skew for H."""
     z = leg / np.linalg.norm(leg) + 0.2 * rng.normal(size=3)
     if kind != "P":
         z = np.cross(z, rng.normal(size=3)) + (0.3 * z if kind == "H" else 0.0)
@@ -432,7 +431,7 @@ def _frame(rng: np.random.Generator, leg: Array, kind: str) -> Array:
 
 
 def _motion(joint: Joint) -> Array:
-    """The transform of a joint at its start value."""
+    """Return the transform of a joint at its start value."""
     if joint.kind == "P":
         return place((0, 0, joint.start))
     return place((0, 0, joint.pitch * joint.start), (0, 0, joint.start))

@@ -132,7 +132,7 @@ def list_slips(check: ConventionCheck) -> list[dict]:
 
 
 def has_slip(check: ConventionCheck, slip: str, **details) -> bool:
-    """Whether this slip is among the interpretations."""
+    """Return whether this slip is among the interpretations."""
     wanted = {"slip": slip, **details}
     return any(wanted.items() <= one.items() for one in list_slips(check))
 
@@ -481,8 +481,8 @@ def test_wrong_unit_of_readings_is_named_when_no_pose_is_reachable() -> None:
 
 @pytest.mark.slow
 def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None:
-    """The hexapod study prints Rz(a) Ry(b) Rx(c), but its Table 4 was made with the angles in the
-    opposite order.
+    """The hexapod study prints Rz(a) Ry(b) Rx(c), but its Table 4 was computed with the opposite
+    order.
     """
     from loopcal.measure import Observations
     from loopcal.papers.hexapod_42.published import MM, load_nominal_machine, read_published

@@ -100,7 +100,7 @@ def measure_motion(program: Program, state: State, of: State, free: bool = False
 def pose_demand(
     target: Array, size: float
 ) -> Callable[[Array, NDArray[np.int64]], tuple[Array, Array]]:
-    """The task of reaching poses (N, 4, 4), all six freedoms."""
+    """Return the task of reaching poses (N, 4, 4) with all six freedoms."""
 
     def task(T: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
         gap = geometry.pose_difference(T, target[rows])
@@ -182,7 +182,7 @@ def limb_residual(
 
 
 def closure_gap(program: Program, state: State, e: Array) -> Array:
-    """Norm of the plain closure residual (t, n) [m]."""
+    """Return the norm of the independent closure residual (t, n) [m]."""
     t, n = state.T.shape[:2]
     out = np.zeros((t, n))
     for group, joints in zip(program.groups, state.joints, strict=True):

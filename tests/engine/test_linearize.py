@@ -169,8 +169,9 @@ def test_derivatives_of_free_actuators_agree_with_differences_and_jax(engine, ro
 
 
 def assert_close_columns(found, reference, unit):
-    """Columns agree to rounding of the largest entry (a few hundred operations, times the
-    condition).
+    """Assert that columns agree to rounding of the largest entry.
+
+    Rounding is that of a few hundred operations times the condition.
     """
     assert_allclose(found * unit, reference * unit, atol=1e-11 * np.abs(reference * unit).max())
 

@@ -27,7 +27,7 @@ FIELDS = ("T", "status", "residual", "iterations", "closure_sign")
 
 
 def assert_same(a, b):
-    """Two states agree bit for bit."""
+    """Assert that two states are equal bit for bit."""
     for field in FIELDS:
         assert_array_equal(getattr(a, field), getattr(b, field), err_msg=field)
     for x, y in zip(a.joints, b.joints, strict=True):
@@ -35,7 +35,7 @@ def assert_same(a, b):
 
 
 def take_rows(state, trials, rows):
-    """Chosen trials and rows of a state."""
+    """Select trials and rows of a state."""
     pick = {field: getattr(state, field)[trials][:, rows] for field in FIELDS}
     return replace(state, joints=tuple(j[trials][:, rows] for j in state.joints), **pick)
 

@@ -18,7 +18,7 @@ COMPLEX_STEP = 1e-30
 
 @dataclass(frozen=True)
 class Certified:
-    """One data set with what NIST certifies."""
+    """A data set with its certified values."""
 
     name: str
     starts: np.ndarray  # (2, p)

@@ -51,7 +51,7 @@ class Unreachable:
 
 
 def make_problem(functions):
-    """The problem that functions of this module define."""
+    """Return the problem of an object of this module."""
     return FunctionProblem(functions.parameters, functions.evaluate, functions.equations)
 
 

@@ -46,8 +46,9 @@ class Problem:
 
 
 def random_problem(rng, unseen):
-    """Up to three sessions of up to four groups, which share unknowns of the machine; `unseen`
-    directions over all of them.
+    """Draw up to three sessions of up to four groups that share unknowns of the machine.
+
+    `unseen` directions over all of them are unobservable.
     """
     scopes, sets = ["machine"] * int(rng.integers(0, 4)), []
     shared = list(range(len(scopes)))
@@ -77,9 +78,7 @@ def random_problem(rng, unseen):
 
 
 def fold_problem(problem, tree):
-    """The factors of a problem, its rows folded in two blocks; the rows without unknowns are left
-    out.
-    """
+    """Fold the rows of a problem in two blocks, without the rows that use no unknown."""
     factors = NodeFactors(tree, 1, problem.right.shape[1] - 1)
     for half in (slice(0, None, 2), slice(1, None, 2)):
         F, right, of = problem.F[half], problem.right[half], problem.of[half]
@@ -96,8 +95,8 @@ def fold_problem(problem, tree):
 
 
 def eliminate_dense(problem, tree):
-    """Best values, their variance, what is open, rank, and the rows left, by one pseudo-inverse for
-    each cluster.
+    """Return best values, variances, unobservable unknowns, rank and remaining rows, by one
+    pseudo-inverse for each cluster.
     """
     U = len(problem.free)
     best, variance, open_, rank = (
@@ -239,7 +238,7 @@ def test_elimination_tree_without_free_unknowns_is_empty():
 
 
 def simulate_probed_planes(groups, per_group=6, seed=1):
-    """A hexapod that probes planes, in turn; all share the offset of one probe."""
+    """Simulate a hexapod that probes planes in turn with a probe of one offset."""
     n = groups * per_group
     group = np.array([f"plate{i % groups}" for i in range(n)])
     sensor = Sensor(PROBE, Gaussian(np.full(1, 5e-6)), group=group)
@@ -254,9 +253,7 @@ def simulate_probed_planes(groups, per_group=6, seed=1):
 
 
 def linearize_nominal(data):
-    """Factor of one fold at the nominal machine, own unknowns from where they are stated, and
-    these.
-    """
+    """Return the factor at the nominal machine and stated setup values, and the estimates."""
     free = select_free_parameters(hexapod())
     problem = problem_of(free, data)
     z = free.deviation(hexapod().values[None])

@@ -159,9 +159,7 @@ MACHINES, MINIMUM_WINS = 20, 17
 
 
 def compute_variances_and_errors(kinds):
-    """Variances predicted and squares of errors made (DRAWS,), parameters in tolerances, for
-    machines all alike.
-    """
+    """Return predicted variances and squared errors (MACHINES,) of parameters in tolerances."""
     robot = load_robot("hexapod-42")
     truth = sample_truth(robot, MACHINES, SEED)
     # 5 um and 5 urad: angles tell as much as lengths on a machine of this size
@@ -232,9 +230,7 @@ def test_unknown_frame_gives_the_robot_of_the_known_frame_up_to_its_gauge(kind):
 
 
 def find_locked_coordinates(truth, joint, constant, rng, n=12):
-    """Coordinates z, phi, theta (n, 3) at which a passive joint of a true 3-PRS has this value;
-    theta is sought.
-    """
+    """Solve for z, phi, theta (n, 3) at which a passive joint of a true 3-PRS has this value."""
     z, phi = rng.uniform(0.66, 0.74, 60), rng.uniform(-np.pi, np.pi, 60)
 
     def off(theta):

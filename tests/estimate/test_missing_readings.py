@@ -35,7 +35,7 @@ from tests.estimate.problems import UM, noise
 
 
 def simulate_with_missing_readings(name, sensors, n, seed, share=0.0, sigma=20 * UM):
-    """A robot, a true one, and measurements of n poses with this share of the readings not taken."""  # noqa: E501
+    """Return robot, true robot, and measurements of n poses with a share of readings missing."""
     robot = load_robot(name)
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
     data = simulate(
@@ -238,5 +238,5 @@ def test_pose_search_from_random_starts_is_bounded_and_never_increases_cost(
 
 
 def home_readings(robot):
-    """Readings (a,) of the home pose."""
+    """Return the readings (a,) of the home pose."""
     return inverse(robot, robot.home[None]).q[0]

@@ -18,9 +18,7 @@ from tests.estimate.problems import MM, UM, noise
 
 @pytest.fixture(scope="module")
 def cable():
-    """A four-line robot, its true positions, and measurements of them; readings have the noise that
-    the robot states.
-    """
+    """Return a four-line robot, true positions, and their measurements with noisy readings."""
     robot = load_robot("cable-4")
     positions = sample_workspace(robot, 8, 1).coordinates
     return (
@@ -31,7 +29,7 @@ def cable():
 
 
 def change_reading(data, sigma, off, pose=2, line=0):
-    """The measurements with one reading off [rad] and of another sigma [rad]."""
+    """Change a reading by `off` [rad] and state another sigma [rad] for it."""
     readings, stated = data.readings.copy(), data.reading_sigma.copy()
     readings[pose, line] += off
     stated[pose, line] = sigma

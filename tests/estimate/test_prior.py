@@ -22,7 +22,7 @@ LEG3 = slice(14, 21)
 
 
 def join_measurements(a, b):
-    """Two sets of measurements as one."""
+    """Join two sets of measurements."""
     rows = replace(b.observations[0], rows=b.observations[0].rows + a.n_poses)
     return replace(
         a,
@@ -96,7 +96,7 @@ def test_arrays_of_a_run_keep_the_posterior():
 
 
 def simulate_repaired(shift, seed=2, n=12):
-    """Measurements of the true hexapod with other values in leg 3."""
+    """Simulate the true hexapod with other values in leg 3."""
     truth = zoo.hexapod_truth().copy()
     truth[LEG3] += shift
     return simulate(

@@ -67,7 +67,7 @@ def make_trial_problem(sigma: float | None) -> Problem:
 
 
 def make_session_problem(sigma: float | None = None) -> Problem:
-    """Frames of three sessions, and planes of four groups that share a probe."""
+    """Return a problem with frames of three sessions, and planes of four groups with one probe."""
     day = np.repeat(["monday", "tuesday", "friday"], POSES // 3)
     plate = np.array([f"plate{i % 4}" for i in range(POSES)])
     return make_problem(
@@ -112,7 +112,7 @@ class Call:
 
 
 def list_arrays(at: Linearization) -> list[np.ndarray]:
-    """The arrays of a linearization."""
+    """Return the arrays of a linearization."""
     found = [at.factor, at.cost, at.equations, at.next_start.nuisance]
     if at.nuisance is not None:
         done = at.nuisance.elimination
@@ -123,7 +123,7 @@ def list_arrays(at: Linearization) -> list[np.ndarray]:
 
 
 def list_calls(problem: Problem) -> list[Call]:
-    """Linearizations at three points, from the first start and from a warm one."""
+    """Return linearizations at three points, from the first and from a warm start."""
     t, p = len(problem), problem.parameters
     nominal = np.zeros((t, p))
     first = problem.start(nominal)
@@ -134,7 +134,7 @@ def list_calls(problem: Problem) -> list[Call]:
 
 
 def assert_same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
-    """All arrays are equal, to the last bit."""
+    """Assert that all arrays are equal bit for bit."""
     assert len(found) == len(expected)
     for a, b in zip(found, expected, strict=True):
         assert_array_equal(a, b)

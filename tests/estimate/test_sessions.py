@@ -138,7 +138,7 @@ def test_moved_station_needs_a_frame_for_each_session():
 
 @cache
 def simulate_delta():
-    """A delta, whose base has no frame of its own to take up a wrong one, seen by a tracker."""
+    """Simulate a delta and a tracker; a delta has no base frame that could absorb a wrong one."""
     robot = lc.load_robot("linear-delta")
     truth = robot.with_values(
         robot.values

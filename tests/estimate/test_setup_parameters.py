@@ -64,7 +64,7 @@ def true_setup_values(*kinds):
 
 
 def make_machine(name, n):
-    """A nominal robot, true values within its tolerances, and poses."""
+    """Return a nominal robot, true values within its tolerances, and poses."""
     if name == "hexapod":
         return hexapod(), zoo.hexapod_truth(), hexapod_poses(n)
     robot = lc.load_robot(name)
@@ -81,7 +81,7 @@ def largest_error(errors, size):
 
 
 def simulate_mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
-    """Poses in a known frame and targets in an unknown one."""
+    """Simulate poses in a known frame and targets in an unknown one."""
     instrument = Instrument((make_sensor(Pose(), noise), make_sensor(TRACKER, noise)))
     truth = hexapod().with_values(zoo.hexapod_truth())
     return simulate(

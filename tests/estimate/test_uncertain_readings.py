@@ -57,14 +57,14 @@ def pose_estimates(fit):
 
 
 def largest_difference(a, b):
-    """Of two fits, in standard deviations of the second: estimates, and covariances."""
+    """Return the largest differences of estimates and covariances, in sd of the second fit."""
     return np.abs((a.estimate - b.estimate) / b.standard_deviations).max(), np.abs(
         (a.covariance - b.covariance) / np.outer(b.standard_deviations, b.standard_deviations)
     ).max()
 
 
 def make_case(name):
-    """A robot and its measurements with exact readings."""
+    """Return a robot and its measurements with exact readings."""
     if name == "hexapod":
         return hexapod(), simulate_hexapod(12, None)
     if name == "hexapod, frame unknown":
@@ -178,7 +178,7 @@ def test_noisy_and_missing_readings_and_linked_poses_equal_the_dense_solution():
 
 @pytest.fixture(scope="module")
 def cable():
-    """A four-line robot, a true one, and positions in its workspace."""
+    """Return a four-line robot, the true one, and positions in its workspace."""
     robot = load_robot("cable-4")
     return (
         robot,
@@ -249,8 +249,8 @@ def test_readings_alone_determine_a_cable_robot_up_to_its_gauge(cable):
 
 
 def test_leg_sensors_determine_all_but_the_frames_with_and_without_noise():
-    """42 parameters less six of the platform's frame and three of where the base is: its turn the
-    joints' axes tell.
+    """42 parameters less six of the platform frame and three of the base position; joint axes
+    determine the base orientation.
     """
     robot = build_ups_hexapod()
     legs = tuple(f"leg{i}.universal{j}" for i in (1, 3, 5) for j in (1, 2))
@@ -404,7 +404,7 @@ def test_reading_of_infinite_sigma_is_estimated_from_the_pose():
 
 @pytest.fixture(scope="module")
 def wrong_reading():
-    """Measurements whose pose 5 has a reading off by 1 mm."""
+    """Return measurements with a wrong reading (1 mm) in pose 5."""
     data = simulate_hexapod(16, 2 * UM)
     readings = data.readings.copy()
     readings[4, 1] += 1e-3

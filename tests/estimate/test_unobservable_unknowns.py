@@ -36,8 +36,8 @@ LINKS = np.array([[i, (i + k) % POSES] for k in (1, 7) for i in range(POSES)])
 def simulate_parallel_poses(
     unknown: tuple[str, ...], truth: np.ndarray | None = None
 ) -> Measurements:
-    """Poses of one orientation, measured in full and by distances between them, in which the place
-    of a target cancels.
+    """Simulate poses of equal orientation with full measurements and distances between poses, in
+    which the position of a target cancels.
     """
     robot = hexapod()
     poses = np.tile(robot.home, (POSES, 1, 1))
@@ -50,7 +50,7 @@ def simulate_parallel_poses(
 
 
 def linearize_nominal(data: Measurements) -> Linearization:
-    """The problem at the nominal robot."""
+    """Linearize the problem at the nominal robot."""
     problem, z = problem_of(select_free_parameters(hexapod()), data), np.zeros((1, 42))
     return problem.linearize(z, problem.start(z))
 
@@ -79,8 +79,8 @@ def test_start_values_are_not_estimated_from_rounding():
 
 @pytest.mark.parametrize("sigma", [None, UM])
 def test_fit_converges_from_an_unobservable_to_a_weakly_observable_target(sigma):
-    """The true machine turns by up to 0.2 mrad where it is told to keep its orientation: that sees
-    the target, at last.
+    """The true machine rotates by up to 0.2 mrad between commands of equal orientation, which makes
+    the target weakly observable.
     """
     truth = zoo.hexapod_truth()
     data = simulate_parallel_poses(("targets",), truth)

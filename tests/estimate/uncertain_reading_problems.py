@@ -24,9 +24,7 @@ closure's curvature does.
 
 
 def build_hexapod_with_seven_legs(sigma: float = 2 * UM) -> Mechanism:
-    """The hexapod with a seventh driven leg from the middle of its base, and seven parameters more:
-    49.
-    """
+    """Build the hexapod with a seventh driven leg from the middle of its base: 49 parameters."""
     assembly = zoo.hexapod().assembly
     foot, corner = zoo.place((0.01, 0.005, 0.0)), zoo.place((0.02, 0.03, 0.0))
     length = float(np.linalg.norm((assembly.home @ corner)[:3, 3] - foot[:3, 3]))
@@ -62,7 +60,7 @@ def free_only(robot: Mechanism, names: tuple[str, ...]) -> Mechanism:
 
 
 def build_ups_hexapod() -> Mechanism:
-    """The hexapod with the joints of its legs, so that sensors can look at them."""
+    """Build the hexapod with joints in its legs, for joint sensors."""
     base, platform = (
         tuple(map(tuple, (a * zoo.MM).tolist())) for a in (zoo.HEXAPOD_BASE, zoo.HEXAPOD_PLATFORM)
     )
@@ -80,7 +78,7 @@ def build_ups_hexapod() -> Mechanism:
 def simulate_hexapod(
     n: int, sigma: ArrayLike | None, seed: int = 0, sensors: tuple[Sensor, ...] = ()
 ) -> Measurements:
-    """The true hexapod at n poses, its readings noisy; measured in full, or by the sensors given."""  # noqa: E501
+    """Simulate the true hexapod at n poses with noisy readings, by a tracker or `sensors`."""
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     tracker = (Sensor(Pose(), noise(*[5e-6] * 3, *[UM] * 3)),)
     return simulate(

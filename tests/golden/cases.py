@@ -350,7 +350,7 @@ add("methods/drop", calibrate_by_method, "map", None, weak=False, drop=("2", "17
 
 
 def calibrate_from_start() -> dict[str, Any]:
-    """Begin with values that are as far off as the true errors again."""
+    """Start from values with twice the true errors."""
     robot = api.robot(HEXAPOD)
     far = api.true_values(robot, 77)[0]
     return report_fit_of(
@@ -362,7 +362,7 @@ add("methods/start", calibrate_from_start)
 
 
 def calibrate_without_tolerances() -> dict[str, Any]:
-    """Free some parameters only, and hold none of them back."""
+    """Calibrate some parameters without tolerances."""
     robot = api.free_only(api.robot(HEXAPOD), ("length", "base.z"))
     data = api.simulate_data(
         robot,
@@ -489,7 +489,7 @@ add(
 
 
 def calibrate_with_mixed_readings(loss: str | None = None) -> dict[str, Any]:
-    """Miss a reading, state one as exact, measure some poses in part and link others."""
+    """Calibrate with a missing and an exact reading, incomplete and linked poses."""
     robot = api.free_only(
         api.robot(HEXAPOD), ("base.x", "leg2.base.z", "leg3.platform.y", "leg4.length")
     )
@@ -537,7 +537,7 @@ add("latent/cable-4/least-squares", calibrate_cable_robot, "ls")
 
 
 def missing_columns() -> dict[str, Any]:
-    """Miss components of some rows."""
+    """Calibrate with missing components of some rows."""
     data = simulate_measurements(HEXAPOD, 24)
     values = api.copy_measured(data)
     values[::3, 3] = np.nan
@@ -552,7 +552,7 @@ DRIFT = {"noon.frame.x": 400 * UM, "evening.frame.x": 900 * UM, "evening.frame.r
 
 
 def sessions(how: str, keep: bool) -> dict[str, Any]:
-    """Measure a base that drifts in three sessions; the first says where it is, or none does."""
+    """Calibrate with a base that drifts over three sessions; the first frame is known, or none."""
     day = np.repeat(["morning", "noon", "evening"], 10)
     data = simulate_measurements(
         HEXAPOD,
@@ -570,7 +570,7 @@ add("unknowns/sessions/all-free/map", sessions, "map", keep=False)
 
 
 def stations() -> dict[str, Any]:
-    """Look from two stations, one of which was moved."""
+    """Calibrate with two stations, one of which was moved."""
     day = np.repeat(["left", "right"], 20)
     seen = api.make_kind(
         "bearing",
@@ -588,7 +588,7 @@ add("unknowns/stations", stations)
 
 
 def prior_of_unknowns(stated: bool) -> dict[str, Any]:
-    """Hold a frame with a prior from the data or the fit, and fix one coordinate of it."""
+    """Calibrate with a prior of a frame, from the data or the fit, and one fixed coordinate."""
     seen = api.make_kind("pose", unknown=("frame",), frame="tracker")
     true = {"tracker.x": 300 * UM, "tracker.ry": 5e-4}
     data = simulate_measurements(HEXAPOD, 24, api.make_sensor(seen), unknowns=true)
@@ -610,7 +610,7 @@ add("unknowns/prior/given-to-the-fit", prior_of_unknowns, stated=False)
 
 
 def surfaces_in_groups() -> dict[str, Any]:
-    """Touch three unknown planes with a ball of unknown place, and two lines."""
+    """Calibrate with three unknown planes, two lines and a ball of unknown position."""
     plane = api.make_kind(
         "plane", targets=("probe",), unknown=("surface", "targets"), surface="bed"
     )
@@ -782,7 +782,7 @@ add("accuracy/3-prs/base", accuracy, TRIPOD, "map", "base")
 
 
 def map_accuracy_with_unknown_frame() -> dict[str, Any]:
-    """Map the accuracy of a fit that leaves frames open."""
+    """Map the accuracy of a fit with unobservable frames."""
     data = simulate_measurements(HEXAPOD, 30, api.make_sensor(PARTS["targets"]))
     return api.report_accuracy(
         api.fit(api.robot(HEXAPOD), data, api.make_method("ls")), data, 10, 2
@@ -805,7 +805,7 @@ add("accuracy/hexapod-42/monte-carlo", monte_carlo)
 
 
 def compensation(name: str, mode: str, **options: Any) -> dict[str, Any]:
-    """Say what to command a calibrated machine."""
+    """Compensate the commands of a calibrated machine."""
     return api.report_compensation(
         usual_fit("map", name), api.draw_poses(api.robot(name), 6, 4), mode, **options
     )
@@ -817,7 +817,7 @@ for _name in (HEXAPOD, TRIPOD, DELTA):
 
 
 def outliers(how: str) -> dict[str, Any]:
-    """Name the rows that do not belong, and examine the fit."""
+    """Detect outliers and examine the fit."""
     data = make_data_with_outliers()
     found = api.fit(api.robot(HEXAPOD), data, api.make_method(how))
     clean = usual_fit("ls")
@@ -867,7 +867,7 @@ add(
 
 
 def identifiability(name: str, *kinds: str, cures: bool = True) -> dict[str, Any]:
-    """Say what kinds determine, and what would determine the rest."""
+    """Report what kinds determine, and the suggested measurements."""
     robot = api.robot(name)
     data = simulate_measurements(name, 24, *[api.make_sensor(PARTS[kind]) for kind in kinds])
     return api.report_identifiability(robot, data, cures)
@@ -881,7 +881,7 @@ add("identifiability/linear-delta/heights", identifiability, DELTA, "plane")
 
 
 def check_conventions(slip: str) -> dict[str, Any]:
-    """Ask whether data with a slip, or none, fit as they are written."""
+    """Check the conventions of data with a slip or without."""
     data = simulate_measurements(HEXAPOD, 16)
     values = api.copy_measured(data)
     if slip == "unit":

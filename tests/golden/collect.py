@@ -19,7 +19,7 @@ from tests.golden.cases import CASES
 
 
 def collect(chosen: tuple[str, ...] = (), timed: bool = False) -> None:
-    """Rewrite the fixture, all of it or the cases whose names begin so."""
+    """Rewrite the fixture: all of it, or the cases whose names begin with `chosen`."""
     results = compare.read() if chosen else {}
     for name, case in CASES.items():
         if not chosen or name.startswith(chosen):

@@ -39,7 +39,7 @@ ABOUT_X, ABOUT_Y = zoo.place((0, 0, 0), (0, np.pi / 2, 0)), zoo.place((0, 0, 0),
 
 
 def make_sps_leg(i, apart=0.0):
-    """Leg RRR-P-RRR; its base axes meet in a point unless `apart` [m]."""
+    """Return a leg RRR-P-RRR; its base axes intersect unless `apart` [m]."""
     F, length = leg_frame(i)
     top = F @ zoo.place((0, 0, length))
     askew = zoo.place((0, 0, 0), (0.3, 0.2, 0))
@@ -58,8 +58,9 @@ def make_sps_leg(i, apart=0.0):
 
 
 def make_rrrprr_leg(i, loose):
-    """Leg RRRPRR with its third axis along the slide; `loose`: the axis behind the slide is along
-    it too, else askew.
+    """Return a leg RRRPRR with its third axis along the slide.
+
+    With `loose` the axis after the slide is parallel to it, else skew.
     """
     F, length = leg_frame(i)
     middle = F @ zoo.place((0, 0, length / 2))
@@ -138,7 +139,7 @@ def test_locked_joint_keeps_its_reported_start_value():
 
 
 def build_planar_3rrr(freedoms):
-    """A planar 3-RRR, every limb pinned rigidly to the platform."""
+    """Build a planar 3-RRR with rigid limb ends."""
     limbs = []
     for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
         out = np.array((np.cos(angle), np.sin(angle), 0.0))
@@ -190,7 +191,7 @@ def test_redundant_equations_are_reported_when_no_freedoms_avoid_them():
 
 
 def build_spherical_3rrr():
-    """Spherical 3-RRR, every frame at the origin: axes 60 degrees apart along each arm."""
+    """Build a spherical 3-RRR with every frame at the origin and axes 60 degrees apart."""
     limbs = []
     for i in range(3):
         turn = zoo.place((0, 0, 0), (0, 0, 2 * np.pi * i / 3))

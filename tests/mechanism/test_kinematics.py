@@ -50,9 +50,7 @@ def relative_pose_distance(robot, T, reference):
 
 
 def closure_condition(robot, state):
-    """Condition of the closure's Jacobian, rows in the size of the robot, columns per radian and
-    per size (n,).
-    """
+    """Return the condition (n,) of the closure Jacobian, lengths in sizes of the robot."""
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearize(robot.program, e, actuated_joint_values(robot.program, state), state)
     A = stack_dense_rows(robot.program, blocks.closure)[0][0]

@@ -33,7 +33,7 @@ def make_five_legs():
 
 
 def add_fixed_rod():
-    """Six driven legs and a seventh rod of fixed length."""
+    """Return a hexapod with a seventh rod of fixed length."""
     rod = replace(
         HEXAPOD.limbs[0], name="rod", actuator=None, attachment=HEXAPOD.limbs[3].attachment
     )

@@ -17,7 +17,7 @@ def squared_distance(robot, T, target):
 
 
 def make_unreachable_poses(n=20):
-    """Poses near a 3-PRS's workspace, off in all six directions by up to 2 cm and 0.05 rad."""
+    """Draw poses up to 2 cm and 0.05 rad from the workspace of a 3-PRS, in all six directions."""
     rng = np.random.default_rng(5)
     values = rng.uniform([0.66, -np.pi, 0.1], [0.74, np.pi, 0.5], (n, 3))
     T = inverse(zoo.three_prs(), values).T

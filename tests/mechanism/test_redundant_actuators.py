@@ -25,7 +25,7 @@ from tests.jacobians import check_jacobian
 
 
 def load_cable_robot(sigmas=None):
-    """The shipped four-line robot, its encoders with these standard deviations."""
+    """Build the shipped four-line robot with these sigmas of its encoders."""
     assembly = load_robot("cable-4").assembly
     if sigmas is None:
         return build(assembly)
@@ -40,7 +40,7 @@ def load_cable_robot(sigmas=None):
 
 
 def compute_line_lengths(robot, q):
-    """Length of each line at readings q (a,), from the assembly's own numbers."""
+    """Return the length of each line at readings q (a,), from the numbers of the assembly."""
     terms = [a.terms for a in robot.actuators]
     driven = np.array(
         [
@@ -58,7 +58,7 @@ def list_attachment_points(robot):
 
 
 def solve_position_by_scipy(robot, q, sigmas):
-    """Position that minimises the weighted sum of squared length errors, by scipy."""
+    """Minimize the weighted sum of squared length errors by scipy; return the position."""
     anchors, attached = list_attachment_points(robot)
     lengths = compute_line_lengths(robot, q)
 
@@ -119,7 +119,7 @@ def test_pose_derivatives_by_redundant_readings_agree_with_differences():
 
 
 def build_hexapod_with_seven_legs():
-    """The small hexapod with a seventh driven leg from the middle of the base."""
+    """Build the small hexapod with a seventh driven leg from the middle of the base."""
     assembly = zoo.hexapod().assembly
     foot, corner = zoo.place((0.0, 0.0, 0.0)), zoo.place((0.02, 0.03, 0.0))
     length = float(np.linalg.norm((assembly.home @ corner)[:3, 3]))

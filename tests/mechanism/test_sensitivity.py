@@ -21,7 +21,7 @@ RANK = 1e-10  # relative; the smallest true singular values are above 1e-6, null
 
 
 def hexapod_closure(jnp, values, q, T, twist):
-    """Plain closure of a hexapod (6,): |t + R p - b| - length - reading."""
+    """Return the closure of a hexapod (6,): |t + R p - b| - length - reading."""
     legs = values.reshape(6, 7)
     w = twist[:3]
     K = jnp.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
@@ -31,9 +31,7 @@ def hexapod_closure(jnp, values, q, T, twist):
 
 
 def delta_closure(jnp, values, q, T, twist):
-    """Plain closure of a linear delta (3,): distance of the nozzle from each carriage, less the
-    arm.
-    """
+    """Return the closure of a linear delta (3,): distance of nozzle and carriage less the arm."""
     radius, towers = values[0], values[1:].reshape(3, 3)
     angle, arm, stop = towers.T
     carriage = jnp.stack(
@@ -131,9 +129,7 @@ def test_pose_derivatives_by_transmission_terms_agree_with_differences():
 
 
 def add_harmonics(robot):
-    """The same robot whose first two actuators have every transmission term as a parameter, on a 5
-    mm screw.
-    """
+    """Add every transmission term of the first two actuators as a parameter, on a 5 mm screw."""
     terms = ("offset", "gain", "sin1", "cos1", "sin2", "cos2")
     assembly, extra, maps = robot.assembly, [], []
     for name in ("q1", "q2"):
@@ -181,8 +177,8 @@ def test_failed_rows_have_nan_derivatives_and_do_not_change_other_rows():
 
 
 def scaled_sensitivities(name, n=40):
-    """Sensitivities of n poses, angles in sizes of the robot; columns for the unknown base and tool
-    frame beside them.
+    """Return sensitivities of n poses, angles in sizes of the robot, with columns of the unknown
+    base and tool frames, and the poses.
     """
     robot, sol, _ = sample_inverse(name, n)
     state = forward_trials(robot, perturb_values(robot, 1e-4), sol.q[None], start=sol.state)
@@ -207,7 +203,7 @@ def scaled_sensitivities(name, n=40):
 
 
 def rank_without(matrix, *unknown):
-    """Rank of the parameters once the unknown columns are projected out, and all singular values."""  # noqa: E501
+    """Return rank and singular values of the parameters after projecting out `unknown`."""
     flat = matrix.reshape(-1, matrix.shape[-1])
     if unknown:
         basis, _ = np.linalg.qr(np.concatenate([u.reshape(len(flat), -1) for u in unknown], axis=1))

@@ -44,7 +44,7 @@ def is_within_strokes(machine: Mechanism, q: Array) -> NDArray[np.bool_]:
 
 
 def generate_reachable_rows(machine: Mechanism, seed: int) -> Iterator[Solution]:
-    """Blocks of solutions inside strokes, 1e5 rows in all; at least half of the workspace must be."""  # noqa: E501
+    """Yield blocks of 1e5 solutions within strokes; at least half of the workspace must be."""
     rng, found, tried = np.random.default_rng(seed), 0, 0
     while found < ROWS:
         there = inverse(machine, draw_coordinates(machine, rng, BLOCK))

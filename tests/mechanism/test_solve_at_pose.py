@@ -24,9 +24,7 @@ from tests.jacobians import check_jacobian
 
 
 def build_planar_robot_with_four_arms():
-    """A planar platform on four arms with two passive joints each, all lengths and offsets
-    parameters.
-    """
+    """Build a planar platform on four arms with two passive joints each and all parameters."""
     limbs = []
     for i, angle in enumerate(np.deg2rad((80.0, 170.0, 260.0, 350.0)), start=1):
         axis = np.array((np.cos(angle), np.sin(angle), 0.0))

@@ -27,9 +27,7 @@ PASSIVE = {"rigid": 6, "ball": 3, "distance": 1}
 
 
 def random_mechanism(seed: int, limbs: int) -> Limbs:
-    """`limbs` (6, 3 or 2) limbs that each take as many freedoms as one actuated joint gives back to
-    all of them: 6 / limbs.
-    """
+    """Draw 6, 3 or 2 limbs, each with one actuated joint and 6 / `limbs` constrained freedoms."""
     rng = np.random.default_rng(seed)
     taken = 6 // limbs
     allowed = [ending for ending, rows in PASSIVE.items() if rows >= taken]
@@ -58,7 +56,7 @@ def expected_rank(record: Limbs) -> int:
 
 
 def sample_near_home(machine: Mechanism, n: int, seed: int) -> tuple[State, Array]:
-    """States (1, m) near home, at most 0.3 rad and 60 mm away in each reading, and their readings
+    """Return states (1, m) within 0.3 rad and 60 mm of home in each reading, and the readings
     (1, m, a).
     """
     rng = np.random.default_rng(seed)
@@ -74,14 +72,13 @@ def sample_near_home(machine: Mechanism, n: int, seed: int) -> tuple[State, Arra
         joints_from_readings(q, tau, machine.slots.frequency),
         machine.home_state,
     )
-    # random machines have small workspaces: rows that do not close, or closed elsewhere, are left
-    # out
+    # random machines have small workspaces: keep rows that closed in the mode of home
     good = (state.status[0] == 0) & (state.closure_sign[0] == machine.home_state.closure_sign[0, 0])
     return select_poses(state, good), q[:, good]
 
 
 def _limb(rng: np.random.Generator, name: str, ending: str, taken: int) -> LimbRecord:
-    """A limb of rows - taken passive joints and one driven one."""
+    """Draw a limb of (rows - taken) passive joints and one actuated joint."""
     passive = PASSIVE[ending] - taken
     drive = f"{name}.q"
     rod_drives = ending == "distance" and rng.random() < 0.4

@@ -30,7 +30,7 @@ def random_coordinates(robot: Mechanism, n: int, seed: int) -> Array:
 
 
 def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
-    """(n, 6, p) platform twist per parameter, all lengths [m / m]."""
+    """Return platform twists per parameter (n, 6, p), all lengths [m / m]."""
     return scale_angles(
         robot,
         differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).parameters[
@@ -40,7 +40,7 @@ def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
 
 
 def scale_angles(robot: Mechanism, D: Array) -> Array:
-    """A sensitivity (.., 6, p) with all angles as lengths."""
+    """Return a sensitivity (.., 6, p) with angles as lengths."""
     columns = np.array(
         [
             1.0 if d is Dimension.LENGTH else 1 / METERS_PER_RADIAN
@@ -51,8 +51,8 @@ def scale_angles(robot: Mechanism, D: Array) -> Array:
 
 
 def perturb(robot: Mechanism, size: float, seed: int) -> Mechanism:
-    """Parameters moved at random by `size` [m], angles by size / 200 mm [rad]: no axis stays
-    parallel to another.
+    """Change parameters at random by `size` [m], angles by size / 200 mm [rad], so that no axes
+    stay parallel.
     """
     rng = np.random.default_rng(seed)
     scale = np.array(
@@ -65,14 +65,14 @@ def perturb(robot: Mechanism, size: float, seed: int) -> Mechanism:
 
 
 def solve_random_poses(robot: Mechanism, n: int = 80, seed: int = 3) -> Solution:
-    """Random poses of the workspace, all closed."""
+    """Solve the inverse kinematics of random poses; all must converge."""
     solution = inverse(robot, random_coordinates(robot, n, seed))
     assert solution.converged.all()
     return solution
 
 
 def select_measured_rows(D: Array, T: Array, what: str) -> Array:
-    """Rows of a measurement: full, positions, orientation, or 5-dof (no rotation about the
+    """Return rows of a measurement: full, positions, orientation, or 5-dof (no rotation about the
     platform's normal).
     """
     if what == "positions":
@@ -120,7 +120,7 @@ def rank(rows: Array, tolerance: float = 1e-12, gap: float = 1e3) -> int:
 def ranks_by_measurement(
     robot: Mechanism, kinds: Sequence[str], seed: int = 3, n: int = 80, **limits: float
 ) -> list[int]:
-    """Ranks of several kinds of measurement, frames known."""
+    """Return ranks for several measurements with known frames."""
     solution = solve_random_poses(robot, n, seed)
     D = scaled_sensitivity(robot, solution)
     return [rank(select_measured_rows(D, solution.T, kind), **limits) for kind in kinds]
@@ -133,9 +133,7 @@ FRAMES = ((True, False), (False, True), (True, True))
 def ranks_with_unknown_frames(
     robot: Mechanism, kind: str, frames: Sequence[tuple[bool, bool]] = FRAMES, n: int = 80
 ) -> list[int]:
-    """Parameters determined beside unknown frames: rank of all columns less the rank of the frames'
-    own.
-    """
+    """Return ranks with unknown frames: rank of all columns less the rank of the frame columns."""
     solution = solve_random_poses(robot, n)
     D, found = scaled_sensitivity(robot, solution), []
     for base, tool in frames:
@@ -147,5 +145,5 @@ def ranks_with_unknown_frames(
 
 
 def null_vector(rows: Array) -> Array:
-    """The last right singular vector (p,)."""
+    """Return the last right singular vector (p,)."""
     return np.linalg.svd(rows.reshape(-1, rows.shape[-1]))[2][-1]

@@ -50,7 +50,7 @@ def build_uneven_delta() -> Mechanism:
 
 
 def position_derivatives(machine: Mechanism, q: Array) -> tuple[Array, Array]:
-    """d position (n, 3, p) and (n, 3, a)."""
+    """Return d position / d parameters (n, 3, p) and / d readings (n, 3, a)."""
     solution = forward(machine, q)
     found = differentiate_pose(machine, machine.values[None], q[None], solution.state)
     return found.parameters[0, :, 3:], found.readings[0, :, 3:]
@@ -122,7 +122,7 @@ def test_robot_files_of_three_and_six_rods_agree_to_nine_digits() -> None:
 
 
 def assert_same_kinematics(three: Mechanism, six: Mechanism, atol: float) -> None:
-    """Readings, poses and slopes that the two must share [m, m/m, m/rad]."""
+    """Assert equal readings, poses and common derivatives [m, m/m, m/rad]."""
     xyz = random_coordinates(three, 200, seed=5)
     q = inverse(three, xyz).q
     np.testing.assert_allclose(inverse(six, xyz).q, q, rtol=0, atol=atol)

@@ -69,9 +69,7 @@ def build_cached_robot(record: Gough) -> Mechanism:
 
 
 def with_published_errors(machine: Mechanism) -> Mechanism:
-    """With the published errors of all 42 parameters, a thousand times their size would be 50 mm:
-    use ten times, 0.5 mm.
-    """
+    """Add ten times the published errors of all 42 parameters: up to 0.5 mm."""
     return machine.with_values(machine.values + 10 * zoo.HEXAPOD_ERRORS.reshape(-1)[ORDER] * zoo.MM)
 
 
@@ -201,7 +199,7 @@ def test_orientation_alone_lowers_the_rank_of_the_complete_hexapod_by_six(
 
 
 def test_complete_model_spans_the_sensitivities_of_the_ideal_model() -> None:
-    """What the 42 can do, the complete model can: its columns span theirs."""
+    """The columns of the complete model span those of the 42 parameters."""
     solution = solve_random_poses(build_cached_robot(ROD))
     small = scaled_sensitivity(build_cached_robot(ROD), solution)
     machine = build_cached_robot(COMPLETE_AXES)
@@ -250,7 +248,7 @@ LEAD = 4.0  # unit of the file, here taken as a metre
 
 @pytest.fixture(scope="module")
 def genhexkins(data_folder: Path) -> tuple[dict[str, Array], Array, Array]:
-    """Geometry, poses (200, 4, 4) and strut lengths (200, 6) that LinuxCNC's own code printed."""
+    """Return geometry, poses (200, 4, 4) and strut lengths (200, 6) printed by LinuxCNC."""
     folder = data_folder / "kinematics_oracles"
     geometry = json.loads((folder / "genhexkins_geometry.json").read_text())
     rows = np.genfromtxt(folder / "genhexkins_screwlead4_200poses.csv", delimiter=",", names=True)
@@ -271,8 +269,8 @@ def genhexkins(data_folder: Path) -> tuple[dict[str, Array], Array, Array]:
 
 
 def is_folded(geometry: dict[str, Array], T: Array) -> NDArray[np.bool_]:
-    """Where the platform's joint axis has turned past a quarter turn from the base's, seen along
-    the leg, (n, 6).
+    """Return whether platform and base joint axes differ by more than 90 degrees about the leg
+    (n, 6).
     """
     R = T[:, None, :3, :3]
     v = T[:, None, :3, 3] + (R @ geometry["platform"][..., None])[..., 0] - geometry["base"]
@@ -285,7 +283,7 @@ def is_folded(geometry: dict[str, Array], T: Array) -> NDArray[np.bool_]:
 
 
 def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Array) -> Mechanism:
-    """Hexapod whose screws do what genhexkins does with asin(sin a) for the angle a.
+    """Build a hexapod whose screws agree with genhexkins, which uses asin(sin a) for the angle a.
 
     Past a quarter turn that is the screw of the other hand, counted from the other side of its
     axis.

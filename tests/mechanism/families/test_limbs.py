@@ -130,8 +130,8 @@ def test_random_mechanisms_have_at_least_fifty_limbs() -> None:
 
 @pytest.mark.parametrize(("limbs", "seed"), RANDOM)
 def test_rank_of_a_random_complete_model_follows_the_counting_rule(limbs: int, seed: int) -> None:
-    """Places and axes are random, so nothing needs perturbing; kept singular values are above 1e-10
-    of the largest.
+    """Frames and axes are random, so no perturbation is needed. Nonzero singular values are above
+    1e-10 of the largest.
     """
     record, machine = random_mechanism(seed, limbs), build_random_robot(limbs, seed)
     state, q = sample_near_home(machine, 400, seed)
@@ -214,9 +214,7 @@ def test_spool_length_includes_radius_and_buildup() -> None:
 
 
 def test_named_parameter_changes_all_elements_of_its_maps() -> None:
-    """A radius common to both slides, and a turn of the frame that they stand on: 0.3 m arm along y
-    of the placed frame.
-    """
+    """A radius common to both slides, and a rotation of their frame with a lever arm of 0.3 m."""
     radius = NamedLength("radius", 0.3, (MapEntry("rod", "P1", "x"),), LengthTolerance(sd=1e-4))
     turn = NamedAngle(
         "turn", 0.0, (MapEntry("rod", "P1", "y", arm=0.3), MapEntry("rod", "P1", "rz"))
@@ -242,7 +240,7 @@ def test_named_parameter_changes_all_elements_of_its_maps() -> None:
 
 
 def test_universal_joint_and_slide_equal_a_rod() -> None:
-    """A rod written as universal joint, slide and ball is the distance between its ends."""
+    """A rod described as universal joint, slide and ball has the length between its ends."""
     chain = (
         # along x while both angles are zero; at home it points from (0.3, 0, 0) to (0, 0, 0.4)
         Universal("U", at=(0.3, 0.0, 0.0), axes=("y", "z"), start=(-2.2, 0.0)),

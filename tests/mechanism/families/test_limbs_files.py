@@ -18,7 +18,7 @@ LIMBS = tuple(
 def load_changed_robot(
     tmp_path: Path, name: str, *changes: tuple[str, str], more: str = ""
 ) -> Mechanism:
-    """A shipped robot with pieces of its text replaced, and more of it."""
+    """Load a shipped robot with replaced and added text."""
     text = find_robot_file(name).read_text()
     for old, new in changes:
         assert old in text
@@ -32,9 +32,7 @@ def load_changed_robot(
 # ------------------------------------------------------------------------
 @pytest.mark.parametrize("name", LIMBS)
 def test_shipped_limbs_files_load_with_the_complete_model(tmp_path: Path, name: str) -> None:
-    """What the file names keeps its name and tolerance; a drive has one offset; nothing stands
-    there twice.
-    """
+    """Named parameters keep their names, actuators have one offset, no column is duplicated."""
     ideal, complete = (
         load_robot(name),
         load_changed_robot(tmp_path, name, more="error_model: complete"),
@@ -48,8 +46,8 @@ def test_shipped_limbs_files_load_with_the_complete_model(tmp_path: Path, name: 
 
 
 def test_named_error_about_another_axis_keeps_the_error_of_that_name(tmp_path: Path) -> None:
-    """A motor about y has the own axes z, x, y: `motor.x` of the file is its second, so the first
-    stays, as `.own`.
+    """A motor about y has the joint axes z, x, y: `motor.x` of the file is its second axis, so the
+    first stays as `.own`.
     """
     machine = load_changed_robot(
         tmp_path, "rotary-delta", ("shift: [x, y, z]", "shift: [x]"), more="error_model: complete"
@@ -67,7 +65,7 @@ def test_named_error_about_another_axis_keeps_the_error_of_that_name(tmp_path: P
 # --- omitted or misspelled
 # --------------------------------------------------------------------------------------------
 def read_refusal(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> str:
-    """The one sentence that a changed file is refused with."""
+    """Return the message with which a changed file is refused."""
     with pytest.raises(LoopcalError) as found:
         load_changed_robot(tmp_path, name, *changes, more=more)
     assert "\n" not in str(found.value)
@@ -168,7 +166,7 @@ def test_file_without_limbs_is_refused(tmp_path: Path) -> None:
 # --- named parameters and their maps
 # ---------------------------------------------------------------------------------
 def parameter_text(kind: str, onto: str) -> str:
-    """A parameter `p` of a kind, mapped once."""
+    """Return the text of a parameter `p` of a kind with one map."""
     return f"parameters: [{{name: p, {kind}: 1, tolerance: {{sd: 1}}, maps: [{{{onto}}}]}}]"
 
 

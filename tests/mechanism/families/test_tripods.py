@@ -91,14 +91,14 @@ def hinge_row(
 
 
 def guide_derivatives(w: Array, R: Array, q: float, Z: Array, tags: dict[str, str]) -> dict:
-    """What centres, offset and guide contribute along w."""
+    """Return the derivatives of joint centers, offset and guide along w."""
     found = {tags["q"]: w @ EZ, tags["thBx"]: -q * (w @ Z @ EY), tags["thBy"]: q * (w @ Z @ EX)}
     found |= {tags[f"b{axis}"]: w @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xy"}
     return found | {tags[f"a{axis}"]: -w @ R @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xyz"}
 
 
 def parameter_names(i: int, joint: str) -> dict[str, str]:
-    """The paper's names of the parameters of chain i."""
+    """Return the paper's names of the parameters of chain i."""
     keys = (
         "ax",
         "ay",
@@ -115,7 +115,7 @@ def parameter_names(i: int, joint: str) -> dict[str, str]:
 
 
 def three_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
-    """The six loops of the 3-PRS."""
+    """Return the six loop equations of the 3-PRS."""
     found = []
     for i in range(3):
         Z = rotation_about_z(2 * np.pi / 3 * i)
@@ -126,8 +126,9 @@ def three_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
 
 
 def ru_pus_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
-    """The six loops of the RU-PUS-PRS: two rods, the hinge of chain 2, |N| = r, n . N = 0, u1 . R
-    u2 = 0.
+    """Return the six loop equations of the RU-PUS-PRS.
+
+    They are two rods, the hinge of chain 2, |N| = r, n . N = 0 and u1 . R u2 = 0.
     """
     a1, b1, a2, b2 = -0.3 * EX, -0.4 * EX, 0.3 * EY, 0.4 * EY
     eye, u1, u2 = np.eye(3), EX, R @ EY
@@ -231,14 +232,14 @@ class Loops:
         return found
 
     def three_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
-        """Six, and one that holds the pivot the machine does not have."""
+        """Return six equations, and one that fixes the unused pivot."""
         limbs = [
             self.limb(i + 1, N, R, q[i], rotation_about_z(2 * np.pi / 3 * i), EY) for i in range(3)
         ]
         return np.array([*limbs[0], *limbs[1], *limbs[2], pivot])
 
     def ru_pus_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
-        """Seven: three of the limbs, the post's end, the cross of its universal joint."""
+        """Return seven equations: three of the limbs, the post's end, its universal joint."""
         eye, c, s = np.eye(3), np.cos(pivot), np.sin(pivot)
         post = rotation_series(self.vector("thO")) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
         u1, u2 = (
@@ -256,8 +257,9 @@ class Loops:
 def sensitivities_by_complex_steps(
     kind: str, names: tuple[str, ...], values: Array, T: Array, q: Array
 ) -> tuple[Array, Array]:
-    """Residuals (7,) and D (6, p) of the loops by complex steps, which have no truncation and no
-    cancellation.
+    """Return residuals (7,) and D (6, p) of the loops by complex steps.
+
+    Complex steps have no truncation and no cancellation.
     """
     N, R, h = T[:3, 3], T[:3, :3], 1e-30
     start = Loops(names, values).pivot(N) if kind == "ru_pus_prs" else 0.0
@@ -354,7 +356,7 @@ def test_each_unknown_frame_lowers_the_rank_of_the_3_prs_by_six() -> None:
 
 
 def test_unknown_frame_lowers_the_rank_of_the_ru_pus_prs_by_motions_it_can_follow() -> None:
-    """A frame costs as many as it has motions that a change of the parameters repeats; by counting.
+    """An unknown frame lowers the rank by the number of its motions that parameters can reproduce.
 
     Base, 5 (20): all moves and turns but the one about z, for the twenty-five leave out the post's
     thOz and thU1z; its other motions the post's angles and length follow, for its end N stands
