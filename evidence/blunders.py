@@ -66,12 +66,14 @@ def collect() -> dict:
         )
         for name, loss in LOSSES.items():
             fit = identify(ROBOT, bad, LeastSquares(), loss=loss)
-            found = find_outliers(fit, bad)
+            result = find_outliers(fit, bad)
             squares[name].append(np.mean((fit.estimate - truth) ** 2))
             right = {data.labels[i] for i in OUTLIERS}
-            named[name] += len(right & set(found.names))
-            falsely[name] += len(set(found.names) - right)
-            leverage.append(float(found.influence.leverage.sum() / found.influence.residuals.sum()))
+            named[name] += len(right & set(result.names))
+            falsely[name] += len(set(result.names) - right)
+            leverage.append(
+                float(result.influence.leverage.sum() / result.influence.residuals.sum())
+            )
     rms = {name: float(np.sqrt(np.mean(values))) for name, values in squares.items()}
     rows = [
         [

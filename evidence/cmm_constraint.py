@@ -126,12 +126,12 @@ def compare_weights(study: Study, full: Cell) -> list[list[Any]]:
 
 def compare_interpretations(study: Study) -> list[list[Any]]:
     """Return figure 5 as printed and under every interpretation."""
-    found = rank_candidates(
+    result = rank_candidates(
         (evaluate_arrangement(TEN, study, SEED, DRAWS_PER_INTERPRETATION),),
         SEED,
         DRAWS_PER_INTERPRETATION,
     )
-    rows = [[c.reading, c.truth, c.frame, *map(float, c.reductions)] for c in found]
+    rows = [[c.reading, c.truth, c.frame, *map(float, c.reductions)] for c in result]
     return [["as printed", None, None, *map(float, list_printed())], *rows]
 
 
@@ -139,7 +139,7 @@ def compare_fifty_points(study: Study) -> list[list[Any]]:
     """Return mean position errors before, by LS and by MAP in each frame, and the share of LS fits
     that converge within 5 iterations.
     """
-    found = [calibrate_fifty(study, groups, SEED, FEW_DRAWS) for groups in LINES]
+    result = [calibrate_fifty(study, groups, SEED, FEW_DRAWS) for groups in LINES]
     return [
         [
             f.groups,
@@ -147,7 +147,7 @@ def compare_fifty_points(study: Study) -> list[list[Any]]:
             *(float(f.compute_median(m, frame)[0]) for m in (BEFORE, LS, PRIOR)),
             f.within_five if frame == ALIGNED else None,
         ]
-        for f in found
+        for f in result
         for frame in FRAMES
     ]
 

@@ -94,12 +94,19 @@ def count_false_alarms(times: float) -> list:
     for seed, (robot, kind) in enumerate(list_cases(times)):
         data = simulate_data(robot, kind, times, seed)
         if data is not None:
-            found = compare_conventions(robot, data)
-            misfits.append(found.misfit)
-            refused += found.is_refused
-    said = np.array(misfits)[~np.isnan(misfits)]
-    doubted = int((said > IMPLAUSIBLE).sum())
-    return [times, len(misfits), len(misfits) - len(said), float(np.median(said)), doubted, refused]
+            result = compare_conventions(robot, data)
+            misfits.append(result.misfit)
+            refused += result.is_refused
+    finite = np.array(misfits)[~np.isnan(misfits)]
+    doubted = int((finite > IMPLAUSIBLE).sum())
+    return [
+        times,
+        len(misfits),
+        len(misfits) - len(finite),
+        float(np.median(finite)),
+        doubted,
+        refused,
+    ]
 
 
 def scale_columns(chosen: list[int], factor: float) -> Change:
@@ -229,11 +236,11 @@ def count_detections() -> list[list]:
     rows = []
     for name, kind, change, change_readings, details in tried:
         every = [(robot, simulate_slip(robot, kind, change, change_readings)) for robot in machines]
-        found = [compare_conventions(robot, data) for robot, data in every if data is not None]
-        named = sum(is_named(check, details) for check in found)
-        doubtful = sum(check.is_doubtful for check in found)
-        refused = sum(check.is_refused for check in found)
-        rows.append([name, len(found), doubtful, refused, named])
+        result = [compare_conventions(robot, data) for robot, data in every if data is not None]
+        named = sum(is_named(check, details) for check in result)
+        doubtful = sum(check.is_doubtful for check in result)
+        refused = sum(check.is_refused for check in result)
+        rows.append([name, len(result), doubtful, refused, named])
     return rows
 
 

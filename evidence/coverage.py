@@ -113,44 +113,44 @@ def simulate_fits(case: Case, count: int) -> Iterator[Outcome]:
                 robot, truth, coordinates, make_instrument(case, case.noise), seed
             )
             trials = replace(trials, measured=louder.measured)
-        found = identify_trials(robot, trials, case.method)
-        good = found.converged
-        sd = found.standard_deviations()[good]
+        result = identify_trials(robot, trials, case.method)
+        good = result.converged
+        sd = result.standard_deviations()[good]
         places = np.flatnonzero(robot.parameters.free)
-        error = (found.values - truth)[good][:, places]
+        error = (result.values - truth)[good][:, places]
         decided = np.isfinite(sd)
         inside = np.abs(error) <= NORMAL_95 * np.where(decided, sd, np.inf)
-        z = found.free_parameters.deviation(found.values)
-        chi_square = found.cost + penalize(found.decomposition, found.penalty, z)
+        z = result.free_parameters.deviation(result.values)
+        chi_square = result.cost + penalize(result.decomposition, result.penalty, z)
         # a prior counts as one equation for each penalized direction
         dof = (
             case.poses * (3 if case.kind == "component" else 6)
-            - found.decomposition.rank[0]
-            + (found.penalty[0] > 0).sum()
+            - result.decomposition.rank[0]
+            + (result.penalty[0] > 0).sum()
         )
         yield Outcome(
             inside[:, decided.all(axis=0)],
             chi_square[good],
             dof,
-            _spread(robot, found, truth, good, elsewhere),
+            _spread(robot, result, truth, good, elsewhere),
         )
 
 
 def _spread(
-    robot: Mechanism, found: IdentifiedTrials, truth: Array, good: NDArray[np.bool_], q: Array
+    robot: Mechanism, result: IdentifiedTrials, truth: Array, good: NDArray[np.bool_], q: Array
 ) -> Array:
     """Errors of predicted poses at readings q (n, a) in their predicted standard deviations, (t, n,
     6).
     """
-    values = found.values[good]
+    values = result.values[good]
     predicted, true = (
         forward_trials(robot, values, q[None]),
         forward_trials(robot, truth[good], q[None]),
     )
     error = geometry.pose_difference(predicted.T, true.T)
     D = differentiate_pose(robot, values, q[None], predicted).parameters[..., robot.parameters.free]
-    C = found.decomposition.take(np.flatnonzero(good)).covariance(found.penalty[good], 1.0)
-    tolerance = found.free_parameters.tolerance
+    C = result.decomposition.take(np.flatnonzero(good)).covariance(result.penalty[good], 1.0)
+    tolerance = result.free_parameters.tolerance
     C = C * tolerance[:, None] * tolerance
     variance = np.einsum("tnip,tpq,tniq->tni", D, C, D)
     return error / np.sqrt(np.where(variance > 0, variance, np.nan))
@@ -175,7 +175,7 @@ def evaluate_case(case: Case, count: int = FITS) -> dict[str, float]:
 
 def collect() -> dict:
     """Collect every case at full size."""
-    found = {case.name: evaluate_case(case) for case in CASES}
+    result = {case.name: evaluate_case(case) for case in CASES}
     rows = [
         [
             name,
@@ -185,7 +185,7 @@ def collect() -> dict:
             100 * r["rejected"],
             r["pose_spread"],
         ]
-        for name, r in found.items()
+        for name, r in result.items()
     ]
     return {
         "seed": SEED,

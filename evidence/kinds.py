@@ -111,8 +111,8 @@ class Case:
         seen = seen if isinstance(seen, str) else " ".join(seen)
         targets = len(getattr(self.kind, "targets", ()))
         words = [seen, f"{targets} targets" if targets > 1 else ""]
-        open_ = getattr(self.kind, "unknown", ())
-        words.append(f"{' and '.join(open_)} unknown" if open_ else "")
+        unknown = getattr(self.kind, "unknown", ())
+        words.append(f"{' and '.join(unknown)} unknown" if unknown else "")
         return ", ".join([self.kind.name, *(word for word in words if word)])
 
     def __str__(self) -> str:
@@ -264,8 +264,8 @@ def pose_error(
 
 def _largest(errors: PoseErrors, size: float) -> float:
     """Return the largest error, lengths as a share of the robot's size."""
-    found = np.concatenate([errors.position / size, errors.orientation])
-    return float(found[np.isfinite(found)].max())
+    result = np.concatenate([errors.position / size, errors.orientation])
+    return float(result[np.isfinite(result)].max())
 
 
 def compare_along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
@@ -324,10 +324,10 @@ def compute_coverage(
     own = draw_setup_values(robot, looking, POSES, rng)
     truth = sample_truth(robot, fits, seed)
     trials = simulate_trials(robot, truth, coordinates, looking, seed, nuisance_values=own)
-    found = identify_trials(robot, trials, MAP())
-    good = np.flatnonzero(found.converged)
-    free, d, penalty = found.free_parameters, found.decomposition.take(good), found.penalty[good]
-    off = free.deviation(found.values[good]) - free.deviation(truth[good])
+    result = identify_trials(robot, trials, MAP())
+    good = np.flatnonzero(result.converged)
+    free, d, penalty = result.free_parameters, result.decomposition.take(good), result.penalty[good]
+    off = free.deviation(result.values[good]) - free.deviation(truth[good])
     sd = d.standard_deviations(penalty, 1.0)
     s, along = d.singular_values, np.matmul(d.directions.swapaxes(-1, -2), off[..., None])[..., 0]
     known = np.where(s > 1.0, np.abs(along) * np.sqrt(s * s + penalty), np.nan)
@@ -335,7 +335,7 @@ def compute_coverage(
         fits=len(good),
         directions=(known <= NORMAL_95)[~np.isnan(known)],
         parameters=np.abs(off) <= NORMAL_95 * sd,
-        setup=_setup_covered(found, trials, good, own),
+        setup=_setup_covered(result, trials, good, own),
     )
 
 
@@ -377,14 +377,14 @@ def _recovery_rows() -> list[list[object]]:
     rows: dict[int, list[object]] = {}
     each = len(list_cases(ROBOTS[:1]))
     for i, case in enumerate(list_cases()):
-        found = recover_machine(case)
+        result = recover_machine(case)
         row = rows.setdefault(i % each, [case.setting])
         worst = (
-            float(np.nanmax([found.seen, found.pose, found.parameters]))
-            if not found.refused
+            float(np.nanmax([result.seen, result.pose, result.parameters]))
+            if not result.refused
             else None
         )
-        row += [None if found.refused else f"{found.rank} of {found.p}", worst]
+        row += [None if result.refused else f"{result.rank} of {result.p}", worst]
     return list(rows.values())
 
 
@@ -396,17 +396,17 @@ def _coverage_rows() -> list[list[object]]:
         *((case, Gaussian) for case in select_most_unknown()),
         (loud, DoubledNoise),
     ]:
-        found = compute_coverage(case, noise=noise)
+        result = compute_coverage(case, noise=noise)
         shares = [
             part.mean() if part.size else None
-            for part in (found.directions, found.parameters, found.setup)
+            for part in (result.directions, result.parameters, result.setup)
         ]
-        told = ", noise twice as large as stated" if noise is DoubledNoise else ""
+        suffix = ", noise twice as large as stated" if noise is DoubledNoise else ""
         rows.append(
             [
                 case.robot,
-                case.setting + told,
-                found.fits,
+                case.setting + suffix,
+                result.fits,
                 *(None if s is None else 100.0 * float(s) for s in shares),
             ]
         )

@@ -78,15 +78,17 @@ def evaluate_cell(
     )
     truth = sample_truth(robot, machines, SEED)
     trials = simulate_trials(robot, truth, coordinates, make_instrument(robot, *noise), SEED)
-    found = {"before": position_errors(robot, np.broadcast_to(robot.values, truth.shape), truth, q)}
+    result = {
+        "before": position_errors(robot, np.broadcast_to(robot.values, truth.shape), truth, q)
+    }
     for title, method in METHODS.items():
-        found[title] = position_errors(
+        result[title] = position_errors(
             robot, identify_trials(robot, trials, method).values, truth, q
         )
     few = min(machines, MODEL_CHOICES)
     chosen = np.array([choose_values(robot, trials.trial(i)) for i in range(few)])
-    found["chosen model"] = position_errors(robot, chosen, truth[:few], q)
-    return found
+    result["chosen model"] = position_errors(robot, chosen, truth[:few], q)
+    return result
 
 
 def choose_values(robot: Mechanism, data: Measurements) -> Array:
@@ -100,9 +102,9 @@ def collect() -> dict:
     rows = []
     for name in ROBOTS:
         for title, noise in NOISE.items():
-            found = evaluate_cell(name, noise)
-            worse = int((found["default"] > found["before"]).sum())
-            rows.append([name, title, *(1e6 * float(np.median(e)) for e in found.values()), worse])
+            result = evaluate_cell(name, noise)
+            worse = int((result["default"] > result["before"]).sum())
+            rows.append([name, title, *(1e6 * float(np.median(e)) for e in result.values()), worse])
     columns = ["robot", "noise", "before", *METHODS, f"chosen model ({MODEL_CHOICES} machines)"]
     columns.append(f"default worse than before, of {MACHINES}")
     formats = ["", "", *[".3g"] * (2 + len(METHODS)), "d"]

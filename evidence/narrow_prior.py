@@ -38,7 +38,7 @@ def evaluate_case(name: str, factor: float, machines: int = MACHINES) -> dict[st
     )
     truth = sample_truth(robot, machines, SEED)
     trials = simulate_trials(robot, truth, coordinates, make_instrument(robot, *NOISE), SEED)
-    found = {
+    result = {
         title: float(
             np.median(
                 position_errors(robot, identify_trials(stated, trials, method).values, truth, q)
@@ -51,7 +51,7 @@ def evaluate_case(name: str, factor: float, machines: int = MACHINES) -> dict[st
         }.items()
     }
     named = [_reports_conflict(stated, trials.trial(i)) for i in range(machines)]
-    return {**found, "conflict named": float(np.mean(named))}
+    return {**result, "conflict named": float(np.mean(named))}
 
 
 def _reports_conflict(robot: Mechanism, data: Measurements) -> bool:

@@ -183,15 +183,15 @@ def compute_start(name: str, seed: int) -> StartResult | None:
     except DataError:
         return None
     believed = geometry.apply_twist(T, rng.normal(size=(POSES, 6)) * POSE_ERROR)
-    found = guess_nuisance_values(data, believed, local)
+    result = guess_nuisance_values(data, believed, local)
     left, best = (
         float(np.linalg.norm(whitened_residuals(data, believed, local, values)))
-        for values in (found, truth)
+        for values in (result, truth)
     )
     rotation_error = None
     if "frame.rx" in local.table.names:
         first = local.table.index("frame.rx")
-        turn, right = (geometry.exp_so3(values[first : first + 3]) for values in (found, truth))
+        turn, right = (geometry.exp_so3(values[first : first + 3]) for values in (result, truth))
         rotation_error = float(np.linalg.norm(geometry.log_so3(turn @ right.T)))
     return StartResult(left / best, rotation_error)
 

@@ -78,24 +78,24 @@ def load_real_samples(data_folder: Path) -> dict[str, Any]:
     return json.loads((data_folder / "cable_robot" / "hp_mark_adjusted.json").read_text("utf-8"))
 
 
-def gear_and_line_ratios(found: dict[str, Any]) -> tuple[float, Array]:
+def gear_and_line_ratios(samples: dict[str, Any]) -> tuple[float, Array]:
     """Return the gear ratio g, and line moved over line unwound (4,)."""
-    gear = found["motor_gear_teeth"] / found["spool_gear_teeth"]
-    return gear, np.array(found["lines_per_spool"]) / np.array(found["mechanical_advantage"])
+    gear = samples["motor_gear_teeth"] / samples["spool_gear_teeth"]
+    return gear, np.array(samples["lines_per_spool"]) / np.array(samples["mechanical_advantage"])
 
 
-def compute_paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Array:
+def compute_paid_out(samples: dict[str, Any], radius: float, buildup: Array) -> Array:
     """Return the line paid out at the motor angles (N, 4) [mm]."""
-    gear, s = gear_and_line_ratios(found)
-    turn = gear * np.radians(found["motor_pos_samp"])
+    gear, s = gear_and_line_ratios(samples)
+    turn = gear * np.radians(samples["motor_pos_samp"])
     return s * (radius * turn - buildup * turn**2 / 4)
 
 
 def compute_motor_angles(
-    found: dict[str, Any], radius: float, buildup: Array, paid: Array
+    samples: dict[str, Any], radius: float, buildup: Array, paid: Array
 ) -> tuple[Array, Array]:
     """Return motor angles (N, 4) [rad] for the line paid out, and the derivative of the line."""
-    gear, s = gear_and_line_ratios(found)
+    gear, s = gear_and_line_ratios(samples)
     # r t - b t^2 / 4 = u has the root t = 2 u / (r + sqrt(r^2 - b u)), and dt/du = 1 / sqrt(r^2 - b
     # u)
     root = np.sqrt(radius**2 - buildup * paid / s)
@@ -103,22 +103,26 @@ def compute_motor_angles(
 
 
 def solve_reference(
-    found: dict[str, Any], line: float, position: float, start: Array, stretch: Array | None = None
+    samples: dict[str, Any],
+    line: float,
+    position: float,
+    start: Array,
+    stretch: Array | None = None,
 ) -> ReferenceSolution:
     """Solve densely for 21 parameters and all poses.
 
     Parameters
     ----------
-    found : samples. line : what the sigma of motor angles is in line on the spools as guessed,
+    samples : of the cable robot. line : sigma of motor angles as line on the guessed spools,
         position : sigma [mm].
     start : (21,) parameters to begin with [mm]. stretch : (N, 4) that lengthens the lines by an
         unknown factor, the last parameter; none by default.
     """
-    known, measured = np.array(found["xyz_of_samp"]), np.radians(found["motor_pos_samp"])
+    known, measured = np.array(samples["xyz_of_samp"]), np.radians(samples["motor_pos_samp"])
     n, k, p21 = len(measured), len(known), 21 + (stretch is not None)
-    gear, s = gear_and_line_ratios(found)
-    sigma = line / (np.array(found["spool_r_in_origin_first_guess"]) * gear * s)  # [rad]
-    first = np.concatenate([start, np.zeros(p21 - 21), _first_poses(found, start).ravel()])
+    gear, s = gear_and_line_ratios(samples)
+    sigma = line / (np.array(samples["spool_r_in_origin_first_guess"]) * gear * s)  # [rad]
+    first = np.concatenate([start, np.zeros(p21 - 21), _first_poses(samples, start).ravel()])
     more = np.zeros((n, 4)) if stretch is None else stretch
 
     def modelled(p: Array) -> tuple[Array, Array, Array]:
@@ -126,7 +130,7 @@ def solve_reference(
         apart = p[p21:].reshape(-1, 1, 3) - a
         length = np.linalg.norm(apart, axis=2)
         factor = p[21] if stretch is not None else 0.0
-        angles, slope = compute_motor_angles(found, r, b, length - c - factor * more)
+        angles, slope = compute_motor_angles(samples, r, b, length - c - factor * more)
         return angles, slope, apart / length[..., None]
 
     def residual(p: Array) -> Array:
@@ -169,13 +173,13 @@ def _split(p: Array) -> tuple[Array, Array, float, Array]:
     return limbs[:, :3], limbs[:, 3], float(p[16]), p[17:21]
 
 
-def _first_poses(found: dict[str, Any], start: Array) -> Array:
+def _first_poses(samples: dict[str, Any], start: Array) -> Array:
     """Estimate poses by least squares on their lines, from the known position or from above the
     origin.
     """
-    known = np.array(found["xyz_of_samp"])
+    known = np.array(samples["xyz_of_samp"])
     a, c, r, b = _split(start)
-    lengths = c + compute_paid_out(found, r, b)
+    lengths = c + compute_paid_out(samples, r, b)
     free = [
         least_squares(
             lambda x, want=want: np.linalg.norm(x - a, axis=1) - want, [0.0, 0.0, 400.0]
@@ -194,7 +198,7 @@ def simulate_example(seed: int = 11) -> dict[str, Any]:
         [rng.uniform(-450, 450, 36), rng.uniform(-450, 450, 36), rng.uniform(50, 1300, 36)]
     )
     poses = np.concatenate([bed, [[40.0, -30.0, 1200.0]], unknown])
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "_source": f"simulated for loopcal's example, seed {seed}; the machine is truth.yaml",
         "spool_r_in_origin_first_guess": [60.0] * 4,
         "spool_gear_teeth": 240,
@@ -205,13 +209,13 @@ def simulate_example(seed: int = 11) -> dict[str, Any]:
     }
     a, c, r, b = _split(TRUTH)
     paid = np.linalg.norm(poses[:, None] - a, axis=2) - c + LINE * rng.standard_normal((45, 4))
-    angles, _ = compute_motor_angles(found, r, b, paid)
-    return found | {"motor_pos_samp": np.round(np.degrees(angles), 2).tolist()}
+    angles, _ = compute_motor_angles(result, r, b, paid)
+    return result | {"motor_pos_samp": np.round(np.degrees(angles), 2).tolist()}
 
 
-def format_samples(found: dict[str, Any]) -> str:
+def format_samples(samples: dict[str, Any]) -> str:
     """Return the text of a file of samples, one row of numbers on a line."""
-    rows = [f'  "{key}": {_rows(value)}' for key, value in found.items()]
+    rows = [f'  "{key}": {_rows(value)}' for key, value in samples.items()]
     return "{\n" + ",\n".join(rows) + "\n}\n"
 
 

@@ -105,14 +105,14 @@ def test_links_between_pages_lead_to_existing_files(
 
 
 def test_no_file_contains_a_path_of_one_machine(root: Path, repository_files: list[Path]) -> None:
-    found = []
+    result = []
     for path in repository_files:
         try:
             text = path.read_text("utf-8")
         except UnicodeDecodeError:
             continue
-        found += [f"{path.relative_to(root)}: {match[0]}" for match in MACHINE_PATH.finditer(text)]
-    assert found == []
+        result += [f"{path.relative_to(root)}: {match[0]}" for match in MACHINE_PATH.finditer(text)]
+    assert result == []
 
 
 def test_every_python_file_begins_with_its_license(

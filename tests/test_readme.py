@@ -33,8 +33,8 @@ def test_python_example_of_the_readme_runs_and_improves_the_robot(tmp_path, caps
     exec(block[1], names)  # noqa: S102
     assert names["readings"].shape == (40, 6)
     truth = load_robot("examples/hexapod-42/truth.yaml").values
-    found = load_robot("calibrated.yaml").values
-    assert np.linalg.norm(found - truth) < 0.5 * np.linalg.norm(names["robot"].values - truth)
+    result = load_robot("calibrated.yaml").values
+    assert np.linalg.norm(result - truth) < 0.5 * np.linalg.norm(names["robot"].values - truth)
     assert "42 of 42 parameter combinations" in capsys.readouterr().out
 
 

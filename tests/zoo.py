@@ -157,7 +157,7 @@ def gough(
     z: float,
     stroke: tuple[float, float] | None = None,
 ) -> Mechanism:
-    """A hexapod with rod legs from its centres (6, 3) [m] and leg lengths at reading zero."""
+    """A hexapod with rod legs from its centers (6, 3) [m] and leg lengths at reading zero."""
     record = Gough(
         name=name,
         base=tuple(tuple(p) for p in base.tolist()),

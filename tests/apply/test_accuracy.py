@@ -56,9 +56,9 @@ def test_pose_covariance_agrees_with_finite_differences(fit):
         lambda e: forward(fit.robot.with_values(e), q).T, fit.estimate, np.full(42, 1e-6)
     )
     expected = D @ fit.covariance @ D.swapaxes(1, 2)
-    found = pose_uncertainty(fit, TEST_POSES, point="platform").covariance
+    result = pose_uncertainty(fit, TEST_POSES, point="platform").covariance
     np.testing.assert_allclose(
-        found, expected, rtol=0, atol=1e-6 * np.abs(expected).max()
+        result, expected, rtol=0, atol=1e-6 * np.abs(expected).max()
     )  # differences of 1 um steps
 
 
@@ -107,23 +107,23 @@ def test_size_of_pose_uncertainty_does_not_depend_on_the_axes(fit):
 
 
 def test_uncertainty_without_torsion_is_infinite_about_the_normal_only(fit_5):
-    found = pose_uncertainty(fit_5, TEST_POSES, "platform", gauge="infinite", point="platform")
+    result = pose_uncertainty(fit_5, TEST_POSES, "platform", gauge="infinite", point="platform")
     assert np.array_equal(
-        np.isinf(found.sd), np.tile([False, False, True, False, False, False], (5, 1))
+        np.isinf(result.sd), np.tile([False, False, True, False, False, False], (5, 1))
     )
     in_base = pose_uncertainty(fit_5, TEST_POSES, "base", gauge="infinite", point="platform")
     assert np.isinf(
         in_base.sd[:, :3]
     ).all()  # tilted poses: the normal has a part along each axis of the base
-    np.testing.assert_allclose(in_base.position, found.position, rtol=1e-9)
+    np.testing.assert_allclose(in_base.position, result.position, rtol=1e-9)
 
 
 def test_rotation_of_the_platform_frame_is_left_out_and_reported(fit_5):
-    found = pose_uncertainty(fit_5, TEST_POSES)
-    assert np.isfinite(found.sd).all()
-    assert found.reference.code == "accuracy.frame"
-    assert found.reference.data["frames"] == ("platform",)
-    assert found.reference.data["count"] == 1
+    result = pose_uncertainty(fit_5, TEST_POSES)
+    assert np.isfinite(result.sd).all()
+    assert result.reference.code == "accuracy.frame"
+    assert result.reference.data["frames"] == ("platform",)
+    assert result.reference.data["count"] == 1
 
 
 def make_base_unobservable(fit, extra=None):
@@ -176,10 +176,10 @@ def test_frame_known_from_its_prior_alone_is_left_out(fit):
 def test_unreachable_poses_have_nan_uncertainty(fit):
     far = TEST_POSES[:2].copy()
     far[1, 2, 3] = np.nan
-    found = pose_uncertainty(fit, far)
-    assert np.isfinite(found.sd[0]).all()
-    assert np.isnan(found.sd[1]).all()
-    assert np.isnan(found.T[1]).all()
+    result = pose_uncertainty(fit, far)
+    assert np.isfinite(result.sd[0]).all()
+    assert np.isnan(result.sd[1]).all()
+    assert np.isnan(result.T[1]).all()
 
 
 def test_unknown_frame_option_is_refused(fit):
@@ -230,7 +230,7 @@ def test_predicted_pose_errors_agree_with_simulated_calibrations(name, method):
         sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9))
     )
     reports = []
-    found = simulate_accuracy(
+    result = simulate_accuracy(
         robot,
         measured,
         tracker(),
@@ -241,9 +241,9 @@ def test_predicted_pose_errors_agree_with_simulated_calibrations(name, method):
         lambda *report: reports.append(report),
     )
     assert [(done, total) for done, total, _ in reports] == [(0, trials), (250, trials)]
-    ratio = found.ratio[np.isfinite(found.ratio)]
-    low, high = chi_interval(found.trials, len(ratio))
-    assert (found.trials, found.failed) == (trials, 0)
+    ratio = result.ratio[np.isfinite(result.ratio)]
+    low, high = chi_interval(result.trials, len(ratio))
+    assert (result.trials, result.failed) == (trials, 0)
     assert len(ratio) == (18 if name == "linear-delta" else 36)
     # one trial's decomposition stands for all: 3 % for truths that differ by their tolerances
     assert ratio.min() > 0.97 * low

@@ -29,33 +29,33 @@ def make_identified_robot(name, seed=1):
 def test_compensated_readings_reach_the_controlled_coordinates(name):
     robot = make_identified_robot(name)
     targets = sample_workspace(robot, 20, 2).coordinates
-    found = compensate(robot, targets)
-    reached = forward(robot, found.readings).T
+    result = compensate(robot, targets)
+    reached = forward(robot, result.readings).T
     demanded = compare_coordinates(reached, targets, robot.controlled, robot.size)[0]
     assert np.abs(demanded).max() < 1e-12  # [m], closure solved to rounding
-    assert found.usable.all()
-    assert found.uncertainty is None
+    assert result.usable.all()
+    assert result.uncertainty is None
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_compensated_commands_give_the_compensated_readings(name):
     robot = make_identified_robot(name)
     targets = sample_workspace(robot, 20, 2).coordinates
-    best, found = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
-    assert found.commands is not None
+    best, result = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
+    assert result.commands is not None
     np.testing.assert_allclose(
-        found.readings, best.readings, rtol=0, atol=1e-10
+        result.readings, best.readings, rtol=0, atol=1e-10
     )  # [m, rad] six steps of a hundredth each
     np.testing.assert_allclose(
-        inverse(robot.nominal, found.commands).q, best.readings, rtol=0, atol=1e-10
+        inverse(robot.nominal, result.commands).q, best.readings, rtol=0, atol=1e-10
     )
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_each_fixed_point_step_reduces_the_error_tenfold(name):
     robot = make_identified_robot(name)
-    found = compensate(robot, sample_workspace(robot, 20, 2).coordinates, "commands", steps=3)
-    left = found.residual_position + robot.size * found.residual_orientation
+    result = compensate(robot, sample_workspace(robot, 20, 2).coordinates, "commands", steps=3)
+    left = result.residual_position + robot.size * result.residual_orientation
     assert left.shape == (4, 20)
     assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m]
 
@@ -65,39 +65,39 @@ def test_hexapod_is_compensated_in_full():
         make_identified_robot("hexapod-42"),
         sample_workspace(load_robot("hexapod-42"), 10, 3).solution.T,
     )
-    found = compensate(robot, targets)
-    assert set(found.reach) == {Reach.REACHED}
-    assert np.linalg.norm(found.before[:, 3:], axis=1).min() > 1e-6
-    np.testing.assert_allclose(found.remaining, 0, atol=1e-12)
+    result = compensate(robot, targets)
+    assert set(result.reach) == {Reach.REACHED}
+    assert np.linalg.norm(result.before[:, 3:], axis=1).min() > 1e-6
+    np.testing.assert_allclose(result.remaining, 0, atol=1e-12)
 
 
 def test_remaining_error_of_a_tripod_is_the_minimum_over_readings():
     robot = make_identified_robot("3-prs")
     targets = sample_workspace(load_robot("3-prs"), 10, 3).solution.T
-    found = compensate(robot, targets)
-    assert set(found.reach) == {Reach.IN_PART}
-    assert found.findings[0].code == "compensation.reached-in-part"
-    assert found.findings[0].data["names"] == ("z", "phi", "theta")
-    assert 0.0 < found.findings[0].data["position"].value < 1.0  # [mm]
+    result = compensate(robot, targets)
+    assert set(result.reach) == {Reach.IN_PART}
+    assert result.findings[0].code == "compensation.reached-in-part"
+    assert result.findings[0].data["names"] == ("z", "phi", "theta")
+    assert 0.0 < result.findings[0].data["position"].value < 1.0  # [mm]
 
     def distance(readings):
         gap = geometry.pose_difference(forward(robot, readings).T, targets)
         return (gap[:, 3:] ** 2).sum(axis=1) + robot.size**2 * (gap[:, :3] ** 2).sum(axis=1)
 
-    here = distance(found.readings)
-    np.testing.assert_allclose(found.not_compensable, found.remaining)
+    here = distance(result.readings)
+    np.testing.assert_allclose(result.not_compensable, result.remaining)
     for step in np.random.default_rng(0).standard_normal((20, 3)) * 2e-6:
-        assert (distance(found.readings + step) > here).all()
+        assert (distance(result.readings + step) > here).all()
 
 
 def test_compensated_commands_converge_at_zero_tilt():
-    found = compensate(
+    result = compensate(
         make_identified_robot("3-prs"),
         [[0.7, 0.0, 0.0], [0.7, 2.0, 0.0], [0.7, -1.0, 1e-9]],
         "commands",
     )
-    assert found.usable.all()
-    assert found.residual_orientation[-1].max() < 1e-9  # [rad]
+    assert result.usable.all()
+    assert result.residual_orientation[-1].max() < 1e-9  # [rad]
 
 
 def test_targets_out_of_reach_or_beyond_strokes_are_reported():
@@ -108,12 +108,12 @@ def test_targets_out_of_reach_or_beyond_strokes_are_reported():
         [0, 0, 5.0, 0, 0, 0],
         [np.nan, 0, 0.2, 0, 0, 0],
     ]
-    found = compensate(robot, targets, labels=("home", "high", "moon", "nowhere"))
-    assert found.labels[1] == "high"
-    assert found.reach[:2] == (Reach.REACHED, Reach.OUTSIDE)
-    assert found.usable.tolist() == [True, False, False, False]
-    assert "stroke of q1" in found.findings[1].data["limit"]
-    assert found.findings[3].code == "compensation.unreachable"
+    result = compensate(robot, targets, labels=("home", "high", "moon", "nowhere"))
+    assert result.labels[1] == "high"
+    assert result.reach[:2] == (Reach.REACHED, Reach.OUTSIDE)
+    assert result.usable.tolist() == [True, False, False, False]
+    assert "stroke of q1" in result.findings[1].data["limit"]
+    assert result.findings[3].code == "compensation.unreachable"
 
 
 def test_failed_target_does_not_change_other_targets():
@@ -127,11 +127,11 @@ def test_failed_target_does_not_change_other_targets():
 
 def test_compensation_from_a_fit_gives_the_uncertainty_of_each_target():
     fit = identify(hexapod(), hexapod_data(), LeastSquares())
-    found = compensate(fit, hexapod_poses(4, seed=5))
-    assert found.uncertainty is not None
-    assert found.uncertainty.expanded.shape == (4, 6)
-    assert (found.uncertainty.position < 2e-6).all()  # [m], instrument 1 um
-    assert found.to_dict()["uncertainty"]["frame"].startswith("tool point, base axes")
+    result = compensate(fit, hexapod_poses(4, seed=5))
+    assert result.uncertainty is not None
+    assert result.uncertainty.expanded.shape == (4, 6)
+    assert (result.uncertainty.position < 2e-6).all()  # [m], instrument 1 um
+    assert result.to_dict()["uncertainty"]["frame"].startswith("tool point, base axes")
 
 
 def test_invalid_compensation_arguments_are_refused():

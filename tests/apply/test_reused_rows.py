@@ -62,10 +62,10 @@ def test_repeated_and_new_measurements_are_accepted() -> None:
 
 
 def test_few_fitted_rows_among_new_ones_are_reported() -> None:
-    found = find_reused_rows(STORED, join_measurements(FITTED.take(np.arange(3)), OTHER))
-    assert found is not None
-    assert found.severity is Severity.WARNING
-    assert found.data == {"count": 3, "total": 23, "poses": ("1", "2", "3")}
+    result = find_reused_rows(STORED, join_measurements(FITTED.take(np.arange(3)), OTHER))
+    assert result is not None
+    assert result.severity is Severity.WARNING
+    assert result.data == {"count": 3, "total": 23, "poses": ("1", "2", "3")}
 
 
 def test_poses_excluded_from_the_fit_are_accepted() -> None:

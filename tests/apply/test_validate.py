@@ -116,8 +116,8 @@ def test_exceeded_limit_fails_with_quantity_and_limit(split_data):
 
 def test_limit_on_an_unmeasured_quantity_fails():
     robot = zoo.delta()
-    found = validate(robot, simulate_heights(robot, bed_points(8)), limit_angle=1e-3)
-    (failure,) = found.failures
+    result = validate(robot, simulate_heights(robot, bed_points(8)), limit_angle=1e-3)
+    (failure,) = result.failures
     assert failure.code == "gates.limit-not-measured"
     assert failure.data == {"quantity": "orientation"}
 
@@ -149,9 +149,9 @@ def test_text_names_every_error_and_json_every_pose(validation):
 def test_diverged_geometry_and_unreachable_readings_have_different_errors():
     robot, data = hexapod(), hexapod_data(4)
     legs = np.array([name.endswith("length") for name in robot.parameters.names])
-    astray = robot.with_values(np.where(legs, 0.2, 1.0) * robot.values)
+    diverged = robot.with_values(np.where(legs, 0.2, 1.0) * robot.values)
     with pytest.raises(DataError) as error:
-        validate(astray, data, before=robot)
+        validate(diverged, data, before=robot)
     assert error.value.code == "residuals.calibrated-out-of-reach"
     assert error.value.args[0].data["before"] == 4
     far = replace(data, readings=data.readings + np.array([10.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -166,10 +166,10 @@ def make_error_size(*moved, base=1.0, by=50.0, left=30):
 
 
 def test_moved_setups_are_named():
-    found = find_moved_setups(("trk", "tool", "probe"), make_error_size("trk", "probe"))
-    assert found is not None
-    assert found.names == ("trk", "probe")
-    assert found.times == pytest.approx(50.0)
+    result = find_moved_setups(("trk", "tool", "probe"), make_error_size("trk", "probe"))
+    assert result is not None
+    assert result.names == ("trk", "probe")
+    assert result.times == pytest.approx(50.0)
     # a shift of the frame is a shift of the target: refitting either is enough, so that neither
     # alone brings it back
     either = find_moved_setups(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))

@@ -218,14 +218,14 @@ SLIPS = {
 def test_wrong_convention_is_refused_and_the_right_one_is_named(slip) -> None:
     name, kind, change, expected = SLIPS[slip]
     data = change_values(simulate_data(name, kind), change)
-    found = compare_conventions(load_cached_robot(name), data)
-    assert found.is_refused, found
-    assert has_slip(found, **expected), list_slips(found)
-    assert found.misfit > IMPLAUSIBLE
-    assert found.other_misfit < min(found.misfit / BETTER, ALLOWED)
-    assert found.finding is not None
-    assert found.finding.code == "conventions.other-interpretation"
-    assert found.finding.data["is_consistent"]
+    result = compare_conventions(load_cached_robot(name), data)
+    assert result.is_refused, result
+    assert has_slip(result, **expected), list_slips(result)
+    assert result.misfit > IMPLAUSIBLE
+    assert result.other_misfit < min(result.misfit / BETTER, ALLOWED)
+    assert result.finding is not None
+    assert result.finding.code == "conventions.other-interpretation"
+    assert result.finding.data["is_consistent"]
 
 
 READINGS = {
@@ -251,10 +251,10 @@ READINGS = {
 def test_wrong_reading_convention_is_refused_and_the_right_one_is_named(slip) -> None:
     name, change, expected = READINGS[slip]
     data = simulate_data(name, Position())
-    found = compare_conventions(
+    result = compare_conventions(
         load_cached_robot(name), replace(data, readings=change(data.readings))
     )
-    assert expected.items() <= list_slips(found)[0].items(), found
+    assert expected.items() <= list_slips(result)[0].items(), result
 
 
 def test_published_table_has_no_false_refusal_and_names_three_of_four_slips(root: Path) -> None:
@@ -282,16 +282,16 @@ def test_wrong_unit_is_named_although_two_rows_are_outliers() -> None:
     bad = change_values(
         data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01)
     )
-    found = compare_conventions(load_cached_robot("hexapod-42"), bad)
-    assert has_slip(found, **unit_slip("lengths", 10.0)), found
+    result = compare_conventions(load_cached_robot("hexapod-42"), bad)
+    assert has_slip(result, **unit_slip("lengths", 10.0)), result
 
 
 def test_wrong_unit_is_named_although_the_frame_is_unknown() -> None:
     data = change_values(
         simulate_data("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3)
     )
-    found = compare_conventions(load_cached_robot("linear-delta"), data)
-    assert has_slip(found, **unit_slip("lengths", 1e-3)), found
+    result = compare_conventions(load_cached_robot("linear-delta"), data)
+    assert has_slip(result, **unit_slip("lengths", 1e-3)), result
 
 
 def test_outliers_alone_are_reported_but_not_refused() -> None:
@@ -299,12 +299,12 @@ def test_outliers_alone_are_reported_but_not_refused() -> None:
     bad = change_values(
         data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1)
     )
-    found = compare_conventions(load_cached_robot("hexapod-42"), bad)
-    assert not found.is_refused
-    assert found.misfit < IMPLAUSIBLE  # without the two rows all is well
-    assert found.finding is not None
-    assert found.finding.code == "conventions.rows-far-off"
-    assert found.finding.data == {"count": 2, "rows": 20, "poses": ("4", "5")}
+    result = compare_conventions(load_cached_robot("hexapod-42"), bad)
+    assert not result.is_refused
+    assert result.misfit < IMPLAUSIBLE  # without the two rows all is well
+    assert result.finding is not None
+    assert result.finding.code == "conventions.rows-far-off"
+    assert result.finding.data == {"count": 2, "rows": 20, "poses": ("4", "5")}
     assert compare_conventions(load_cached_robot("hexapod-42"), data).finding is None
 
 
@@ -337,11 +337,11 @@ def test_correct_data_of_robots_three_tolerances_off_are_accepted() -> None:
 def test_correct_data_of_robots_forty_tolerances_off_are_doubtful_but_not_refused(name) -> None:
     """All interpretations are tried, and none fits far better."""
     data = simulate_data(name, Position(), times=40.0)
-    found = compare_conventions(load_cached_robot(name), data)
-    assert found.is_doubtful
-    assert not found.is_refused
-    assert found.finding is not None
-    assert found.finding.code == "conventions.unexplained"
+    result = compare_conventions(load_cached_robot(name), data)
+    assert result.is_doubtful
+    assert not result.is_refused
+    assert result.finding is not None
+    assert result.finding.code == "conventions.unexplained"
 
 
 def test_small_heights_are_not_taken_for_a_wrong_unit() -> None:
@@ -361,9 +361,9 @@ def test_small_heights_are_not_taken_for_a_wrong_unit() -> None:
         0,
         controller=robot,
     )
-    found = compare_conventions(robot, data)
-    assert found.is_doubtful
-    assert not found.is_refused, found
+    result = compare_conventions(robot, data)
+    assert result.is_doubtful
+    assert not result.is_refused, result
 
 
 def test_random_data_are_not_refused_and_cost_at_most_two_thorough_linearizations(
@@ -384,9 +384,9 @@ def test_random_data_are_not_refused_and_cost_at_most_two_thorough_linearization
         return linearize(problem, data, effort, start)
 
     monkeypatch.setattr(misfit, "_linearize", counted)
-    found = compare_conventions(load_cached_robot("linear-delta"), data)
-    assert found.misfit > 100.0
-    assert not found.is_refused
+    result = compare_conventions(load_cached_robot("linear-delta"), data)
+    assert result.misfit > 100.0
+    assert not result.is_refused
     assert len(poses) <= 2  # the data as written, before and after far rows were excluded
 
 
@@ -394,9 +394,9 @@ def test_too_few_rows_give_no_misfit_and_no_refusal() -> None:
     data = change_values(
         simulate_data("hexapod-42", Position(unknown=("frame",)), n=4), scaled([0, 1, 2], 1e3)
     )
-    found = compare_conventions(load_cached_robot("hexapod-42"), data)
-    assert np.isnan(found.misfit)
-    assert not found.is_refused
+    result = compare_conventions(load_cached_robot("hexapod-42"), data)
+    assert np.isnan(result.misfit)
+    assert not result.is_refused
 
 
 def test_instrument_in_the_wrong_unit_is_named_among_two() -> None:
@@ -411,9 +411,9 @@ def test_instrument_in_the_wrong_unit_is_named_among_two() -> None:
     data = simulate(robot, at, Instrument(sensors), 0)
     tracker, level = data.observations
     level = replace(level, measured=level.measured * np.pi / 180.0)
-    found = compare_conventions(robot, replace(data, observations=(tracker, level)))
+    result = compare_conventions(robot, replace(data, observations=(tracker, level)))
     expected = unit_slip("angles", pytest.approx(180.0 / np.pi), source="kind 'inclination'")
-    assert expected.items() <= list_slips(found)[0].items()
+    assert expected.items() <= list_slips(result)[0].items()
 
 
 def test_file_in_the_wrong_unit_is_named_among_two_of_one_kind() -> None:
@@ -424,11 +424,11 @@ def test_file_in_the_wrong_unit_is_named_among_two_of_one_kind() -> None:
         replace(rows.take(np.arange(8, 16)), source="b.csv"),
     )
     inches = replace(parts[1], measured=parts[1].measured / 25.4)
-    found = compare_conventions(robot, replace(data, observations=(parts[0], inches)))
-    assert unit_slip("lengths", 25.4, source="b.csv").items() <= list_slips(found)[0].items()
+    result = compare_conventions(robot, replace(data, observations=(parts[0], inches)))
+    assert unit_slip("lengths", 25.4, source="b.csv").items() <= list_slips(result)[0].items()
     readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
-    found = compare_conventions(robot, replace(data, observations=parts, readings=readings))
-    assert unit_slip("readings", 10.0, source="b.csv").items() <= list_slips(found)[0].items()
+    result = compare_conventions(robot, replace(data, observations=parts, readings=readings))
+    assert unit_slip("readings", 10.0, source="b.csv").items() <= list_slips(result)[0].items()
     nameless = tuple(replace(part, source="") for part in parts)
     unnamed = list_reading_interpretations(replace(data, observations=nameless), robot.actuators)
     assert ("part 2 of the data", 10.0) in {
@@ -453,30 +453,30 @@ def test_missing_values_and_fixed_parameters_do_not_change_the_convention_check(
         (robot, change_values(wrong, lambda values: values.__setitem__(holes, np.nan)), True),
         (robot, replace(data, readings=readings, reading_sigma=sigma), False),
     ):
-        found = compare_conventions(machine, some)
-        assert found.is_refused == slip
-        assert has_slip(found, **unit_slip("lengths", 1e-3)) == slip
+        result = compare_conventions(machine, some)
+        assert result.is_refused == slip
+        assert has_slip(result, **unit_slip("lengths", 1e-3)) == slip
     for nothing in (data.with_weights(np.zeros(10)), replace(data, observations=())):
         assert np.isnan(compare_conventions(robot, nothing).misfit)
 
 
 def test_shifted_rows_are_detected_in_large_data() -> None:
     data = simulate_data("linear-delta", Position(), n=200)
-    found = compare_conventions(
+    result = compare_conventions(
         load_cached_robot("linear-delta"), replace(data, readings=np.roll(data.readings, 1, axis=0))
     )
-    assert has_slip(found, "shifted-readings", neighbor="below")
+    assert has_slip(result, "shifted-readings", neighbor="below")
 
 
 @pytest.mark.slow
 def test_wrong_unit_of_readings_is_named_when_no_pose_is_reachable() -> None:
     data = simulate_data("linear-delta", Position(), n=4)
-    found = compare_conventions(
+    result = compare_conventions(
         load_cached_robot("linear-delta"), replace(data, readings=data.readings * 1e3)
     )
-    assert found.finding is not None
-    assert (found.finding.data["reached"], found.finding.data["poses"]) == (0, 4)
-    assert has_slip(found, "unit", quantity="readings")
+    assert result.finding is not None
+    assert (result.finding.data["reached"], result.finding.data["poses"]) == (0, 4)
+    assert has_slip(result, "unit", quantity="readings")
 
 
 @pytest.mark.slow
@@ -500,9 +500,9 @@ def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None
     rows = Observations.from_sigma(
         kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1)
     )
-    found = compare_conventions(robot, replace(right, observations=(rows,)))
-    assert has_slip(found, "orientation-form", form=f"euler-{ORDER}")
-    assert found.misfit > 100.0 * found.other_misfit
+    result = compare_conventions(robot, replace(right, observations=(rows,)))
+    assert has_slip(result, "orientation-form", form=f"euler-{ORDER}")
+    assert result.misfit > 100.0 * result.other_misfit
 
 
 def test_refusal_has_the_code_of_its_finding_and_can_be_overridden() -> None:

@@ -33,7 +33,7 @@ Printer = tuple[Mechanism, Measurements]
 @pytest.fixture(scope="module")
 def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
     """Every printer with nine free parameters of tolerance 1 mm or 1 degree, and its probes."""
-    found = {}
+    result = {}
     for name, record in read_records(data_folder).items():
         path = tmp_path_factory.mktemp("printer") / "printer.cfg"
         path.write_text(format_printer_cfg(record), "utf-8")
@@ -44,12 +44,12 @@ def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
             if not line.startswith("fixed")
         ]
         assert read.measurements is not None
-        found[name] = (
+        result[name] = (
             build_imported_robot(path, Imported("".join(lines) + UNIT_TOLERANCES)),
             read.measurements,
         )
-    assert len(found) == 5
-    return found
+    assert len(result) == 5
+    return result
 
 
 def free_only(robot: Mechanism, *names: str) -> Mechanism:
@@ -77,35 +77,35 @@ def select_heights(data: Measurements) -> Measurements:
 
 def test_six_parameters_are_well_conditioned_from_seven_heights(printers):
     for name, (robot, data) in printers.items():
-        found = identifiability(free_only(robot, *GEOMETRY), select_heights(data))
-        assert found.rank == found.n_parameters == 6, name
-        assert 6.0 < found.condition < 8.0, name
+        result = identifiability(free_only(robot, *GEOMETRY), select_heights(data))
+        assert result.rank == result.n_parameters == 6, name
+        assert 6.0 < result.condition < 8.0, name
 
 
 def test_one_free_arm_makes_the_condition_about_thirty_times_worse(printers):
     """Seven parameters from seven heights can be computed but are nearly meaningless."""
     first = []
     for name, (robot, data) in printers.items():
-        found = [
+        result = [
             identifiability(free_only(robot, *GEOMETRY, arm), select_heights(data)) for arm in ARMS
         ]
-        assert {one.rank for one in found} == {7}, name
-        assert all(140.0 < one.condition < 480.0 for one in found), name
-        first.append(found[0].condition)
+        assert {one.rank for one in result} == {7}, name
+        assert all(140.0 < one.condition < 480.0 for one in result), name
+        first.append(result[0].condition)
     assert 185.0 < min(first) < max(first) < 320.0
 
 
 def test_heights_leave_two_of_nine_parameters_undetermined_and_distances_are_suggested(printers):
     for name, (robot, data) in printers.items():
-        found = identifiability(robot, select_heights(data))
-        assert (found.rank, found.n_parameters, found.n_equations) == (7, 9, 7), name
-        assert found.gap > 1e10, name  # the two singular values that are cut are rounding
-        unidentifiable = [set(combination.names) for combination in found.unidentifiable]
+        result = identifiability(robot, select_heights(data))
+        assert (result.rank, result.n_parameters, result.n_equations) == (7, 9, 7), name
+        assert result.gap > 1e10, name  # the two singular values that are cut are rounding
+        unidentifiable = [set(combination.names) for combination in result.unidentifiable]
         assert len(unidentifiable) == 2
         assert all(names & set(ARMS) for names in unidentifiable), name
-        for remedy in suggest_measurements(found):
+        for suggestion in suggest_measurements(result):
             assert (
-                remedy.measurements[0].words
+                suggestion.measurements[0].words
                 == "distances between two poses (ball bar; calipers on a printed part)"
             ), name
 

@@ -44,20 +44,20 @@ def pose_instrument(*unknown: str) -> Instrument:
     ("instrument", "rank"), [(None, 42), (five_dof(), 41), (position_instrument(), 39)]
 )
 def test_rank_of_the_hexapod_equals_the_count_of_measured_freedoms(instrument, rank):
-    found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
-    assert found.rank == rank
-    assert len(found.unidentifiable) == 42 - rank
-    assert found.n_parameters == 42
+    result = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
+    assert result.rank == rank
+    assert len(result.unidentifiable) == 42 - rank
+    assert result.n_parameters == 42
     if rank < 42:
-        assert found.singular_values[rank] < 1e-13 * found.singular_values[0]
-        assert found.gap > 1e8
+        assert result.singular_values[rank] < 1e-13 * result.singular_values[0]
+        assert result.gap > 1e8
 
 
 @pytest.mark.parametrize(("unknown", "rank"), FRAMES.items())
 def test_unknown_frame_lowers_the_rank_by_six_rigid_motions_of_that_frame(unknown, rank):
-    found = identifiability(hexapod(), hexapod_data(60, instrument=pose_instrument(*unknown)))
-    assert found.rank == rank
-    moved = [moved_frame(c) for c in found.unidentifiable]
+    result = identifiability(hexapod(), hexapod_data(60, instrument=pose_instrument(*unknown)))
+    assert result.rank == rank
+    moved = [moved_frame(c) for c in result.unidentifiable]
     assert moved.count("base") == (6 if "frame" in unknown else 0)
     assert moved.count("platform") == (6 if "tool" in unknown else 0)
 
@@ -68,21 +68,21 @@ def test_unknown_frame_lowers_the_rank_by_six_rigid_motions_of_that_frame(unknow
 )
 def test_rank_of_kinds_with_setup_parameters_and_of_kinds_that_link_poses(kind, rank):
     sigma = noise(*[5 * UM] * len(kind.noise_columns))
-    # a closed chain of neighbours and one of pairs further apart
+    # a closed chain of neighbors and one of pairs further apart
     far = (
         None
         if kind.poses_per_row == 1
         else np.array([(i, (i + k) % 60) for k in (1, 7, 19) for i in range(60)])
     )
-    found = identifiability(
+    result = identifiability(
         hexapod(), hexapod_data(60, instrument=Instrument((Sensor(kind, sigma, rows=far),)))
     )
-    assert found.rank == rank
+    assert result.rank == rank
 
 
 def test_unmeasured_torsion_leaves_platform_rotation_unidentifiable():
-    found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
-    (turn,) = found.unidentifiable
+    result = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
+    (turn,) = result.unidentifiable
     moved = dict(zip(turn.names, turn.changes, strict=True))
     assert all(".platform.x" in n or ".platform.y" in n for n in moved)
     # a turn about z: dx = -w y, dy = w x at every joint
@@ -96,28 +96,28 @@ def test_unmeasured_torsion_leaves_platform_rotation_unidentifiable():
 
 
 def test_3_prs_without_torsion_has_rank_32_of_33_and_names_three_balls():
-    found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
-    (turn,) = found.unidentifiable
-    assert (found.rank, found.n_parameters) == (32, 33)
+    result = identifiability(load_robot("3-prs"), five_dof(), poses=36)
+    (turn,) = result.unidentifiable
+    assert (result.rank, result.n_parameters) == (32, 33)
     assert turn.names == ("a1y", "a2y", "a3y")
     np.testing.assert_allclose(turn.weights, 1 / np.sqrt(3), rtol=1e-6)
     assert isinstance(turn.meaning, Finding)
     assert turn.meaning.data == TURN_ABOUT_Z
-    (finding,) = [f for f in found.findings if f.code == "fit.unidentifiable"]
+    (finding,) = [f for f in result.findings if f.code == "fit.unidentifiable"]
     assert finding.data["names"] == turn.names
-    assert "a1y, a2y and a3y, in equal parts" in str(found)
+    assert "a1y, a2y and a3y, in equal parts" in str(result)
 
 
 def test_ru_pus_prs_without_torsion_has_rank_24():
-    found = identifiability(load_robot("ru-pus-prs"), five_dof(), poses=36)
-    (turn,) = found.unidentifiable
-    assert found.rank == 24
+    result = identifiability(load_robot("ru-pus-prs"), five_dof(), poses=36)
+    (turn,) = result.unidentifiable
+    assert result.rank == 24
     assert set(turn.names) == {"a1y", "a2x", "thU2z"}
 
 
 def test_each_parameter_has_a_state_and_the_parameters_of_its_combination():
-    found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
-    verdict = {v.name: v for v in found.parameters}
+    result = identifiability(load_robot("3-prs"), five_dof(), poses=36)
+    verdict = {v.name: v for v in result.parameters}
     assert verdict["a2y"].state == "together"
     assert verdict["a2y"].others == ("a1y", "a3y")
     assert {v.state for name, v in verdict.items() if name not in {"a1y", "a2y", "a3y"}} == {
@@ -128,33 +128,35 @@ def test_each_parameter_has_a_state_and_the_parameters_of_its_combination():
 
 
 def test_weak_directions_are_listed_from_the_weakest():
-    found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
-    assert [c.singular_value for c in found.weak] == sorted(found.singular_values[: found.rank])[:5]
-    assert found.improved == (found.singular_values > 1.0).sum() < found.rank
-    assert [f.code for f in found.findings].count("fit.hardly-observable") == len(found.weak)
+    result = identifiability(load_robot("3-prs"), five_dof(), poses=36)
+    assert [c.singular_value for c in result.weak] == sorted(result.singular_values[: result.rank])[
+        :5
+    ]
+    assert result.improved == (result.singular_values > 1.0).sum() < result.rank
+    assert [f.code for f in result.findings].count("fit.hardly-observable") == len(result.weak)
 
 
 def test_observability_indices_equal_their_definitions():
     A = np.random.default_rng(0).normal(size=(30, 5))
     s = np.asarray(np.linalg.svd(A, compute_uv=False), dtype=float)
-    found = compute_observability(s, 5, 30)
-    assert found.o1**10 * 30**5 == pytest.approx(np.linalg.det(A.T @ A), rel=1e-12)  # rounding
-    assert (found.o2, found.o3, found.o4) == pytest.approx(
+    result = compute_observability(s, 5, 30)
+    assert result.o1**10 * 30**5 == pytest.approx(np.linalg.det(A.T @ A), rel=1e-12)  # rounding
+    assert (result.o2, result.o3, result.o4) == pytest.approx(
         (1 / np.linalg.cond(A), s[-1], s[-1] ** 2 / s[0])
     )
-    assert found.o5 == pytest.approx(1 / sum(1 / s))
+    assert result.o5 == pytest.approx(1 / sum(1 / s))
     cut = compute_observability(np.append(s, 1e-17), 5, 30)
-    assert (cut.o3, cut.left_out) == (found.o3, 1)
+    assert (cut.o3, cut.left_out) == (result.o3, 1)
     assert compute_observability(np.zeros(3), 0, 4).o1 == 0.0
-    assert "rows divided by sigma, columns multiplied by tolerance" in str(found)
+    assert "rows divided by sigma, columns multiplied by tolerance" in str(result)
 
 
 def test_combinations_span_the_null_space():
     free = select_free_parameters(hexapod())
     null = np.linalg.qr(np.random.default_rng(0).standard_normal((42, 4))).Q
-    found = describe_null_space(free, null)
+    result = describe_null_space(free, null)
     z = np.zeros((4, 42))
-    for row, combination in zip(z, found, strict=True):
+    for row, combination in zip(z, result, strict=True):
         for name, change in zip(combination.names, combination.changes, strict=True):
             row[free.names.index(name)] = change
     np.testing.assert_allclose(z @ null @ null.T, z, atol=1e-10)
@@ -162,18 +164,18 @@ def test_combinations_span_the_null_space():
 
 
 def test_text_is_short_and_json_has_all_attributes():
-    found = identifiability(hexapod(), hexapod_data(6))
-    rank = found.findings[0]
+    result = identifiability(hexapod(), hexapod_data(6))
+    rank = result.findings[0]
     assert rank.code == "identifiability.rank"
     assert rank.data == {"rank": 36, "parameters": 42, "equations": 36}
-    assert [f.code for f in found.findings].count("fit.unidentifiable") == 6
-    assert len(str(found).splitlines()) < 40
-    assert len(repr(found)) < 120
-    document = json.loads(to_json(found.to_dict()))
+    assert [f.code for f in result.findings].count("fit.unidentifiable") == 6
+    assert len(str(result).splitlines()) < 40
+    assert len(repr(result)) < 120
+    document = json.loads(to_json(result.to_dict()))
     assert document["rank"] == 36
     assert len(document["singular_values"]) == 42
     assert len(document["parameters"]) == 42
-    assert document["unidentifiable"][0]["names"] == list(found.unidentifiable[0].names)
+    assert document["unidentifiable"][0]["names"] == list(result.unidentifiable[0].names)
     assert document["findings"][0]["code"] == "identifiability.rank"
 
 

@@ -39,9 +39,9 @@ def name_parameters(*letters: str) -> set[str]:
 
 def test_3_prs_with_fourteen_parameters_a_chain_drops_bz_thbz_and_thcy(load_with_line):
     robot = load_with_line("3-prs", "parameters: fourteen")
-    found = identifiability(robot, tracker(), poses=36)
-    assert (found.rank, found.n_parameters) == (33, 42)
-    smaller = choose_identifiable_subset(found)
+    result = identifiability(robot, tracker(), poses=36)
+    assert (result.rank, result.n_parameters) == (33, 42)
+    smaller = choose_identifiable_subset(result)
     assert {m.name for m in smaller.dropped} == name_parameters("bz", "thBz", "thCy")
     assert smaller.kept == load_robot("3-prs").parameters.names
     merged = {m.name: m for m in smaller.dropped}
@@ -49,21 +49,21 @@ def test_3_prs_with_fourteen_parameters_a_chain_drops_bz_thbz_and_thcy(load_with
     assert merged["b2z"].units == ("mm",)
     np.testing.assert_allclose(merged["b2z"].changes, [1.0], rtol=1e-9)
     assert merged["thB3z"].into == ()
-    assert {v.name for v in found.parameters if v.state == "not at all"} == name_parameters(
+    assert {v.name for v in result.parameters if v.state == "not at all"} == name_parameters(
         "thBz", "thCy"
     )
 
 
 def test_ru_pus_prs_with_27_parameters_merges_two_rotations(load_with_line):
-    found = identifiability(
+    result = identifiability(
         load_with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
     )
-    (merged,) = choose_identifiable_subset(found).dropped
-    assert found.rank == 26
+    (merged,) = choose_identifiable_subset(result).dropped
+    assert result.rank == 26
     assert {merged.name, *merged.into} == {"thOz", "thU1z"}
     assert merged.into == ("thOz",)
     np.testing.assert_allclose(merged.changes, [1.0], rtol=1e-9)
-    (tied,) = found.unidentifiable
+    (tied,) = result.unidentifiable
     assert set(tied.names) == {"thOz", "thU1z"}
     assert isinstance(tied.meaning, Finding)
     assert tied.meaning.code == "identifiability.no-motion"
@@ -72,12 +72,12 @@ def test_ru_pus_prs_with_27_parameters_merges_two_rotations(load_with_line):
 @pytest.mark.parametrize("unknown", [("frame",), ("tool",), ("frame", "tool")])
 def test_dropped_parameter_and_its_replacement_have_the_same_effect_on_rows(unknown):
     instrument = Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
-    found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
-    smaller = choose_identifiable_subset(found)
-    free = found.free_parameters
-    assert len(smaller.kept) == found.rank
+    result = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
+    smaller = choose_identifiable_subset(result)
+    free = result.free_parameters
+    assert len(smaller.kept) == result.rank
     s = np.linalg.svd(
-        found.factor[:, [free.names.index(n) for n in smaller.kept]], compute_uv=False
+        result.factor[:, [free.names.index(n) for n in smaller.kept]], compute_uv=False
     )
     assert s[-1] > 1e-4 * s[0]
     factor, _ = free.display()
@@ -85,11 +85,11 @@ def test_dropped_parameter_and_its_replacement_have_the_same_effect_on_rows(unkn
         z = np.zeros(len(free))
         place = free.names.index(merged.name)
         z[place] = factor[place] / free.tolerance[place]
-        effect = found.factor @ z
+        effect = result.factor @ z
         for name, change in zip(merged.into, merged.changes, strict=True):
             other = free.names.index(name)
             z[other] -= change * factor[other] / free.tolerance[other]
-        assert np.linalg.norm(found.factor @ z) < 1e-5 * np.linalg.norm(
+        assert np.linalg.norm(result.factor @ z) < 1e-5 * np.linalg.norm(
             effect
         )  # [1] parts below 1e-6 are left out
 
@@ -102,8 +102,8 @@ def test_identifiable_set_is_not_reduced():
 
 def test_reduced_robot_file_loads_with_its_comments_and_full_rank(tmp_path):
     robot = load_robot("3-prs")
-    found = identifiability(robot, five_dof(), poses=36)
-    smaller = choose_identifiable_subset(found)
+    result = identifiability(robot, five_dof(), poses=36)
+    smaller = choose_identifiable_subset(result)
     path = tmp_path / "smaller.yaml"
     path.write_text(
         format_reduced_robot(smaller.robot, {m.name: m.describe_effect() for m in smaller.dropped}),
@@ -147,7 +147,7 @@ def test_json_lists_dropped_and_kept_parameters():
 
 
 def test_observed_poses_mark_unreached_poses_and_stay_finite():
-    found = identifiability(hexapod(), hexapod_data(60))
-    at = observe_poses(found.free_parameters, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
+    result = identifiability(hexapod(), hexapod_data(60))
+    at = observe_poses(result.free_parameters, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
     assert at.is_reached.tolist() == [True, False]
     assert np.isfinite(at.twists).all()

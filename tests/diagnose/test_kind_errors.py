@@ -68,14 +68,14 @@ def test_improvement_weights_each_instrument_by_its_sigma():
         Component(("z",)).with_tool(new.tool), np.arange(10), z, 20 * UM
     )
     positions = Observations.from_sigma(Position().with_tool(new.tool), np.arange(10, 40), xyz, MM)
-    found = validate(new, Measurements(new.name, readings, (heights, positions)), before=old)
-    assert found.improvement() == pytest.approx(
+    result = validate(new, Measurements(new.name, readings, (heights, positions)), before=old)
+    assert result.improvement() == pytest.approx(
         1 / np.sqrt(3.0), rel=1e-6
     )  # as millimetres they grew
-    ((name, times),) = found.improvements().items()
+    ((name, times),) = result.improvements().items()
     assert name == "weighted"
     assert times == pytest.approx(np.sqrt(10 * 5.0**2 / (30 * 0.1**2)), rel=1e-6)
-    assert [k["kind"] for k in found.to_dict()["kinds"]] == ["component", "position", "all"]
+    assert [k["kind"] for k in result.to_dict()["kinds"]] == ["component", "position", "all"]
 
 
 def test_validation_counts_rows_of_each_quantity_and_reports_too_few():
@@ -87,10 +87,10 @@ def test_validation_counts_rows_of_each_quantity_and_reports_too_few():
         np.nan
     )  # position of three rows, orientation of eleven, and one empty row
     measured[11] = np.nan
-    found = validate(hexapod(), replace(data, observations=(replace(pose, measured=measured),)))
-    assert len(found.poses) == 11
-    assert found.after.statistics("position").count == 3
-    assert found.after.statistics("orientation").count == 11
-    (few,) = [f for f in found.findings if f.code == "validation.few-rows"]
+    result = validate(hexapod(), replace(data, observations=(replace(pose, measured=measured),)))
+    assert len(result.poses) == 11
+    assert result.after.statistics("position").count == 3
+    assert result.after.statistics("orientation").count == 11
+    (few,) = [f for f in result.findings if f.code == "validation.few-rows"]
     assert few.data == {"quantity": "position", "count": 3}
     assert not validate(hexapod(), data).findings

@@ -40,38 +40,38 @@ def test_folds_hold_out_every_pose_once_and_keep_blocks_together():
 
 def test_held_out_poses_are_predicted_to_the_noise_and_worse_than_fitted_ones():
     data = hexapod_data(40)
-    found = cross_validate(hexapod(), data, LeastSquares())
-    assert sorted(found.poses, key=int) == list(data.labels)
+    result = cross_validate(hexapod(), data, LeastSquares())
+    assert sorted(result.poses, key=int) == list(data.labels)
     fit = identify(hexapod(), data, LeastSquares())
     fitted = fit.chi_square / 240
-    assert fitted < 1.0 < found.score < 2.0  # 42 parameters from 192 equations add about a quarter
-    assert found.improvement() > 10.0
-    assert found.converged
-    assert (found.before_fold > 100.0).all()
+    assert fitted < 1.0 < result.score < 2.0  # 42 parameters from 192 equations add about a quarter
+    assert result.improvement() > 10.0
+    assert result.converged
+    assert (result.before_fold > 100.0).all()
 
 
 def test_machine_with_length_errors_alone_needs_lengths_alone():
-    found = choose_model(hexapod(), simulate_length_errors(), method=LeastSquares())
-    assert [c.name for c in found.candidates] == ["nothing", "lengths", "ideal"]
-    assert found.chosen.name == "lengths"
-    assert len(found.chosen.parameters) == 6
-    assert found.finding.code == "model.simpler-suffices"
-    assert found.finding.data["parameters"] == 6
-    assert int(found.robot.parameters.free.sum()) == 6
-    assert "nothing" in str(found)
+    result = choose_model(hexapod(), simulate_length_errors(), method=LeastSquares())
+    assert [c.name for c in result.candidates] == ["nothing", "lengths", "ideal"]
+    assert result.chosen.name == "lengths"
+    assert len(result.chosen.parameters) == 6
+    assert result.finding.code == "model.simpler-suffices"
+    assert result.finding.data["parameters"] == 6
+    assert int(result.robot.parameters.free.sum()) == 6
+    assert "nothing" in str(result)
 
 
 def test_machine_with_all_errors_needs_all_parameters():
-    found = choose_model(hexapod(), hexapod_data(30))
-    assert found.chosen.name == "ideal"
-    assert found.finding.code == "model.all-needed"
+    result = choose_model(hexapod(), hexapod_data(30))
+    assert result.chosen.name == "ideal"
+    assert result.finding.code == "model.all-needed"
 
 
 def test_perfect_machine_and_poor_instrument_give_no_parameters():
     data = simulate(zoo.hexapod(), hexapod_poses(30), tracker(100 * UM, 500 * URAD), 1)
-    found = choose_model(hexapod(), data, method=LeastSquares())
-    assert found.chosen.name == "nothing"
-    assert found.finding.code == "model.nothing-gained"
+    result = choose_model(hexapod(), data, method=LeastSquares())
+    assert result.chosen.name == "nothing"
+    assert result.finding.code == "model.nothing-gained"
 
 
 def test_nested_parameter_sets_of_the_3_prs():
@@ -97,10 +97,10 @@ def test_excluded_poses_are_neither_fitted_nor_predicted():
     measured[4] += 0.1  # [rad], [m]
     wrong = replace(data, observations=(replace(rows, measured=measured),))
     options = FitOptions(method=LeastSquares(), excluded_poses=("5",))
-    found = cross_validate(hexapod(), wrong, options=options)
-    assert "5" not in found.poses
+    result = cross_validate(hexapod(), wrong, options=options)
+    assert "5" not in result.poses
     same = cross_validate(hexapod(), data, options=options)
-    np.testing.assert_allclose(found.fold, same.fold, rtol=1e-9)
+    np.testing.assert_allclose(result.fold, same.fold, rtol=1e-9)
 
 
 def test_nuisance_parameters_of_all_rows_are_refused_in_folds():

@@ -89,15 +89,15 @@ def test_robust_fit_with_outliers_is_nearly_as_good_as_a_fit_of_clean_data(loss)
 def test_outliers_are_named_but_not_excluded(loss, method):
     _, bad = make_data_with_outliers(0)
     fit = identify(hexapod(), bad, method, loss=loss)
-    found = find_outliers(fit, bad)
-    assert set(found.names) == set(NAMED)
-    assert found.influence.leverage.sum() / 240 < 0.3
-    (summary,) = found.summary
+    result = find_outliers(fit, bad)
+    assert set(result.names) == set(NAMED)
+    assert result.influence.leverage.sum() / 240 < 0.3
+    (summary,) = result.summary
     assert summary.code == "outliers.some"
     assert (summary.data["count"], summary.data["blocks"]) == (3, 40)
-    assert found.outliers[0].finding.data["poses"] == found.outliers[0].poses
+    assert result.outliers[0].finding.data["poses"] == result.outliers[0].poses
     assert fit.residual_test.degrees in {240 - 42, 240} or loss is not None
-    fitted = identify(hexapod(), bad, method, options=FitOptions(excluded_poses=found.names))
+    fitted = identify(hexapod(), bad, method, options=FitOptions(excluded_poses=result.names))
     assert set(fitted.options.excluded_poses) == set(NAMED)
     assert any(f.code == "fit.excluded-poses" for f in fitted.findings)
     assert find_outliers(fitted, bad).outliers == ()
@@ -105,7 +105,7 @@ def test_outliers_are_named_but_not_excluded(loss, method):
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()])
 def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
-    # one linearisation: with it the shortcut is exact
+    # one linearization: with it the shortcut is exact
     data, free = hexapod_data(12), select_free_parameters(hexapod())
     problem = problem_of(free, data)
     member, z = np.arange(12) // 2, np.zeros((1, 42))  # two poses to a block
@@ -117,7 +117,7 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
         return kept, d, penalty, d.deviation(d.solution(penalty))
 
     whole, d, penalty, at = fitted(np.ones(12))
-    found = compute_influence(problem, whole, member, d, penalty, np.ones(6), at)
+    result = compute_influence(problem, whole, member, d, penalty, np.ones(6), at)
     parts = [part for block in problem.leverage_rows(whole) for part in block]
     A = np.concatenate([part.rows.reshape(-1, 43) for part in parts])
     for j in range(6):
@@ -130,10 +130,10 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
             )
         without = -np.linalg.lstsq(held[:, :-1], held[:, -1], rcond=None)[0]
         residual = A[own, :-1] @ without + A[own, -1]
-        assert found.deleted[j] == pytest.approx(residual @ residual, rel=1e-7)
+        assert result.deleted[j] == pytest.approx(residual @ residual, rel=1e-7)
         G = A[own, :-1] @ np.linalg.inv(held[:, :-1].T @ held[:, :-1]) @ A[own, :-1].T
         expected = residual @ np.linalg.solve(np.eye(12) + G, residual)
-        assert found.distance[j] == pytest.approx(expected, rel=1e-6)
+        assert result.distance[j] == pytest.approx(expected, rel=1e-6)
         # the same from a fit in which the block has no weight
         outside = (np.arange(6) != j).astype(float)
         kept, d_j, penalty_j, at_j = fitted(outside[member])
@@ -141,7 +141,7 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
         assert again.distance[j] == pytest.approx(expected, rel=1e-6)
         assert again.leverage[j] == 0.0
     if method == LeastSquares():
-        assert found.leverage.sum() == pytest.approx(42.0)
+        assert result.leverage.sum() == pytest.approx(42.0)
 
 
 def test_false_alarm_rate_of_clean_data_sets_is_the_stated_one():
@@ -159,16 +159,16 @@ def test_estimated_noise_is_not_inflated_by_outliers():
     claimed = bad.observations[0]
     sharp = replace(bad, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
     fit = identify(hexapod(), sharp, loss=Huber(), options=FitOptions(noise="estimated"))
-    found = find_outliers(fit, sharp)
-    assert found.scale == pytest.approx(3.0, rel=0.3)
-    assert set(found.names) == set(NAMED)
+    result = find_outliers(fit, sharp)
+    assert result.scale == pytest.approx(3.0, rel=0.3)
+    assert set(result.names) == set(NAMED)
 
 
 def test_blocks_are_not_testable_without_degrees_of_freedom():
     data = hexapod_data(7)  # 42 equations, 42 parameters
-    found = find_outliers(identify(hexapod(), data, LeastSquares()), data)
-    assert found.blocks == 0
-    assert [f.code for f in found.summary] == ["outliers.not-testable"]
+    result = find_outliers(identify(hexapod(), data, LeastSquares()), data)
+    assert result.blocks == 0
+    assert [f.code for f in result.summary] == ["outliers.not-testable"]
 
 
 def test_block_limit_has_the_exceedance_probability_of_a_single_residual():
@@ -218,15 +218,15 @@ def test_distance_of_an_excluded_pose_without_a_reading_equals_the_chi_square_lo
     )
     fit = identify(robot, data, LeastSquares(), loss=Tukey())
     assert fit.pose_weights[7] < 0.5  # excluded in the first round
-    found = find_outliers(fit, data)
-    assert "8" in found.names
-    others = tuple(name for name in found.names if name != "8")
+    result = find_outliers(fit, data)
+    assert "8" in result.names
+    others = tuple(name for name in result.names if name != "8")
     with_it, without = (
         identify(robot, data, LeastSquares(), options=FitOptions(excluded_poses=names))
-        for names in (others, found.names)
+        for names in (others, result.names)
     )
     # [1] nonlinearity over 0.1 mm
-    assert found.influence.distance[7] == pytest.approx(
+    assert result.influence.distance[7] == pytest.approx(
         with_it.chi_square - without.chi_square, rel=1e-2
     )
 
@@ -265,15 +265,15 @@ def test_one_degree_of_freedom_reports_a_conflict_and_names_no_outlier(wrong):
     """All seven residuals are multiples of one number, so each height may be the wrong one."""
     robot, data = probe_delta(7, {wrong: 1e-3})
     fit = identify(robot, data, LeastSquares())
-    found = find_outliers(fit, data)
-    assert found.is_converged
-    assert found.blocks == 7
-    assert found.names == ()
+    result = find_outliers(fit, data)
+    assert result.is_converged
+    assert result.blocks == 7
+    assert result.names == ()
     assert fit.residual_test.failed
-    (group,) = found.ambiguous
+    (group,) = result.ambiguous
     assert len(group.poses) == 7
     assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
-    (summary,) = found.summary
+    (summary,) = result.summary
     assert summary.code == "outliers.ambiguous"
     assert (summary.data["count"], summary.data["blocks"]) == (7, 7)
     assert "outliers.conflict" in [f.code for f in examine_fit(fit, data).findings]
@@ -281,27 +281,27 @@ def test_one_degree_of_freedom_reports_a_conflict_and_names_no_outlier(wrong):
 
 def test_one_degree_of_freedom_with_unknown_noise_is_reported_as_untestable():
     robot, data = probe_delta(7, {3: 1e-3})
-    found = find_outliers(
+    result = find_outliers(
         identify(robot, data, LeastSquares(), options=FitOptions(noise="estimated")), data
     )
-    assert found.outliers == found.ambiguous == ()
-    assert [f.code for f in found.summary] == ["outliers.unknown-noise"]
+    assert result.outliers == result.ambiguous == ()
+    assert [f.code for f in result.summary] == ["outliers.unknown-noise"]
 
 
 def test_wrong_height_is_named_with_enough_degrees_of_freedom():
     robot, data = probe_delta(12, {4: 1e-3})
-    found = find_outliers(identify(robot, data, LeastSquares()), data)
-    assert found.names == ("5",)
-    assert found.ambiguous == ()
+    result = find_outliers(identify(robot, data, LeastSquares()), data)
+    assert result.names == ("5",)
+    assert result.ambiguous == ()
 
 
 def test_two_wrong_heights_of_eight_are_ambiguous():
     robot, data = probe_delta(
         8, {0: 1e-3, 1: -1e-3}
     )  # no single height explains both, and any two do
-    found = find_outliers(identify(robot, data, LeastSquares()), data)
-    assert found.names == ()
-    assert [f.code for f in found.summary] == ["outliers.ambiguous"]
+    result = find_outliers(identify(robot, data, LeastSquares()), data)
+    assert result.names == ()
+    assert [f.code for f in result.summary] == ["outliers.ambiguous"]
 
 
 def test_misfit_of_all_rows_is_reported_although_no_outlier_is_named():
@@ -309,10 +309,10 @@ def test_misfit_of_all_rows_is_reported_although_no_outlier_is_named():
     rows = data.observations[0]
     data = replace(data, observations=(replace(rows, covariance=rows.covariance * (20 / 38) ** 2),))
     fit = identify(robot, data, LeastSquares())
-    found = find_outliers(fit, data, level=1e-9)  # so low a level that no outlier is named
+    result = find_outliers(fit, data, level=1e-9)  # so low a level that no outlier is named
     assert fit.residual_test.failed
-    assert found.outliers == found.ambiguous == ()
-    assert [f.code for f in found.summary] == ["outliers.none-but-misfit"]
+    assert result.outliers == result.ambiguous == ()
+    assert [f.code for f in result.summary] == ["outliers.none-but-misfit"]
 
 
 def test_outlier_search_reports_progress():

@@ -15,20 +15,22 @@ from tests.estimate.problems import hexapod, hexapod_data
 
 def test_start_at_the_truth_is_within_noise_of_the_fit() -> None:
     truth = hexapod().with_values(zoo.hexapod_truth())
-    found = check_start_values(identify(truth, hexapod_data()))
-    assert found.verdict is StartVerdict.WITHIN_NOISE
-    assert found.p_value > 1e-3
+    result = check_start_values(identify(truth, hexapod_data()))
+    assert result.verdict is StartVerdict.WITHIN_NOISE
+    assert result.p_value > 1e-3
     # 180 equations, 42 parameters: the truth leaves 1 sigma, the fit sqrt(138 / 180) of it
-    assert found.before == pytest.approx(1.0, abs=0.2)
-    assert found.after == pytest.approx(np.sqrt(138 / 180), abs=0.2)
+    assert result.before == pytest.approx(1.0, abs=0.2)
+    assert result.after == pytest.approx(np.sqrt(138 / 180), abs=0.2)
 
 
 @pytest.mark.parametrize("noise", ["given", "estimated"])
 def test_nominal_start_is_not_calibrated(noise) -> None:
-    found = check_start_values(identify(hexapod(), hexapod_data(), options=FitOptions(noise=noise)))
-    assert found.verdict is StartVerdict.NOT_CALIBRATED
-    assert found.p_value < 1e-6
-    assert found.before > 10 * found.after
+    result = check_start_values(
+        identify(hexapod(), hexapod_data(), options=FitOptions(noise=noise))
+    )
+    assert result.verdict is StartVerdict.NOT_CALIBRATED
+    assert result.p_value < 1e-6
+    assert result.before > 10 * result.after
 
 
 def test_start_at_the_fit_is_the_best() -> None:

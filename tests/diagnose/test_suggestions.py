@@ -11,12 +11,12 @@ from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 
 def test_torsion_is_suggested_for_the_3_prs_without_torsion():
-    (remedy,) = suggest_measurements(identifiability(load_robot("3-prs"), five_dof(), poses=36))
-    assert remedy.measurements[0].words == "psi"
-    assert remedy.finding.code == "identifiability.measure-also"
-    assert remedy.finding.data["names"] == ("a1y", "a2y", "a3y")
-    assert remedy.finding.data["measurements"][0]["words"] == "psi"
-    words = {cure.words for cure in remedy.measurements}
+    (suggestion,) = suggest_measurements(identifiability(load_robot("3-prs"), five_dof(), poses=36))
+    assert suggestion.measurements[0].words == "psi"
+    assert suggestion.finding.code == "identifiability.measure-also"
+    assert suggestion.finding.data["names"] == ("a1y", "a2y", "a3y")
+    assert suggestion.finding.data["measurements"][0]["words"] == "psi"
+    words = {measurement.words for measurement in suggestion.measurements}
     assert "the pose" in words
     # none of these measurements depends on a rotation about the platform's z axis
     assert not words & {
@@ -34,12 +34,12 @@ def test_torsion_is_suggested_for_the_3_prs_without_torsion():
 @pytest.mark.parametrize(("unknown", "datum"), [("frame", "the pose"), ("tool", "the pose")])
 def test_known_frame_is_suggested_for_an_unknown_frame(unknown, datum):
     instrument = Instrument((Sensor(Pose(unknown=(unknown,)), tracker().sensors[0].noise),))
-    found = suggest_measurements(
+    result = suggest_measurements(
         identifiability(hexapod(), hexapod_data(60, instrument=instrument))
     )
-    assert len(found) == 6
-    for remedy in found:
-        words = {cure.words for cure in remedy.measurements}
+    assert len(result) == 6
+    for suggestion in result:
+        words = {measurement.words for measurement in suggestion.measurements}
         assert datum in words
         assert "the pose (frame and tool unknown)" not in words
 
@@ -49,13 +49,15 @@ def test_joint_sensor_is_suggested_for_a_parameter_without_effect_on_poses(tmp_p
     path.write_text(
         list_shipped_robots()["3-prs"].read_text("utf-8") + "parameters: fourteen\n", "utf-8"
     )
-    found = {
+    result = {
         r.combination.names[0]: r
         for r in suggest_measurements(identifiability(load_robot(path), tracker(), poses=36))
     }
-    assert found["thB1z"].finding.code == "identifiability.fix-one"
-    assert {cure.words for cure in found["thC1y"].measurements} == {"the joint chain1.joint"}
-    assert found["b1z"].finding.code == "identifiability.fix-one"
+    assert result["thB1z"].finding.code == "identifiability.fix-one"
+    assert {measurement.words for measurement in result["thC1y"].measurements} == {
+        "the joint chain1.joint"
+    }
+    assert result["b1z"].finding.code == "identifiability.fix-one"
 
 
 def test_identifiable_robot_has_no_suggestions():
@@ -63,19 +65,21 @@ def test_identifiable_robot_has_no_suggestions():
 
 
 def test_every_suggestion_has_a_known_kind_and_lowers_the_uncertainty():
-    found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
-    before = {v.name: v.left for v in found.parameters}
-    (remedy,) = suggest_measurements(found)
-    assert remedy.measurements
-    for cure in remedy.measurements:
-        assert cure.kind in KINDS
-        assert cure.left < before[remedy.combination.names[0]]
+    result = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
+    before = {v.name: v.left for v in result.parameters}
+    (suggestion,) = suggest_measurements(result)
+    assert suggestion.measurements
+    for measurement in suggestion.measurements:
+        assert measurement.kind in KINDS
+        assert measurement.left < before[suggestion.combination.names[0]]
 
 
 def test_suggestions_of_a_robot_without_workspace_use_poses_about_home():
-    found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
+    result = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     assert not hexapod().assembly.workspace
-    assert "psi" in {cure.words for cure in suggest_measurements(found)[0].measurements}
+    assert "psi" in {
+        measurement.words for measurement in suggest_measurements(result)[0].measurements
+    }
 
 
 TRANSLATIONAL = """\
@@ -108,9 +112,9 @@ def test_quantities_measured_in_full_are_not_suggested(tmp_path):
     """This platform never rotates and full poses were measured: rounding is no information."""
     path = tmp_path / "upu.yaml"
     path.write_text(TRANSLATIONAL)
-    found = identifiability(load_robot(path), tracker(), poses=60)
-    assert found.rank < found.n_parameters
-    for remedy in suggest_measurements(found):
+    result = identifiability(load_robot(path), tracker(), poses=60)
+    assert result.rank < result.n_parameters
+    for suggestion in suggest_measurements(result):
         assert not {"psi", "theta", "phi and theta", "the pose"} & {
-            cure.words for cure in remedy.measurements
-        }, str(remedy)
+            measurement.words for measurement in suggestion.measurements
+        }, str(suggestion)

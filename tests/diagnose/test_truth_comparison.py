@@ -35,26 +35,26 @@ def fit():
 
 
 def test_unidentifiable_combinations_are_removed_from_the_error_and_named(fit):
-    found = compare_with_truth(fit, zoo.hexapod_truth())
-    assert len(found.dropped) == 6
-    assert np.abs(found.raw).max() > 0.01e-3  # [m] the base frame is free
+    result = compare_with_truth(fit, zoo.hexapod_truth())
+    assert len(result.dropped) == 6
+    assert np.abs(result.raw).max() > 0.01e-3  # [m] the base frame is free
     assert (
-        np.abs(found.error).max() < 0.001e-3
+        np.abs(result.error).max() < 0.001e-3
     )  # [m] noise of 0.02 um and 0.1 urad, condition about 100
-    finding = found.finding
+    finding = result.finding
     assert (finding.data["parameters"], finding.data["compared"]) == (42, 36)
-    assert [c["names"] for c in finding.data["excluded"]] == [c.names for c in found.dropped]
+    assert [c["names"] for c in finding.data["excluded"]] == [c.names for c in result.dropped]
     np.testing.assert_allclose(
-        found.tolerances * fit.tolerance, found.error, rtol=1e-12, atol=1e-18
+        result.tolerances * fit.tolerance, result.error, rtol=1e-12, atol=1e-18
     )
-    assert json.loads(to_json(found.to_dict()))["rms"] == pytest.approx(found.rms)
+    assert json.loads(to_json(result.to_dict()))["rms"] == pytest.approx(result.rms)
 
 
 def test_truth_moved_along_the_null_space_gives_the_same_error(fit):
     known = fit.posterior
     rng = np.random.default_rng(0)
-    open_ = known.directions[:, ~known.determined]
-    move = known.unit * (open_ @ rng.standard_normal(open_.shape[1]))
+    null_space = known.directions[:, ~known.determined]
+    move = known.unit * (null_space @ rng.standard_normal(null_space.shape[1]))
     one, other = (compare_with_truth(fit, zoo.hexapod_truth() + step) for step in (0.0, move))
     np.testing.assert_allclose(one.error, other.error, atol=1e-15)  # [m] double rounding
     seen = known.unit * known.directions[:, known.determined][:, 0]
@@ -65,19 +65,19 @@ def test_truth_moved_along_the_null_space_gives_the_same_error(fit):
 
 def test_error_of_an_identifiable_robot_is_the_plain_difference():
     fit = identify(hexapod(), hexapod_data(20), LeastSquares())
-    found = compare_with_truth(fit, zoo.hexapod_truth())
-    assert found.dropped == ()
-    np.testing.assert_array_equal(found.error, found.tolerances * fit.tolerance)
-    np.testing.assert_allclose(found.error, found.raw, rtol=1e-12)
-    assert found.finding.data["compared"] == 42
+    result = compare_with_truth(fit, zoo.hexapod_truth())
+    assert result.dropped == ()
+    np.testing.assert_array_equal(result.error, result.tolerances * fit.tolerance)
+    np.testing.assert_allclose(result.error, result.raw, rtol=1e-12)
+    assert result.finding.data["compared"] == 42
 
 
 @pytest.mark.parametrize(
-    ("truth", "said"), [(np.zeros(41), r"shape \(41,\)"), (np.full(42, np.nan), "not finite")]
+    ("truth", "message"), [(np.zeros(41), r"shape \(41,\)"), (np.full(42, np.nan), "not finite")]
 )
-def test_truth_with_wrong_shape_or_nan_is_refused(fit, truth, said):
+def test_truth_with_wrong_shape_or_nan_is_refused(fit, truth, message):
     with pytest.raises(
-        EstimationError, match=f"{said}.*give 42 values for all parameters of 'hexapod'"
+        EstimationError, match=f"{message}.*give 42 values for all parameters of 'hexapod'"
     ):
         compare_with_truth(fit, truth)
 

@@ -16,9 +16,12 @@ def rows():
     return np.random.default_rng(5).normal(size=(3, 40, 7)) * 10.0 ** np.arange(-3, 4)
 
 
-def test_folding_blocks_gives_the_factor_of_all_rows(engine, rows):
+@pytest.mark.parametrize(
+    "cuts", [(11, 12, 30), (1, 3, 20), tuple(range(1, 40))], ids=["large", "small", "single rows"]
+)
+def test_folding_blocks_gives_the_factor_of_all_rows(engine, rows, cuts):
     factor = np.zeros((3, 7, 7))
-    for part in np.split(rows, [11, 12, 30], axis=1):
+    for part in np.split(rows, cuts, axis=1):
         factor = engine.fold(factor, part)
     assert_array_equal(factor, np.triu(factor))
     scale = np.linalg.norm(rows, axis=1, keepdims=True)

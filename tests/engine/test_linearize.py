@@ -168,12 +168,12 @@ def test_derivatives_of_free_actuators_agree_with_differences_and_jax(engine, ro
         assert_close_columns(analytic[row], jax_derivatives(case, state, row, free=True)[m:], unit)
 
 
-def assert_close_columns(found, reference, unit):
+def assert_close_columns(actual, reference, unit):
     """Assert that columns agree to rounding of the largest entry.
 
     Rounding is that of a few hundred operations times the condition.
     """
-    assert_allclose(found * unit, reference * unit, atol=1e-11 * np.abs(reference * unit).max())
+    assert_allclose(actual * unit, reference * unit, atol=1e-11 * np.abs(reference * unit).max())
 
 
 def test_blocks_of_stacked_trials_equal_single_trials_bit_for_bit(engine):

@@ -17,13 +17,13 @@ def test_engine_has_at_most_five_files_and_850_lines(root: Path):
 
 
 def test_engine_imports_numpy_only(root: Path):
-    found = set()
+    result = set()
     for file in (root / "src" / "loopcal" / "engine").glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            found |= {name for name in names if not name.startswith("loopcal.engine")}
-    assert found <= {
+            result |= {name for name in names if not name.startswith("loopcal.engine")}
+    assert result <= {
         "numpy",
         "numpy.typing",
         "__future__",

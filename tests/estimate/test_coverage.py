@@ -23,23 +23,23 @@ def binomial_band(p, n, sigmas=4.0):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CORRECT_NOISE_CASES, ids=lambda case: case.name)
 def test_95_percent_intervals_contain_the_truth_in_95_percent_of_few_fits(case):
-    found = evaluate_case(case, FEW_FITS)
+    result = evaluate_case(case, FEW_FITS)
     # intervals of one fit are correlated: the band is that of as many draws as there are fits, at
     # four standard deviations
-    assert found["coverage"] == pytest.approx(0.95, abs=binomial_band(0.95, FEW_FITS))
-    assert found["rejected"] == pytest.approx(0.05, abs=binomial_band(0.05, FEW_FITS))
+    assert result["coverage"] == pytest.approx(0.95, abs=binomial_band(0.95, FEW_FITS))
+    assert result["rejected"] == pytest.approx(0.05, abs=binomial_band(0.05, FEW_FITS))
     # relative error of an rms of FEW fits with 60 correlated values each, as if only the fits were
     # independent
-    assert found["pose_spread"] == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * FEW_FITS))
+    assert result["pose_spread"] == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * FEW_FITS))
 
 
 @pytest.mark.slow
 def test_intervals_fail_if_the_stated_noise_is_half_the_true_noise():
     (case,) = (case for case in CASES if case.noise == 2.0)
-    found = evaluate_case(case, FEW_FITS)
+    result = evaluate_case(case, FEW_FITS)
     # half the width: a normal value lies within 0.98 sd in 67 % of the draws
-    assert found["coverage"] == pytest.approx(0.673, abs=binomial_band(0.673, FEW_FITS))
-    assert found["rejected"] > 0.99
+    assert result["coverage"] == pytest.approx(0.673, abs=binomial_band(0.673, FEW_FITS))
+    assert result["rejected"] > 0.99
 
 
 @pytest.fixture(scope="module")

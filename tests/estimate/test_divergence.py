@@ -57,5 +57,7 @@ def test_estimate_far_outside_its_tolerance_is_reported():
     far = get_finding(fit.findings, "fit.beyond-tolerance")
     assert far.data["names"][0] == "leg1.length"
     assert far.data["factor"] > 10.0
-    calm = identify(robot, data, LeastSquares()).findings + identify(wrong, data, MAP()).findings
-    assert "fit.beyond-tolerance" not in list_codes(calm)
+    findings = (
+        identify(robot, data, LeastSquares()).findings + identify(wrong, data, MAP()).findings
+    )
+    assert "fit.beyond-tolerance" not in list_codes(findings)

@@ -99,7 +99,7 @@ def eliminate_dense(problem, tree):
     pseudo-inverse for each cluster.
     """
     U = len(problem.free)
-    best, variance, open_, rank = (
+    best, variance, unobservable, rank = (
         np.zeros((U, problem.right.shape[1])),
         np.zeros(U),
         np.zeros(U, dtype=bool),
@@ -117,10 +117,10 @@ def eliminate_dense(problem, tree):
         seen = int((s > NUISANCE_TOLERANCE * s[0]).sum())
         inverse = (vt[:seen].T / s[:seen]) @ u[:, :seen].T / norm[:, None]
         best[inside], variance[inside] = -inverse @ right, (inverse**2).sum(axis=1)
-        open_[inside] = np.linalg.norm(vt[seen:], axis=0) > NULL_COMPONENT
+        unobservable[inside] = np.linalg.norm(vt[seen:], axis=0) > NULL_COMPONENT
         left.append(right - u[:, :seen] @ (u[:, :seen].T @ right))
         rank += seen
-    return best, variance, open_, rank, np.concatenate(left)
+    return best, variance, unobservable, rank, np.concatenate(left)
 
 
 @pytest.mark.parametrize("unseen", [0, 1, 2])
@@ -131,14 +131,14 @@ def test_nested_elimination_equals_dense_elimination_with_unobservable_direction
         if not problem.free.any():
             continue
         tree = problem.tree
-        best, variance, open_, rank, left = eliminate_dense(problem, tree)
-        found, rest = eliminate_tree(fold_problem(problem, tree))
-        assert found.rank[0] == rank, seed
-        assert (found.is_unobservable[0] == open_).all(), seed
+        best, variance, unobservable, rank, left = eliminate_dense(problem, tree)
+        result, rest = eliminate_tree(fold_problem(problem, tree))
+        assert result.rank[0] == rank, seed
+        assert (result.is_unobservable[0] == unobservable).all(), seed
         # each unknown in the unit of its own column: 1e-9 is rounding times the worst condition of
         # 60 problems
         scale = np.maximum(np.linalg.norm(problem.F, axis=0), 1e-3)[:, None]
-        values = np.column_stack([found.slope[0], found.shift[0]])
+        values = np.column_stack([result.slope[0], result.shift[0]])
         assert_allclose(
             values * scale,
             best * scale,
@@ -147,7 +147,10 @@ def test_nested_elimination_equals_dense_elimination_with_unobservable_direction
             err_msg=f"{seed}",
         )
         assert_allclose(
-            found.variances()[0][~open_], variance[~open_], rtol=1e-8, err_msg=f"{seed}"
+            result.variances()[0][~unobservable],
+            variance[~unobservable],
+            rtol=1e-8,
+            err_msg=f"{seed}",
         )
         squares = (problem.right**2).sum()
         assert_allclose(
@@ -160,14 +163,14 @@ def test_nested_elimination_equals_dense_elimination_with_unobservable_direction
 def test_whitened_nuisance_columns_are_orthonormal():
     problem = random_problem(np.random.default_rng(8), 0)
     tree = problem.tree
-    found, _ = eliminate_tree(fold_problem(problem, tree))
+    result, _ = eliminate_tree(fold_problem(problem, tree))
     assert len(tree.structures) > 2
-    assert not found.is_unobservable.any()
+    assert not result.is_unobservable.any()
     whitened = np.zeros_like(problem.F)
     for row, i in enumerate(problem.of):
         used = [x for x in problem.sets[i] if problem.free[x]]
         if used:
-            path, root, _ = found.at_nodes(np.array([tree.node[used].max()]))
+            path, root, _ = result.at_nodes(np.array([tree.node[used].max()]))
             whitened[row, path[0]] = problem.F[row, path[0]] @ root[0]
     free = problem.free
     assert_allclose(
@@ -184,11 +187,11 @@ def test_offset_absorbed_by_leaf_unknowns_is_unobservable():
     sets = [[i, G] for i in range(G)]
     problem = Problem(np.ones(G + 1, dtype=bool), ["group"] * G + ["machine"], sets, F, rng.normal(size=(5 * G, 3)),  # noqa: E501
                       np.repeat(np.arange(G), 5))  # fmt: skip
-    found, rest = eliminate_tree(fold_problem(problem, problem.tree))
-    assert found.rank[0] == G
-    assert found.is_unobservable.all()
+    result, rest = eliminate_tree(fold_problem(problem, problem.tree))
+    assert result.rank[0] == G
+    assert result.is_unobservable.all()
     best, _, _, _, left = eliminate_dense(problem, problem.tree)
-    assert_allclose(found.shift[0], best[:, -1], rtol=0, atol=1e-12)
+    assert_allclose(result.shift[0], best[:, -1], rtol=0, atol=1e-12)
     assert_allclose(
         rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-12 * np.abs(left.T @ left).max()
     )
@@ -207,32 +210,32 @@ def test_groups_are_nested_in_sessions_and_sessions_in_the_machine():
     sets = [
         [0, 1 + 5 * day, 2 + 5 * day, 3 + 5 * day + group] for day in range(2) for group in range(3)
     ]
-    found = nest_groups(scopes, sets)
-    assert [(len(structure), *structure.path.shape[1:]) for structure in found.structures] == [
+    result = nest_groups(scopes, sets)
+    assert [(len(structure), *structure.path.shape[1:]) for structure in result.structures] == [
         (1, 1),
         (2, 3),
         (6, 4),
     ]
-    assert found.structures[2].path[4].tolist() == [9, 6, 7, 0]
-    assert (found.cluster == 0).all()
-    assert found.columns(found.node[[9]], np.array([[0, 6, 7, 9]])).tolist() == [[3, 1, 2, 0]]
+    assert result.structures[2].path[4].tolist() == [9, 6, 7, 0]
+    assert (result.cluster == 0).all()
+    assert result.columns(result.node[[9]], np.array([[0, 6, 7, 9]])).tolist() == [[3, 1, 2, 0]]
 
 
 def test_targets_are_nested_in_the_frame_that_measures_them():
     scopes = ["session"] * 6 + ["machine"] * 60
-    found = nest_groups(scopes, [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(20)])
-    assert [structure.path.shape for structure in found.structures] == [(1, 6), (20, 9)]
+    result = nest_groups(scopes, [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(20)])
+    assert [structure.path.shape for structure in result.structures] == [(1, 6), (20, 9)]
 
 
 def test_unknowns_of_two_scopes_used_by_every_row_share_a_node():
-    found = nest_groups(["session"] * 6 + ["machine"] * 3, [list(range(9))])
-    assert [structure.path.tolist() for structure in found.structures] == [[list(range(9))]]
+    result = nest_groups(["session"] * 6 + ["machine"] * 3, [list(range(9))])
+    assert [structure.path.tolist() for structure in result.structures] == [[list(range(9))]]
 
 
 def test_elimination_tree_without_free_unknowns_is_empty():
-    found = build_tree(np.zeros(3, dtype=bool), ["group"] * 3, np.array([[0, 0], [0, 1], [0, 2]]))
-    assert found.structures == ()
-    eliminated, rest = eliminate_tree(NodeFactors(found, 2, 4))
+    result = build_tree(np.zeros(3, dtype=bool), ["group"] * 3, np.array([[0, 0], [0, 1], [0, 2]]))
+    assert result.structures == ()
+    eliminated, rest = eliminate_tree(NodeFactors(result, 2, 4))
     assert eliminated.slope.shape == (2, 3, 4)
     assert not rest.any()
 
@@ -272,7 +275,7 @@ def test_cost_of_planes_that_share_a_probe_is_linear_in_their_number(monkeypatch
             counted.update(rows=counted["rows"] + rows.size, kept=kept, widest=widest)
 
     monkeypatch.setattr(NodeFactors, "add", counting)
-    found = []
+    result = []
     for groups in (5, 10, 20):
         counted.update(rows=0, kept=0, widest=0)
         _, own = linearize_nominal(simulate_probed_planes(groups))
@@ -281,8 +284,8 @@ def test_cost_of_planes_that_share_a_probe_is_linear_in_their_number(monkeypatch
         assert counted["widest"] == 3 + 3 + 42 + 1
         assert own is not None
         assert int(own.elimination.tree.width.max()) == 6
-        found.append((counted["rows"], counted["kept"]))
-    one, two, four = np.array(found)
+        result.append((counted["rows"], counted["kept"]))
+    one, two, four = np.array(result)
     assert (four - two == 2 * (two - one)).all()
     assert (four <= 4 * one).all()
 

@@ -93,15 +93,15 @@ def test_every_registered_kind_has_a_case_on_every_robot():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", RECOVERED_CASES, ids=str)
 def test_noise_free_rows_of_one_kind_recover_the_robot_up_to_its_gauge(case):
-    found = recover_machine(case)
-    assert not found.refused
-    assert found.machine == 0, "only motions of frames stay open"
-    assert found.before > 1e4 * EXACT
-    assert found.seen < EXACT
-    assert found.pose < EXACT
-    assert found.parameters < EXACT
+    result = recover_machine(case)
+    assert not result.refused
+    assert result.machine == 0, "only motions of frames stay open"
+    assert result.before > 1e4 * EXACT
+    assert result.seen < EXACT
+    assert result.pose < EXACT
+    assert result.parameters < EXACT
     if case.robot == "hexapod-42":
-        assert found.rank == RANKS[case.kind.name]
+        assert result.rank == RANKS[case.kind.name]
 
 
 @pytest.mark.parametrize("case", BLIND_CASES, ids=str)
@@ -127,20 +127,20 @@ def pool_coverage(found: list[Coverage], what: str) -> float:
 
 @pytest.mark.slow
 def test_intervals_of_a_hexapod_and_setup_parameters_have_95_percent_coverage():
-    found = [compute_coverage(case, 10) for case in select_most_unknown(("hexapod-42",))]
-    total = sum(one.fits for one in found)
-    assert total == 10 * len(found), "every fit converged"
+    result = [compute_coverage(case, 10) for case in select_most_unknown(("hexapod-42",))]
+    total = sum(one.fits for one in result)
+    assert total == 10 * len(result), "every fit converged"
     for what in ("directions", "parameters", "setup"):
-        assert pool_coverage(found, what) == pytest.approx(0.95, abs=coverage_band(total)), what
+        assert pool_coverage(result, what) == pytest.approx(0.95, abs=coverage_band(total)), what
 
 
 @pytest.mark.slow
 def test_coverage_is_too_low_if_the_stated_noise_is_half_the_true_noise():
     case = next(case for case in list_cases() if case.kind.name == "position")
-    found = compute_coverage(case, 60, DoubledNoise)
+    result = compute_coverage(case, 60, DoubledNoise)
     # half the width: a normal value lies within 0.98 sd in 67 % of the draws; the prior holds the
     # weaker directions
-    assert found.directions.mean() < 0.95 - coverage_band(60)
+    assert result.directions.mean() < 0.95 - coverage_band(60)
 
 
 STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
@@ -169,11 +169,11 @@ def compute_variances_and_errors(kinds):
     trials = simulate_trials(
         robot, truth, sample_workspace(robot, 40, SEED).coordinates, looking, SEED
     )
-    found = identify_trials(robot, trials, MAP())
-    assert found.converged.all()
-    free = found.free_parameters
-    off = free.deviation(found.values) - free.deviation(truth)
-    return ((found.standard_deviations() / free.tolerance) ** 2).sum(axis=1), (off**2).sum(axis=1)
+    result = identify_trials(robot, trials, MAP())
+    assert result.converged.all()
+    free = result.free_parameters
+    off = free.deviation(result.values) - free.deviation(truth)
+    return ((result.standard_deviations() / free.tolerance) ** 2).sum(axis=1), (off**2).sum(axis=1)
 
 
 @pytest.mark.slow
@@ -234,12 +234,12 @@ def find_locked_coordinates(truth, joint, constant, rng, n=12):
     z, phi = rng.uniform(0.66, 0.74, 60), rng.uniform(-np.pi, np.pi, 60)
 
     def off(theta):
-        found = inverse(truth, np.column_stack([z, phi, theta]))
-        return found.passive[:, found.passive_names.index(joint)] - constant
+        result = inverse(truth, np.column_stack([z, phi, theta]))
+        return result.passive[:, result.passive_names.index(joint)] - constant
 
     low, high = np.full(60, 0.02), np.full(60, 0.5)
     side = np.sign(off(low))
-    there = side * np.sign(off(high)) < 0.0
+    solution = side * np.sign(off(high)) < 0.0
     for _ in range(10):
         middle = 0.5 * (low + high)
         before = np.sign(off(middle)) == side
@@ -253,7 +253,7 @@ def find_locked_coordinates(truth, joint, constant, rng, n=12):
         )
         before, before_off, at = at, at_off, at + step
         at_off = off(at)
-    return np.column_stack([z, phi, at])[there][:n]
+    return np.column_stack([z, phi, at])[solution][:n]
 
 
 def test_joints_locked_at_unknown_values_recover_a_tripod_up_to_its_frames():

@@ -156,12 +156,12 @@ def test_unreachable_trial_is_marked_and_does_not_change_others():
     trials = simulate_trials(robot, truth, hexapod_poses(15), tracker(), 2)
     start = np.repeat(robot.values[None], 3, axis=0)
     start[1] += 1.0  # [m]
-    found = identify_trials(robot, trials, options=FitOptions(start=start))
-    assert found.status[1] == DescentStatus.BAD_START
-    assert found.converged[[0, 2]].all()
+    result = identify_trials(robot, trials, options=FitOptions(start=start))
+    assert result.status[1] == DescentStatus.BAD_START
+    assert result.converged[[0, 2]].all()
     # the trials no longer share a start, so this also proves the path without sharing
     np.testing.assert_allclose(
-        found.values[2], identify_trials(robot, trials).values[2], rtol=0, atol=1e-13
+        result.values[2], identify_trials(robot, trials).values[2], rtol=0, atol=1e-13
     )
 
 
@@ -285,9 +285,9 @@ def test_unreachable_poses_are_refused_by_name_unless_their_weight_is_zero(data)
         identify(hexapod(), broken, LeastSquares())
     weight = np.ones(30)
     weight[4] = 0.0
-    found = identify(hexapod(), broken.with_weights(weight), LeastSquares())
+    result = identify(hexapod(), broken.with_weights(weight), LeastSquares())
     expected = identify(hexapod(), data.take(weight > 0), LeastSquares())
-    np.testing.assert_allclose(found.estimate, expected.estimate, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result.estimate, expected.estimate, rtol=0, atol=1e-12)
 
 
 def test_fit_stopped_by_the_iteration_limit_is_reported(data):

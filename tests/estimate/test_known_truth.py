@@ -14,8 +14,8 @@ from evidence import known_truth, narrow_prior
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])  # the tripods take longer
 def test_default_method_does_not_make_the_median_robot_worse(name):
-    found = known_truth.evaluate_cell(name, known_truth.NOISE["100 um, 500 urad"], machines=12)
-    medians = {title: np.median(error) for title, error in found.items()}
+    result = known_truth.evaluate_cell(name, known_truth.NOISE["100 um, 500 urad"], machines=12)
+    medians = {title: np.median(error) for title, error in result.items()}
     assert medians["default"] < 1.05 * medians["before"]
     # 12 machines: the default was never above least squares by more than the scatter of such a
     # median
@@ -24,11 +24,11 @@ def test_default_method_does_not_make_the_median_robot_worse(name):
 
 @pytest.mark.slow
 def test_tolerances_ten_times_too_small_are_reported_and_cost_little():
-    found = narrow_prior.evaluate_case("3-prs", 10.0, machines=12)
-    assert found["conflict named"] == 1.0
-    assert found["default"] < 1.2 * found["least squares"]
+    result = narrow_prior.evaluate_case("3-prs", 10.0, machines=12)
+    assert result["conflict named"] == 1.0
+    assert result["default"] < 1.2 * result["least squares"]
     assert (
-        found["MAP"] > 1.2 * found["least squares"]
+        result["MAP"] > 1.2 * result["least squares"]
     )  # the case that must fail: a prior believed blindly
 
 

@@ -112,18 +112,18 @@ FULL_MEASUREMENTS = {
 def test_rows_that_determine_all_freedoms_give_the_pose(case):
     robot, sensors = FULL_MEASUREMENTS[case]
     robot = load_robot(robot)
-    found = inverse(robot, sample_workspace(robot, 6, 1).coordinates)
-    data = simulate(robot, found.T, Instrument(sensors), 0, reading_sigma=20 * UM)
+    result = inverse(robot, sample_workspace(robot, 6, 1).coordinates)
+    data = simulate(robot, result.T, Instrument(sensors), 0, reading_sigma=20 * UM)
     problem = problem_of(select_free_parameters(robot), data)
     T, known = measure_poses(robot, problem.rows[:-1], np.zeros(6, dtype=int), np.arange(6))
     assert known.all()
     assert_allclose(
-        T[:, :3, 3], found.T[:, :3, 3], atol=2e-3, rtol=0
+        T[:, :3, 3], result.T[:, :3, 3], atol=2e-3, rtol=0
     )  # [m] of noise and, for 3-prs, of its weak direction
     fewer = tuple(replace(s, rows=np.array([0, 1, 3])) for s in sensors[:1])
     problem = problem_of(
         select_free_parameters(robot),
-        simulate(robot, found.T, Instrument((*fewer, *sensors[1:])), 0, reading_sigma=20 * UM),
+        simulate(robot, result.T, Instrument((*fewer, *sensors[1:])), 0, reading_sigma=20 * UM),
     )
     _, known = measure_poses(robot, problem.rows[:-1], np.zeros(6, dtype=int), np.arange(6))
     assert known.tolist() == [True, True, False, True, False, False]
@@ -180,10 +180,10 @@ def test_reading_outside_its_stroke_or_in_another_working_mode_is_reported():
     fit = identify(robot, remove_readings(data, lost))
     assert fit.poses is not None
     assert report_doubtful_readings(fit.robot, fit.poses) == ()
-    found = fit.poses.readings.copy()
-    found[7, 0] += 0.1 if found[7, 0] < 0.3 else -0.1  # [m]: within the stroke of 0 to 0.4 m
-    found[9, 2] = -0.02
-    outside, beside = report_doubtful_readings(fit.robot, replace(fit.poses, readings=found))
+    result = fit.poses.readings.copy()
+    result[7, 0] += 0.1 if result[7, 0] < 0.3 else -0.1  # [m]: within the stroke of 0 to 0.4 m
+    result[9, 2] = -0.02
+    outside, beside = report_doubtful_readings(fit.robot, replace(fit.poses, readings=result))
     name = robot.actuators[2].name
     assert outside.code == "poses.outside-stroke"
     reading = outside.data["readings"][-1]
@@ -195,7 +195,7 @@ def test_reading_outside_its_stroke_or_in_another_working_mode_is_reported():
     assert (reading["actuator"], reading["pose"]) == (robot.actuators[0].name, "8")
     assert (
         report_doubtful_readings(
-            fit.robot, replace(fit.poses, readings=found, is_undetermined=np.ones(20, dtype=bool))
+            fit.robot, replace(fit.poses, readings=result, is_undetermined=np.ones(20, dtype=bool))
         )
         == ()
     )

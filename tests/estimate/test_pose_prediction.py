@@ -40,17 +40,17 @@ def change_reading(data, sigma, off, pose=2, line=0):
 def test_line_with_a_large_sigma_does_not_affect_the_predicted_pose(cable, sigma, off):
     robot, positions, data = cable
     usual = validate(robot, data, before=robot)
-    found = validate(robot, change_reading(data, sigma, off), before=robot)
-    assert found.poses == usual.poses
-    assert found.unreachable == ()
-    assert found.findings == usual.findings
-    error = found.after.position
+    result = validate(robot, change_reading(data, sigma, off), before=robot)
+    assert result.poses == usual.poses
+    assert result.unreachable == ()
+    assert result.findings == usual.findings
+    error = result.after.position
     assert_allclose(
         np.delete(error, 2), np.delete(usual.after.position, 2), atol=1e-6
     )  # [m]: two ways to solve the same
-    assert error[2] < 10 * MM  # three lines; 50 rad of the fourth are metres
-    at, told = predict_from_readings(robot, change_reading(data, sigma, off))
-    assert told.all()
+    assert error[2] < 10 * MM  # three lines; 50 rad of the fourth are meters
+    at, is_predicted = predict_from_readings(robot, change_reading(data, sigma, off))
+    assert is_predicted.all()
     assert_allclose(at.T[2, :3, 3], positions[2], atol=10 * MM)
     assert_allclose(
         inverse(robot, at.T[2:3]).q[0, 1:], data.readings[2, 1:], atol=1e-4
@@ -60,22 +60,22 @@ def test_line_with_a_large_sigma_does_not_affect_the_predicted_pose(cable, sigma
 def test_pose_with_too_few_readings_is_left_out_and_reported(cable):
     robot, _, data = cable
     two = change_reading(change_reading(data, np.inf, np.nan), np.inf, np.nan, line=2)
-    found = validate(robot, two, before=robot)
-    assert found.poses == ("1", "2", "4", "5", "6", "7", "8")
-    assert found.unreachable == ()
-    (missing,) = [f for f in found.findings if f.code == "validation.missing-readings"]
+    result = validate(robot, two, before=robot)
+    assert result.poses == ("1", "2", "4", "5", "6", "7", "8")
+    assert result.unreachable == ()
+    (missing,) = [f for f in result.findings if f.code == "validation.missing-readings"]
     assert tuple(missing.data["names"]) == ("pose 3",)
 
 
 def test_equal_sigmas_predict_the_forward_kinematics(cable):
     robot, _, data = cable
-    found, _ = predict_from_readings(robot, data)
-    assert_allclose(found.T, forward(robot, data.readings).T, atol=0)
+    result, _ = predict_from_readings(robot, data)
+    assert_allclose(result.T, forward(robot, data.readings).T, atol=0)
     other, _ = predict_from_readings(
         robot,
         replace(data, reading_sigma=data.reading_sigma * np.array([1.0, 1.0, 1.0, 1.0 + 1e-6])),
     )
-    assert_allclose(other.T, found.T, atol=1e-6)  # [m]: closure's curvature times noise
+    assert_allclose(other.T, result.T, atol=1e-6)  # [m]: closure's curvature times noise
 
 
 @pytest.mark.parametrize("name", ["cable-4", "linear-delta"])

@@ -38,7 +38,7 @@ def test_sequential_fits_with_a_prior_equal_the_joint_fit():
     first = identify(hexapod(), a, LeastSquares())
     then = identify(hexapod(), b, options=FitOptions(prior=prior_from(first.posterior)))
     together = identify(hexapod(), join_measurements(a, b), LeastSquares())
-    # the first was linearised at its own estimate, which differs from the last by its sd: relative
+    # the first was linearized at its own estimate, which differs from the last by its sd: relative
     # errors of 1e-4
     np.testing.assert_allclose(
         (then.estimate - together.estimate) / together.standard_deviations, 0, atol=1e-2
@@ -131,14 +131,14 @@ def test_false_alarm_rate_of_a_moved_limb_is_the_stated_one():
     # chi-square of the change over 100 repetitions of both calibrations without any change: mean 7,
     # sd of the mean sqrt(2 * 7 / 100) = 0.37; bounds at 4.5 sd. At 5 % level: binomial(100, 0.05),
     # more than 15 has probability 4e-5
-    found = []
+    result = []
     for seed in range(100):
         first = identify(hexapod(), hexapod_data(15, seed=1000 + seed), LeastSquares())
-        found.append(
+        result.append(
             recalibrate(hexapod(), simulate_repaired(0.0, seed)[0], first.posterior, "leg3")[1]
         )
-    assert {c.degrees for c in found} == {7.0}
-    values = np.array([c.chi_square for c in found])
+    assert {c.degrees for c in result} == {7.0}
+    values = np.array([c.chi_square for c in result])
     assert abs(values.mean() - 7) < 4.5 * 0.37
     assert (values > chi2.ppf(0.95, 7)).sum() <= 15
 

@@ -67,10 +67,10 @@ def test_prior_statistic_of_precise_data_equals_the_joint_quadratic_form():
 
 def test_correct_tolerances_are_rarely_inflated():
     robot, measured = simulate_hexapods(300)
-    found = identify_trials(robot, measured)
+    result = identify_trials(robot, measured)
     held = identify_trials(robot, measured, MAP())
     # at the level 1e-3 three of 300 are allowed: P(binomial(300, 1e-3) > 3) = 3e-4
-    widened = (found.penalty != held.penalty).any(axis=1).sum()
+    widened = (result.penalty != held.penalty).any(axis=1).sum()
     assert widened <= 3
 
 
@@ -89,8 +89,8 @@ def test_narrow_tolerances_are_reported_and_inflated_by_the_default_method(narro
     assert narrow_prior.data["ratio"] > 1.5
 
     def error(method):
-        found = identify_trials(believed, measured, method).values - measured.truth
-        return np.median(np.sqrt(np.mean(found**2, axis=1)))
+        result = identify_trials(believed, measured, method).values - measured.truth
+        return np.median(np.sqrt(np.mean(result**2, axis=1)))
 
     assert error(None) <= 1.2 * error(LeastSquares())
     assert error(None) < error(MAP())
@@ -140,13 +140,13 @@ def test_estimated_sigma_weights_the_prior_like_the_true_sigma():
     sharp = replace(
         measured, observations=(replace(claimed, covariance=claimed.covariance / 25.0),)
     )
-    expected, found = (
+    expected, result = (
         identify(robot, measured),
         identify(robot, sharp, options=FitOptions(noise="estimated")),
     )
-    assert found.residual_test.sigma_scale == pytest.approx(5.0, rel=0.15)
-    np.testing.assert_allclose(found.standard_deviations, expected.standard_deviations, rtol=0.15)
-    assert np.abs((found.estimate - expected.estimate) / expected.standard_deviations).max() < 0.3
+    assert result.residual_test.sigma_scale == pytest.approx(5.0, rel=0.15)
+    np.testing.assert_allclose(result.standard_deviations, expected.standard_deviations, rtol=0.15)
+    assert np.abs((result.estimate - expected.estimate) / expected.standard_deviations).max() < 0.3
 
 
 def test_too_small_sigma_is_not_reported_as_narrow_tolerances():

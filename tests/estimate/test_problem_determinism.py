@@ -105,21 +105,21 @@ class Call:
         at = self.problem.linearize(self.z, self.start)
         solution = self.problem.solve(self.z, at.next_start)
         residuals = self.problem.residuals(self.z, solution)
-        found = [*list_arrays(at), *(r.whitened for r in residuals)]
+        result = [*list_arrays(at), *(r.whitened for r in residuals)]
         one = np.arange(1)
         blocks = self.problem.take(one).leverage_rows(at.take(one))
-        return [*found, *(part.rows for block in blocks for part in block)]
+        return [*result, *(part.rows for block in blocks for part in block)]
 
 
 def list_arrays(at: Linearization) -> list[np.ndarray]:
     """Return the arrays of a linearization."""
-    found = [at.factor, at.cost, at.equations, at.next_start.nuisance]
+    result = [at.factor, at.cost, at.equations, at.next_start.nuisance]
     if at.nuisance is not None:
         done = at.nuisance.elimination
-        found += [at.nuisance.best, done.slope, done.rank, done.variances()]
+        result += [at.nuisance.best, done.slope, done.rank, done.variances()]
     if at.poses is not None:
-        found += [at.poses.states.q, at.poses.states.state.T, at.poses.rank]
-    return found
+        result += [at.poses.states.q, at.poses.states.state.T, at.poses.rank]
+    return result
 
 
 def list_calls(problem: Problem) -> list[Call]:
@@ -147,8 +147,8 @@ def test_equal_arguments_give_equal_bits_in_any_order_and_in_threads(name):
     for i in np.random.default_rng(1).permutation(2 * len(calls)) % len(calls):
         assert_same(calls[i](), expected[i])
     with ThreadPoolExecutor(4) as pool:
-        for found, wanted in zip(pool.map(lambda call: call(), calls), expected, strict=True):
-            assert_same(found, wanted)
+        for result, wanted in zip(pool.map(lambda call: call(), calls), expected, strict=True):
+            assert_same(result, wanted)
 
 
 @pytest.mark.parametrize("name", ["trials", "trials, uncertain readings"])

@@ -32,17 +32,17 @@ def simulate_repeats(seed: int, times: int = 3, instrument=None, poses: int = 12
 
 def test_pure_error_is_the_spread_within_groups_of_repeats():
     data = simulate_repeats(0)
-    found = check_lack_of_fit(identify(hexapod(), data, LeastSquares()), data)
+    result = check_lack_of_fit(identify(hexapod(), data, LeastSquares()), data)
     sigma = np.array([5 * URAD] * 3 + [UM] * 3)
     groups = (data.observations[0].measured / sigma).reshape(12, 3, 6)
     expected = ((groups - groups.mean(axis=1, keepdims=True)) ** 2).sum()
-    assert found.groups == 12
-    assert found.pure_degrees == 12 * 2 * 6
-    assert found.pure == pytest.approx(
+    assert result.groups == 12
+    assert result.pure_degrees == 12 * 2 * 6
+    assert result.pure == pytest.approx(
         expected, rel=1e-2
     )  # rotation residuals are those differences to first order
-    assert found.lack_degrees == 12 * 6 - 42
-    assert found.is_explained
+    assert result.lack_degrees == 12 * 6 - 42
+    assert result.is_explained
 
 
 def test_lack_of_fit_is_rarely_reported_for_a_correct_model_with_wrong_sigma():
@@ -51,9 +51,9 @@ def test_lack_of_fit_is_rarely_reported_for_a_correct_model_with_wrong_sigma():
         data = simulate_repeats(seed)
         claimed = data.observations[0]
         wrong = replace(data, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
-        found = check_lack_of_fit(identify(hexapod(), wrong, LeastSquares()), wrong)
-        assert found.sigma_scale == pytest.approx(3.0, rel=0.3)
-        blamed += not found.is_explained
+        result = check_lack_of_fit(identify(hexapod(), wrong, LeastSquares()), wrong)
+        assert result.sigma_scale == pytest.approx(3.0, rel=0.3)
+        blamed += not result.is_explained
     assert blamed <= 4  # P(binomial(60, 0.01) > 4) = 3e-4
 
 
@@ -63,17 +63,17 @@ def test_repeatable_error_outside_the_model_is_reported_as_lack_of_fit():
     warm = np.array(rows.measured)
     warm[:, 5] += 5 * UM * np.sin(300.0 * data.readings[:, 0])  # the same in all repeats of a pose
     bent = replace(data, observations=(replace(rows, measured=warm),))
-    found = check_lack_of_fit(identify(hexapod(), bent, LeastSquares()), bent)
-    assert found.is_explained is False
-    assert "residuals.lack-of-fit" in [f.code for f in found.findings]
-    assert found.sigma_scale == pytest.approx(1.0, abs=0.2)
+    result = check_lack_of_fit(identify(hexapod(), bent, LeastSquares()), bent)
+    assert result.is_explained is False
+    assert "residuals.lack-of-fit" in [f.code for f in result.findings]
+    assert result.sigma_scale == pytest.approx(1.0, abs=0.2)
 
 
 def test_lack_of_fit_is_undecided_without_repeats_or_with_a_loss():
     data = hexapod_data(20)
-    found = check_lack_of_fit(identify(hexapod(), data), data)
-    assert found.is_explained is None
-    assert [f.code for f in found.findings] == ["residuals.no-repeats"]
+    result = check_lack_of_fit(identify(hexapod(), data), data)
+    assert result.is_explained is None
+    assert [f.code for f in result.findings] == ["residuals.no-repeats"]
     again = simulate_repeats(2)
     assert check_lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).is_explained is None
 

@@ -73,11 +73,11 @@ def make_machine(name, n):
 
 def largest_error(errors, size):
     """Return the largest error, lengths as a share of the robot's size."""
-    found = [
+    result = [
         np.abs(values[np.isfinite(values)])
         for values in (errors.position / size, errors.orientation)
     ]
-    return float(np.concatenate(found).max())
+    return float(np.concatenate(result).max())
 
 
 def simulate_mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
@@ -306,11 +306,11 @@ def test_trials_with_unknown_frames_equal_single_fits():
     trials = simulate_trials(
         robot, truths, hexapod_poses(30), instrument, 3, nuisance_values=true_setup_values(TRACKER)
     )
-    found = identify_trials(robot, trials, MAP())
+    result = identify_trials(robot, trials, MAP())
     for i in range(2):
         alone = identify(robot, trials.trial(i), MAP())
-        assert found.converged[i]
-        assert_allclose(found.values[i], alone.robot.values, rtol=0, atol=1e-10)
+        assert result.converged[i]
+        assert_allclose(result.values[i], alone.robot.values, rtol=0, atol=1e-10)
 
 
 def test_setup_start_values_are_computed_once_for_all_trials(monkeypatch):

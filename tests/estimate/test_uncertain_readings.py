@@ -95,26 +95,26 @@ def test_vanishing_reading_sigma_gives_the_fit_of_exact_readings(name):
     robot, data = make_case(name)
     exact = identify(robot, data, LeastSquares(), options=FitOptions(rank_tolerance=1e-9))
     for sigma in (TINY_SIGMA, np.where(np.arange(data.readings.shape[1]) == 1, 0.0, TINY_SIGMA)):
-        found = identify(
+        result = identify(
             robot,
             replace(data, reading_sigma=sigma),
             LeastSquares(),
             options=FitOptions(rank_tolerance=1e-9),
         )
-        assert found.rank == exact.rank
-        assert found.residual_test.dof == exact.residual_test.dof
+        assert result.rank == exact.rank
+        assert result.residual_test.dof == exact.residual_test.dof
         if np.isfinite(exact.standard_deviations).all():
-            assert max(largest_difference(found, exact)) < 1e-9
+            assert max(largest_difference(result, exact)) < 1e-9
         else:  # a frame is known only together with the machine: what is known is the same
             known = exact.posterior.directions[:, exact.posterior.determined]
-            change = known.T @ ((found.estimate - exact.estimate) / exact.posterior.unit)
+            change = known.T @ ((result.estimate - exact.estimate) / exact.posterior.unit)
             assert (
                 np.abs(change / np.sqrt(exact.posterior.variance[exact.posterior.determined])).max()
                 < 1e-9
             )
             assert_allclose(
-                found.spectrum.singular_values[: found.rank],
-                exact.spectrum.singular_values[: found.rank],
+                result.spectrum.singular_values[: result.rank],
+                exact.spectrum.singular_values[: result.rank],
                 rtol=1e-9,
             )
 
@@ -153,27 +153,27 @@ def test_noisy_and_missing_readings_and_linked_poses_equal_the_dense_solution():
     sigma[5, 0] = 0.0
     data = replace(data, readings=readings, reading_sigma=sigma)
     expected, covariance = solve_dense(robot, data, copy_reading_sigma(data))
-    found = identify(robot, data, LeastSquares())
-    assert found.converged
+    result = identify(robot, data, LeastSquares())
+    assert result.converged
     sd = np.sqrt(np.diag(covariance))
-    assert_allclose(found.estimate, expected, atol=1e-4 * sd.min(), rtol=0)  # [m], differences
+    assert_allclose(result.estimate, expected, atol=1e-4 * sd.min(), rtol=0)  # [m], differences
     stated = (
-        found.covariance / found.residual_test.sigma_scale**2
+        result.covariance / result.residual_test.sigma_scale**2
     )  # six of 42 wrong parameters are free: it is widened
     assert_allclose(stated, covariance, atol=1e-4 * sd.max() ** 2, rtol=0)
-    assert pose_estimates(found).to_dict() == {
+    assert pose_estimates(result).to_dict() == {
         "exact": 1,
         "uncertain": 34,
         "not_taken": 1,
         "open": [],
         "calm": True,
     }
-    assert {r.kind for r in found.residuals} == {"pose", "separation", "position", "readings"}
-    whitened = found.residuals[-1].whitened
+    assert {r.kind for r in result.residuals} == {"pose", "separation", "position", "readings"}
+    whitened = result.residuals[-1].whitened
     assert whitened[2, 4] == 0.0
-    assert np.isnan(found.residuals[-1].raw[2, 4])
-    total = sum(float((r.whitened**2).sum()) for r in found.residuals)
-    assert total == pytest.approx(found.chi_square, rel=1e-6)
+    assert np.isnan(result.residuals[-1].raw[2, 4])
+    total = sum(float((r.whitened**2).sum()) for r in result.residuals)
+    assert total == pytest.approx(result.chi_square, rel=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -195,9 +195,9 @@ def test_redundant_readings_equal_the_dense_solution(cable):
         Instrument((Sensor(Position(), noise(*[1e-3] * 3), rows=np.arange(8)),)),
         1,
     )
-    found = identify(robot, data, LeastSquares())
+    result = identify(robot, data, LeastSquares())
     sigma = np.array([a.sigma for a in robot.actuators])
-    p, unit, names = len(found.names), robot.parameters.tolerance, robot.parameters.names
+    p, unit, names = len(result.names), robot.parameters.tolerance, robot.parameters.names
     lengths = np.array([limb.length for limb in robot.assembly.limbs])
     nominal = np.array([limb.links[-1].transform[:3, 3] for limb in robot.assembly.limbs])
     radius = np.array([a.terms["gain"] for a in robot.actuators])
@@ -219,13 +219,13 @@ def test_redundant_readings_equal_the_dense_solution(cable):
     inverse_r = np.linalg.inv(np.linalg.qr(fit.jac)[1])
     sd = np.linalg.norm(inverse_r, axis=1)[:p] * unit
     assert_allclose(
-        found.estimate, robot.parameters.nominal + unit * fit.x[:p], atol=1e-3 * sd.min(), rtol=0
+        result.estimate, robot.parameters.nominal + unit * fit.x[:p], atol=1e-3 * sd.min(), rtol=0
     )
     assert_allclose(
-        found.standard_deviations, sd, rtol=1e-4
+        result.standard_deviations, sd, rtol=1e-4
     )  # at two solutions that differ by the noise's curvature
     assert_allclose(
-        pose_estimates(found).poses[:, :3, 3], fit.x[p:].reshape(-1, 3), atol=1e-7
+        pose_estimates(result).poses[:, :3, 3], fit.x[p:].reshape(-1, 3), atol=1e-7
     )  # [m]
 
 
@@ -241,8 +241,8 @@ def test_readings_alone_determine_a_cable_robot_up_to_its_gauge(cable):
     gap = forward(fit.robot, unseen).residual.max()
     assert gap < 1e-9 * robot.size  # [m]: with the right geometry four lines meet in a point
     assert forward(robot, unseen).residual.max() > 1e-3
-    found = identifiability(robot, data)
-    assert (found.rank, found.n_equations) == (13, 30)
+    result = identifiability(robot, data)
+    assert (result.rank, result.n_equations) == (13, 30)
     checked = cross_validate(robot, data, LeastSquares(), count=3)
     assert checked.poses == ()
     assert checked.fold.max() < 1e-3 * checked.before_fold.min()
@@ -256,11 +256,11 @@ def test_leg_sensors_determine_all_but_the_frames_with_and_without_noise():
     legs = tuple(f"leg{i}.universal{j}" for i in (1, 3, 5) for j in (1, 2))
     sensors = Instrument((Sensor(JointSensor(joints=legs, measures="angle"), noise(*[1e-5] * 6)),))
     for sigma in (None, 2 * UM):
-        found = identifiability(
+        result = identifiability(
             robot, simulate(robot, hexapod_poses(30), sensors, 0, reading_sigma=sigma)
         )
-        assert found.rank == 33
-        assert found.gap > 1e6
+        assert result.rank == 33
+        assert result.gap > 1e6
 
 
 def test_readings_of_seven_legs_determine_all_but_two_frames():
@@ -374,13 +374,13 @@ def test_undetermined_pose_adds_no_information_and_is_reported():
     unread = (np.arange(12) == 11)[:, None]
     lost = replace(data, observations=(seen,), readings=np.where(unread, np.nan, data.readings),
                    reading_sigma=np.where(unread, np.inf, copy_reading_sigma(data)))  # fmt: skip
-    found = identify(hexapod(), lost, LeastSquares())
+    result = identify(hexapod(), lost, LeastSquares())
     assert (
-        max(largest_difference(found, known)) < 1e-6
+        max(largest_difference(result, known)) < 1e-6
     )  # both fits end where steps are a millionth of the residual
-    assert found.residual_test.dof == known.residual_test.dof
-    assert pose_estimates(found).is_undetermined.tolist() == [False] * 11 + [True]
-    (lost,) = (f for f in found.findings if f.code == "poses.undetermined")
+    assert result.residual_test.dof == known.residual_test.dof
+    assert pose_estimates(result).is_undetermined.tolist() == [False] * 11 + [True]
+    (lost,) = (f for f in result.findings if f.code == "poses.undetermined")
     assert "12" in str(lost)
 
 
@@ -391,13 +391,13 @@ def test_reading_of_infinite_sigma_is_estimated_from_the_pose():
     for wrong in (5e-3, np.nan):
         readings = data.readings.copy()
         readings[7, 3] += wrong
-        found = identify(
+        result = identify(
             hexapod(), replace(data, readings=readings, reading_sigma=sigma), LeastSquares()
         )
-        assert pose_estimates(found).readings[7, 3] == pytest.approx(
+        assert pose_estimates(result).readings[7, 3] == pytest.approx(
             data.readings[7, 3], abs=20 * UM
         )
-        held = validate(found, replace(data, readings=readings, reading_sigma=sigma))
+        held = validate(result, replace(data, readings=readings, reading_sigma=sigma))
         assert "8" not in held.poses
         assert [f for f in held.findings if f.code == "validation.missing-readings"]
 
@@ -433,15 +433,15 @@ def test_wrong_reading_is_named_and_corrected_by_exclusion_or_a_loss(wrong_readi
 def test_outlier_distance_is_the_decrease_of_chi_square_without_the_pose():
     data = simulate_hexapod(14, 2 * UM)
     fit = identify(hexapod(), data, LeastSquares())
-    found = find_outliers(fit, data).influence
-    assert found.leverage.sum() == pytest.approx(42, abs=1e-6)
+    result = find_outliers(fit, data).influence
+    assert result.leverage.sum() == pytest.approx(42, abs=1e-6)
     assert (
-        int(found.residuals.sum()) == 14 * 6
+        int(result.residuals.sum()) == 14 * 6
     )  # six readings and six numbers of a pose, less its six freedoms
     for i in (3, 11):
         without = identify(hexapod(), data.take(np.arange(14) != i), LeastSquares())
         assert fit.chi_square - without.chi_square == pytest.approx(
-            found.distance[i], rel=1e-3
+            result.distance[i], rel=1e-3
         )  # what is not linear
 
 
@@ -505,17 +505,17 @@ def test_too_few_readings_and_too_many_linked_poses_are_refused(cable, monkeypat
 def test_excluded_pose_is_not_reported_as_undetermined_or_missing():
     data = simulate_hexapod(12, 2 * UM)
     fit = identify(hexapod(), data, options=FitOptions(excluded_poses=("3", "9")))
-    found, out = pose_estimates(fit), np.isin(np.arange(12), (2, 8))
+    result, out = pose_estimates(fit), np.isin(np.arange(12), (2, 8))
     assert "poses.undetermined" not in {f.code for f in fit.findings}
-    assert found.to_dict() == {
+    assert result.to_dict() == {
         "exact": 0,
         "uncertain": 60,
         "not_taken": 0,
         "open": [],
         "calm": True,
     }
-    assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
-    assert_array_equal(np.isnan(found.readings).all(axis=1), out)
+    assert_array_equal(np.isnan(result.poses).all(axis=(1, 2)), out)
+    assert_array_equal(np.isnan(result.readings).all(axis=1), out)
     assert examine_fit(fit, data).gain.is_worthwhile
     held = validate(fit, exclude_poses(data, ("3", "9")))
     assert not [f for f in held.findings if f.code == "validation.missing-readings"]

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from loopcal import geometry
 from tests.jacobians import check_jacobian
 
-ROUNDING = 2e-14  # [1] and [m], double rounding over three products of poses of a few metres
+ROUNDING = 2e-14  # [1] and [m], double rounding over three products of poses of a few meters
 coordinate = st.floats(-1.7, 1.7)
 twist = st.lists(coordinate, min_size=6, max_size=6).map(np.array)
 poses = twist.map(lambda x: geometry.apply_twist(np.eye(4), x))

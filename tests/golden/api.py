@@ -128,7 +128,7 @@ def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Repo
     true = machine.with_values(values)
     back = inverse(true, coordinates)
     front = forward(true, inverse(machine, coordinates).q)
-    found = differentiate_pose(true, true.values[None], front.q[None], front.state)
+    result = differentiate_pose(true, true.values[None], front.q[None], front.state)
     rows = np.array([1.0] * 3 + [1.0 / machine.size] * 3)[:, None]
     lengths = np.array([_size(machine, d) for d in machine.parameters.dimensions])
     strokes = np.array([_size(machine, a.dimension) for a in machine.actuators])
@@ -144,8 +144,8 @@ def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Repo
             "inverse_passive": back.passive,
             "forward_pose": _pose(machine, front.T),
             "forward_passive": front.passive,
-            "by_parameters": found.parameters[0] * rows * lengths,
-            "by_readings": found.readings[0] * rows * strokes,
+            "by_parameters": result.parameters[0] * rows * lengths,
+            "by_readings": result.readings[0] * rows * strokes,
         },
     }
 
@@ -339,11 +339,11 @@ def fit_to_rounding(machine: Robot, data: Data, how: Any = None, **options: Any)
     The descent ends when a step no longer reduces the cost, up to 1e-5 standard deviations from
     the minimum.
     """
-    found = fit(machine, data, how, **options)
+    result = fit(machine, data, how, **options)
     one_step = estimate.StepControl(relative=1e-4)
     for _ in range(3):
-        found = fit(machine, data, how, start=found.robot.values, control=one_step, **options)
-    return found
+        result = fit(machine, data, how, start=result.robot.values, control=one_step, **options)
+    return result
 
 
 def report_fit(found: Fit, parts: bool = True) -> Report:
@@ -385,13 +385,13 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
         local = found.nuisance
         # a setup parameter that is determined only together with the machine keeps its start
         # value
-        told, scale = (
+        known, scale = (
             np.where(np.isinf(local.sd), np.nan, local.estimate),
             np.full(len(local), 1e-3),
         )
         result["local_names"] = list(local.names)
         result["local_open"] = [bool(x) for x in local.is_unobservable]
-        result["local"] = {"estimate": told, "sd": local.sd, "scale": scale}
+        result["local"] = {"estimate": known, "sd": local.sd, "scale": scale}
     if found.prior_conflict is not None:
         one = found.prior_conflict
         result["conflict"] = {
@@ -436,33 +436,33 @@ def _report_unidentifiable(names: Sequence[str], combinations: Sequence[Any]) ->
 
 def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
     """Identify stacked trials at once."""
-    found = estimate.identify_trials(machine, trials, how)
-    free = found.free_parameters
+    result = estimate.identify_trials(machine, trials, how)
+    free = result.free_parameters
     return {
-        "status": found.status,
+        "status": result.status,
         "fit": {
-            "estimate": found.values[:, free.places],
-            "sd": found.standard_deviations(),
-            "scale": np.broadcast_to(free.tolerance, (len(found.values), len(free))),
+            "estimate": result.values[:, free.places],
+            "sd": result.standard_deviations(),
+            "scale": np.broadcast_to(free.tolerance, (len(result.values), len(free))),
         },
-        "cost": found.cost,
-        "rank": found.decomposition.rank,
-        "singular_values": found.decomposition.singular_values,
+        "cost": result.cost,
+        "rank": result.decomposition.rank,
+        "singular_values": result.decomposition.singular_values,
     }
 
 
 def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> Report:
     """Score methods by leave-one-out from one linearization."""
-    found = diagnose.score_leave_one_out(machine, data, tuple(methods))
-    return {"score": found.score, "dof": found.dof, "best": list(methods).index(found.best)}
+    result = diagnose.score_leave_one_out(machine, data, tuple(methods))
+    return {"score": result.score, "dof": result.dof, "best": list(methods).index(result.best)}
 
 
 def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
     """Identify leg by leg."""
     from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 
-    found = identify_per_leg(machine, data, steps)
-    return {"values": found.robot.values, "conditions": found.conditions}
+    result = identify_per_leg(machine, data, steps)
+    return {"values": result.robot.values, "conditions": result.conditions}
 
 
 def fix_setup(data: Data, pattern: str, values: Mapping[str, float] | None = None) -> Any:
@@ -485,7 +485,7 @@ def report_recalibration(
     machine: Robot, data: Data, earlier: Fit, limb: str | None = None
 ) -> Report:
     """Calibrate again with an earlier fit as prior, and test for a change."""
-    found, change = estimate.recalibrate(machine, data, earlier.posterior, limb)
+    result, change = estimate.recalibrate(machine, data, earlier.posterior, limb)
     tested = {
         "what": change.subject,
         "names": list(change.names),
@@ -495,7 +495,7 @@ def report_recalibration(
         "degrees": change.degrees,
         "p_value": change.p_value,
     }
-    return {"again": report_fit(found, parts=False), "change": tested}
+    return {"again": report_fit(result, parts=False), "change": tested}
 
 
 # --- identifiability, validation and diagnosis
@@ -504,26 +504,28 @@ def report_recalibration(
 
 def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> Report:
     """Report what the data determine, and with `cures` the suggested measurements."""
-    found = diagnose.identifiability(machine, data)
+    outcome = diagnose.identifiability(machine, data)
     result: Report = {
-        "rank": found.rank,
-        "n_parameters": found.n_parameters,
-        "n_equations": found.n_equations,
-        "improved": found.improved,
-        "condition": found.condition,
-        "singular_values": found.singular_values,
-        **_report_unidentifiable(found.free_parameters.names, found.unidentifiable),
-        "weak_values": [c.singular_value for c in found.weak],
-        "indices": {name: getattr(found.indices, name) for name in ("o1", "o2", "o3", "o4", "o5")},
-        "states": [v.state for v in found.parameters],
-        "partners": [list(v.partners) for v in found.parameters],
-        "left": [v.left for v in found.parameters],
+        "rank": outcome.rank,
+        "n_parameters": outcome.n_parameters,
+        "n_equations": outcome.n_equations,
+        "improved": outcome.improved,
+        "condition": outcome.condition,
+        "singular_values": outcome.singular_values,
+        **_report_unidentifiable(outcome.free_parameters.names, outcome.unidentifiable),
+        "weak_values": [c.singular_value for c in outcome.weak],
+        "indices": {
+            name: getattr(outcome.indices, name) for name in ("o1", "o2", "o3", "o4", "o5")
+        },
+        "states": [v.state for v in outcome.parameters],
+        "partners": [list(v.partners) for v in outcome.parameters],
+        "left": [v.left for v in outcome.parameters],
     }
     if cures:
-        told = suggest_measurements(found)
-        result["cures"] = [[c.words for c in r.measurements] for r in told]
+        suggestions = suggest_measurements(outcome)
+        result["cures"] = [[c.words for c in r.measurements] for r in suggestions]
         result["cures_left"] = {
-            str(i): [c.left for c in r.measurements] for i, r in enumerate(told)
+            str(i): [c.left for c in r.measurements] for i, r in enumerate(suggestions)
         }
     return result
 
@@ -559,27 +561,27 @@ def report_validation(found: Fit, data: Data) -> Report:
 
 def report_cross_validation(machine: Robot, data: Data, how: Any, count: int, seed: int) -> Report:
     """Score a method on folds."""
-    found = diagnose.cross_validate(machine, data, how, count=count, seed=seed)
+    result = diagnose.cross_validate(machine, data, how, count=count, seed=seed)
     return {
-        "poses": list(found.poses),
-        "score": found.score,
-        "standard_error": found.standard_error,
-        "fold": found.fold,
-        "before_fold": found.before_fold,
-        "after_position": found.after.position,
-        "converged": bool(found.converged),
+        "poses": list(result.poses),
+        "score": result.score,
+        "standard_error": result.standard_error,
+        "fold": result.fold,
+        "before_fold": result.before_fold,
+        "after_position": result.after.position,
+        "converged": bool(result.converged),
     }
 
 
 def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Report:
     """Choose a set of parameters by cross-validation."""
-    found = diagnose.choose_model(machine, data, None, how, count=count)
+    result = diagnose.choose_model(machine, data, None, how, count=count)
     return {
-        "names": [c.name for c in found.candidates],
-        "parameters": [list(c.parameters) for c in found.candidates],
-        "scores": [c.validation.score for c in found.candidates],
-        "chosen": found.chosen.name,
-        "best": found.best.name,
+        "names": [c.name for c in result.candidates],
+        "parameters": [list(c.parameters) for c in result.candidates],
+        "scores": [c.validation.score for c in result.candidates],
+        "chosen": result.chosen.name,
+        "best": result.best.name,
     }
 
 
@@ -602,14 +604,14 @@ def report_monte_carlo(
     machine: Robot, coordinates: Array, sensors: Iterable[Any], where: Array, trials: int
 ) -> Report:
     """Compare predicted with observed uncertainties over a few drawn machines."""
-    found = apply.simulate_accuracy(
+    result = apply.simulate_accuracy(
         machine, coordinates, Instrument(tuple(sensors)), where, trials=trials
     )
     return {
-        "predicted_sd": found.predicted.sd,
-        "observed": found.observed,
-        "trials": found.trials,
-        "failed": found.failed,
+        "predicted_sd": result.predicted.sd,
+        "observed": result.observed,
+        "trials": result.trials,
+        "failed": result.failed,
     }
 
 
@@ -680,13 +682,13 @@ def report_examination(found: Fit, data: Data) -> Report:
 
 def report_conventions(machine: Robot, data: Data) -> Report:
     """Report the convention check."""
-    found = compare_conventions(machine, data)
+    result = compare_conventions(machine, data)
     return {
-        "misfit": found.misfit,
-        "doubtful": bool(found.is_doubtful),
-        "refused": bool(found.is_refused),
-        "other_misfit": found.other_misfit,
-        "alike": len(found.alternatives),
+        "misfit": result.misfit,
+        "doubtful": bool(result.is_doubtful),
+        "refused": bool(result.is_refused),
+        "other_misfit": result.other_misfit,
+        "alike": len(result.alternatives),
     }
 
 
@@ -743,8 +745,8 @@ def report_fedorov(
     problem = prepare_problem(machine, Instrument(tuple(sensors)), settings)
     wanted = problem.build_criterion(criterion, "pose")
     rows = problem.groups.rows
-    found = fedorov_exchange(rows, n, wanted, problem.prior, seed=1, starts=starts)
-    return {"chosen": found.chosen, "value": found.value, "candidates": len(rows)}
+    result = fedorov_exchange(rows, n, wanted, problem.prior, seed=1, starts=starts)
+    return {"chosen": result.chosen, "value": result.value, "candidates": len(rows)}
 
 
 def report_coordinate_exchange(
@@ -760,7 +762,7 @@ def report_coordinate_exchange(
     first = planned.draw(groups, 1)
     wanted = {"D": D(), "A": A()}[criterion]
     start = PriorInformation.none(len(planned.free))
-    found = coordinate_exchange(
+    result = coordinate_exchange(
         lambda _, design: planned.linearize(design),
         first,
         planned.list_levels(),
@@ -770,9 +772,9 @@ def report_coordinate_exchange(
     )
     return {
         "first": first,
-        "design": found.design,
-        "value": found.value,
-        "evaluated": found.evaluated,
+        "design": result.design,
+        "value": result.value,
+        "evaluated": result.evaluated,
     }
 
 
@@ -804,15 +806,15 @@ def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Rep
 
     study, _ = _hexapod_42()
     measured = steps.draw_measured_poses(study, None if noise is None else to_si(noise), 0)
-    found = steps.iterate(study, measured, iterations)
-    off = found.compute_parameter_errors(study.truth)
+    result = steps.iterate(study, measured, iterations)
+    off = result.compute_parameter_errors(study.truth)
     return {
         "commanded": study.commanded.q,
         "actual": measured,
-        "conditions": found.conditions,
+        "conditions": result.conditions,
         # what exact poses leave in the end is rounding: errors as shares of the first
         "kinematic": {
-            "integrated": found.integrated / found.integrated[0],
+            "integrated": result.integrated / result.integrated[0],
             "left": off / np.abs(off[0]).max(),
         },
     }
@@ -843,14 +845,14 @@ def report_hexapod_42_methods(trials: int) -> Report:
     """
     from loopcal.papers.hexapod_42 import noise_study
 
-    found = [
+    result = [
         m
         for m in noise_study.compare_methods(_hexapod_42()[0], 0, trials)
         if not m.method.startswith("all legs")
     ]
     return {
-        "names": [m.method for m in found],
-        "errors": [[m.parameters, m.narrow, m.wide] for m in found],
+        "names": [m.method for m in result],
+        "errors": [[m.parameters, m.narrow, m.wide] for m in result],
     }
 
 
@@ -943,7 +945,7 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     study = plan_points(load_machine(), groups, points, AXES, 0, 0)
     q = study.layout.solve_readings(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.build_measurements(study.layout, q[0], noise)
-    found = estimate.identify(
+    result = estimate.identify(
         study.robot, data, estimate.MAP(), options=estimate.FitOptions(rank_tolerance=forms.RANK)
     )
-    return report_fit(found, parts=False)
+    return report_fit(result, parts=False)

@@ -99,10 +99,10 @@ def calibration(name: str, how: str) -> dict[str, Any]:
     data = simulate_measurements(name, 24)
     options = {"rank_tolerance": 3e-4} if (name, how) == SECOND_ORDER else {}
     identify = api.fit_to_rounding if name == "hexapod-nategh-agheli" else api.fit
-    found = api.report_fit(
+    result = api.report_fit(
         identify(api.robot(name), data, api.make_method(how), allow_fewer_equations=True, **options)
     )
-    return {"data": api.report_data(data) if how == "map" else {}, **found}
+    return {"data": api.report_data(data) if how == "map" else {}, **result}
 
 
 for _name in api.robot_names():
@@ -394,14 +394,14 @@ def calibrate_by_loss(
 ) -> dict[str, Any]:
     """Calibrate from data with blunders, with a loss; and look for the blunders."""
     data = make_data_with_outliers()
-    found = api.fit(
+    result = api.fit(
         api.robot(HEXAPOD),
         data,
         api.make_method(how),
         loss=api.make_loss(loss, constant),
         **options,
     )
-    return api.report_fit(found) | {"outliers": api.report_outliers(found, data)}
+    return api.report_fit(result) | {"outliers": api.report_outliers(result, data)}
 
 
 for _loss in ("huber", "tukey"):
@@ -528,8 +528,8 @@ def calibrate_cable_robot(how: str) -> dict[str, Any]:
     data = api.simulate_data(
         robot, truth(CABLE), api.draw_poses(robot, 24, 5), [seen], 1, reading_sigma=np.deg2rad(1.0)
     )
-    found = api.fit(robot, data, api.make_method(how))
-    return api.report_fit(found) | {"known": api.report_identifiability(robot, data)}
+    result = api.fit(robot, data, api.make_method(how))
+    return api.report_fit(result) | {"known": api.report_identifiability(robot, data)}
 
 
 add("latent/cable-4/map", calibrate_cable_robot, "map")
@@ -650,10 +650,10 @@ add("recalibration/freed-limb", recalibrate_after_change, 300 * UM, "leg3")
 def calibrate_with_earlier_fit(how: str) -> dict[str, Any]:
     """Use an earlier fit as prior knowledge of one with too few equations."""
     few = simulate_measurements(HEXAPOD, 4, seed=6)
-    found = api.fit_to_rounding(
+    result = api.fit_to_rounding(
         api.robot(HEXAPOD), few, api.make_method(how), prior=api.make_prior(usual_fit("ls"))
     )
-    return api.report_fit(found)
+    return api.report_fit(result)
 
 
 add("recalibration/prior-from-earlier", calibrate_with_earlier_fit, "ls")
@@ -761,8 +761,8 @@ def validation(name: str, how: str, *kinds: str) -> dict[str, Any]:
     """Judge a fit on poses held out."""
     sensors = [api.make_sensor(PARTS[kind]) for kind in kinds]
     data = simulate_measurements(name, 32, *sensors)
-    found = api.fit(api.robot(name), api.take_poses(data, np.arange(24)), api.make_method(how))
-    return api.report_validation(found, api.take_poses(data, np.arange(24, 32)))
+    result = api.fit(api.robot(name), api.take_poses(data, np.arange(24)), api.make_method(how))
+    return api.report_validation(result, api.take_poses(data, np.arange(24, 32)))
 
 
 for _name in (HEXAPOD, TRIPOD, DELTA, "ru-pus-prs", "five-bar"):
@@ -819,12 +819,12 @@ for _name in (HEXAPOD, TRIPOD, DELTA):
 def outliers(how: str) -> dict[str, Any]:
     """Detect outliers and examine the fit."""
     data = make_data_with_outliers()
-    found = api.fit(api.robot(HEXAPOD), data, api.make_method(how))
+    result = api.fit(api.robot(HEXAPOD), data, api.make_method(how))
     clean = usual_fit("ls")
     return {
-        "blunders": api.report_outliers(found, data),
+        "blunders": api.report_outliers(result, data),
         "clean": api.report_outliers(clean, simulate_measurements(HEXAPOD, 24)),
-        "examined": api.report_examination(found, data),
+        "examined": api.report_examination(result, data),
     }
 
 
@@ -837,9 +837,9 @@ def repeats() -> dict[str, Any]:
     robot = api.robot(HEXAPOD)
     at = np.repeat(api.draw_poses(robot, 15, 1), 2, axis=0)
     data = api.simulate_data(robot, truth(HEXAPOD), at, [api.make_sensor(PARTS["pose"])], 1)
-    found = api.fit(robot, data, api.make_method("map"))
-    return api.report_examination(found, data) | {
-        "error": api.report_parameter_error(found, truth(HEXAPOD))
+    result = api.fit(robot, data, api.make_method("map"))
+    return api.report_examination(result, data) | {
+        "error": api.report_parameter_error(result, truth(HEXAPOD))
     }
 
 

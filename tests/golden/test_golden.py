@@ -41,8 +41,8 @@ def test_fixture_has_exactly_the_registered_cases():
 )
 def test_results_equal_the_golden_results(name):
     factor, _ = EXCEPTIONS.get(name, (1.0, ""))
-    found = list(compare.differences(GOLDEN[name], compare.flatten(CASES[name].run()), factor))
-    assert not found, "\n".join(found)
+    result = list(compare.differences(GOLDEN[name], compare.flatten(CASES[name].run()), factor))
+    assert not result, "\n".join(result)
 
 
 EXAMPLE = compare.flatten(

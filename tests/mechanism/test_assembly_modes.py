@@ -61,14 +61,14 @@ def build_dietmaier_hexapod():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_dietmaier_hexapod_has_forty_assembly_modes(seed):
-    found = find_assembly_modes(build_dietmaier_hexapod(), np.zeros(6), seed=seed)
-    assert len(found) == 40
-    assert found.solution.residual.max() < 1e-12  # of legs of length 1
-    for T in found.solution.T:  # closure in closed form
+    result = find_assembly_modes(build_dietmaier_hexapod(), np.zeros(6), seed=seed)
+    assert len(result) == 40
+    assert result.solution.residual.max() < 1e-12  # of legs of length 1
+    for T in result.solution.T:  # closure in closed form
         legs = np.array(DIETMAIER_PLATFORM) @ T[:3, :3].T + T[:3, 3] - DIETMAIER_BASE
         assert_allclose(np.linalg.norm(legs, axis=1), DIETMAIER_LENGTHS, atol=1e-13)
-    assert found.starts_since_new >= 8192
-    assert str(found).startswith("40 modes from ")
+    assert result.starts_since_new >= 8192
+    assert str(result).startswith("40 modes from ")
 
 
 @pytest.mark.slow
@@ -84,10 +84,10 @@ def test_planar_hexapods_have_equal_counts_of_modes_above_and_below_the_base(
 ):
     machine = robot()
     at = inverse(machine, np.array(coordinates))
-    found = find_assembly_modes(machine, at.q[0])
-    assert (len(found), int((found.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
+    result = find_assembly_modes(machine, at.q[0])
+    assert (len(result), int((result.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
     assert (
-        np.abs(found.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
+        np.abs(result.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
     )  # the original pose is among them
 
 
@@ -130,9 +130,9 @@ def test_start_selects_the_assembly_and_working_mode():
 
 
 def test_unreachable_readings_have_no_assembly_modes():
-    found = find_assembly_modes(load_robot("linear-delta"), [5.0, -5.0, 0.0], patience=2048)
-    assert len(found) == 0
-    assert "0 modes" in str(found)
+    result = find_assembly_modes(load_robot("linear-delta"), [5.0, -5.0, 0.0], patience=2048)
+    assert len(result) == 0
+    assert "0 modes" in str(result)
 
 
 def test_incomplete_search_for_modes_is_refused():
@@ -151,18 +151,18 @@ def test_working_modes_are_within_half_a_turn_and_ordered_by_distance_from_home(
     robot = build(
         replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators))
     )
-    found = find_working_modes(robot, home_coordinates(robot))
+    result = find_working_modes(robot, home_coordinates(robot))
     low, high = stroke or (-np.pi, np.pi)
     home = inverse(robot, robot.home[None]).q[0]
     middle = (low + high) / 2
-    q = found.solution.q
-    assert len(found) == 4
+    q = result.solution.q
+    assert len(result) == 4
     assert (np.abs(q - middle) <= np.pi + 1e-12).all()
     distance = np.linalg.norm(q - home, axis=1)
     assert (np.diff(distance) >= -1e-12).all()
     if stroke is None:
         assert_allclose(q[0], home, atol=1e-9)
     for row in range(4):  # readings, joints and pose belong together
-        one = found.solution.take(np.array([row]))
+        one = result.solution.take(np.array([row]))
         assert_allclose(driven_values(robot.program, one.state)[0], one.q, atol=1e-12)
         assert_allclose(forward(robot, one.q, start=one).T, one.T, atol=1e-12)

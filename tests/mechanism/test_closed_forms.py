@@ -48,11 +48,11 @@ def test_reached_poses_equal_table_4_to_one_unit_of_the_last_digit():
     units = np.array([[10.0 ** -len(text.partition(".")[2]) for text in row] for row in printed])
     nominal = zoo.hexapod().values.reshape(6, 7)
     truth = zoo.hexapod_truth().reshape(6, 7)
-    found = compute_reached_poses(truth.ravel())
-    found[WITHOUT_LENGTH_ERRORS] = compute_reached_poses(
+    result = compute_reached_poses(truth.ravel())
+    result[WITHOUT_LENGTH_ERRORS] = compute_reached_poses(
         np.column_stack([truth[:, :6], nominal[:, 6]]).ravel()
     )[WITHOUT_LENGTH_ERRORS]
-    off = np.abs(found - np.array(printed, dtype=float)) / units
+    off = np.abs(result - np.array(printed, dtype=float)) / units
     assert off.max() <= 1.0
     assert np.delete(off > 0.5, WITHOUT_LENGTH_ERRORS, axis=0).sum() <= 2
 

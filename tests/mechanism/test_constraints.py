@@ -82,14 +82,14 @@ def make_assembly(limbs, controlled=("x", "y", "z", "roll", "pitch", "yaw")):
 @pytest.mark.parametrize("odd", [0, 3])
 def test_underdetermined_limb_is_named_in_any_order_of_limbs(odd):
     limbs = [make_sps_leg(i, 0.02 if i == odd else 0.0) for i in range(6)]
-    said = set()
+    messages = set()
     for shift in range(6):
         with pytest.raises(
             MechanismError, match=f"limb 'leg{odd + 1}' has 7 joints, but 6 closure equations"
         ) as error:
             build(make_assembly(np.roll(np.array(limbs, dtype=object), shift)))
-        said.add(str(error.value))
-    assert len(said) == 1
+        messages.add(str(error.value))
+    assert len(messages) == 1
 
 
 def test_limb_order_does_not_change_poses_or_the_locked_joint():
@@ -101,10 +101,10 @@ def test_limb_order_does_not_change_poses_or_the_locked_joint():
     ]
     target = np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])
     poses = [inverse(robot, target) for robot in robots]
-    for robot, found in zip(robots, poses, strict=True):
-        assert found.converged.all()
-        assert_allclose(found.T, poses[0].T, atol=1e-12)
-        assert_allclose(forward(robot, found.q).T, found.T, atol=1e-11)
+    for robot, result in zip(robots, poses, strict=True):
+        assert result.converged.all()
+        assert_allclose(result.T, poses[0].T, atol=1e-12)
+        assert_allclose(forward(robot, result.q).T, result.T, atol=1e-11)
         held = [
             (limb, j)
             for g in robot.program.groups
@@ -166,16 +166,16 @@ def test_planar_robot_with_six_freedoms_is_solved_and_reported_as_redundant():
     assert finding.code == "mechanism.repeated-equations"
     assert finding.data == {"count": 6, "freedoms": ("rz", "x", "y")}
     asked = np.random.default_rng(0).uniform((-0.06, -0.06, -0.45), (0.06, 0.06, 0.45), (300, 3))
-    found = inverse(flat, asked)
-    found = found.take(found.converged)
-    assert len(found.q) > 200
-    again = forward(whole, found.q)
+    result = inverse(flat, asked)
+    result = result.take(result.converged)
+    assert len(result.q) > 200
+    again = forward(whole, result.q)
     # the closure matrix is not square, so its determinant must not select a mode by its sign
     assert again.converged.all()
-    assert_allclose(again.T, found.T, atol=1e-11)
+    assert_allclose(again.T, result.T, atol=1e-11)
     assert (again.state.closure_sign == 0).all()
     assert (whole.home_state.closure_sign == 0).all()
-    modes = [find_assembly_modes(robot, found.q[0], patience=2048) for robot in (whole, flat)]
+    modes = [find_assembly_modes(robot, result.q[0], patience=2048) for robot in (whole, flat)]
     assert_allclose(modes[0].solution.T, modes[1].solution.T, atol=1e-9)
     assert (modes[0].solution.state.closure_sign == 0).all()
 
@@ -220,6 +220,6 @@ def test_spherical_robot_without_lengths_has_a_size_of_one_meter():
     robot = build_spherical_3rrr()
     assert robot.size == 1.0
     asked = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3))
-    found = inverse(robot, asked)
-    assert found.converged.all()
-    assert_allclose(forward(robot, found.q).T, found.T, atol=1e-10)
+    result = inverse(robot, asked)
+    assert result.converged.all()
+    assert_allclose(forward(robot, result.q).T, result.T, atol=1e-10)

@@ -265,19 +265,19 @@ def test_argument_of_a_wrong_type_is_refused_with_the_expected_type(call, words)
 def test_jacobian_has_labels_and_is_the_derivative_of_the_poses():
     robot = zoo.hexapod()
     q = np.array([[0.01, -0.02, 0.0, 0.015, 0.0, 0.01], [0.0, 0.01, 0.0, 0.0, -0.01, 0.0]])
-    found = jacobian(robot, q)
-    assert found.components == ("rx", "ry", "rz", "x", "y", "z")
+    result = jacobian(robot, q)
+    assert result.components == ("rx", "ry", "rz", "x", "y", "z")
     step = 1e-6
     for name in ("q2", "leg3.length", "leg5.base.y"):
-        if name in found.reading_names:
-            moved = forward(robot, q + step * (np.array(found.reading_names) == name))
+        if name in result.reading_names:
+            moved = forward(robot, q + step * (np.array(result.reading_names) == name))
         else:
-            change = step * (np.array(found.parameter_names) == name)
+            change = step * (np.array(result.parameter_names) == name)
             moved = forward(robot.with_values(robot.values + change), q)
-        slope = geometry.pose_difference(moved.T, found.solution.T) / step
-        assert_allclose(found.of(name), slope, atol=1e-5)  # [rad/m, m/m] of a forward difference
+        slope = geometry.pose_difference(moved.T, result.solution.T) / step
+        assert_allclose(result.of(name), slope, atol=1e-5)  # [rad/m, m/m] of a forward difference
     with pytest.raises(DataError, match="no column 'leg9'"):
-        found.of("leg9")
+        result.of("leg9")
 
 
 def test_repr_of_robots_and_results_is_short():

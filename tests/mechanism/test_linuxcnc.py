@@ -39,8 +39,8 @@ def hexapod(oracle_folder):
     path = oracle_folder / "genhexkins_default_200poses.csv"
     degrees = np.array([1.0, 1.0, 1.0, *[np.pi / 180] * 3])
     given_poses = zoo.make_poses(read_columns(path, "x y z a_deg b_deg c_deg") * degrees)
-    found = zoo.make_poses(read_columns(path, "fk_x fk_y fk_z fk_a fk_b fk_c") * degrees)
-    return robot, given_poses, read_columns(path, "L0 L1 L2 L3 L4 L5"), found
+    result = zoo.make_poses(read_columns(path, "fk_x fk_y fk_z fk_a fk_b fk_c") * degrees)
+    return robot, given_poses, read_columns(path, "L0 L1 L2 L3 L4 L5"), result
 
 
 def test_strut_lengths_agree_with_genhexkins(hexapod):
@@ -52,14 +52,14 @@ def test_strut_lengths_agree_with_genhexkins(hexapod):
 
 
 def test_poses_of_genhexkins_lengths_agree_with_genhexkins(hexapod):
-    robot, poses, lengths, found = hexapod
+    robot, poses, lengths, result = hexapod
     sol = forward(robot, inverse(robot, poses).q)
     assert_array_equal(sol.status, Status.CONVERGED)
     assert_allclose(geometry.pose_difference(sol.T, poses), 0.0, atol=1e-10)
     theirs = forward(robot, lengths)
     assert_array_equal(theirs.status, Status.CONVERGED)
     assert_allclose(
-        geometry.pose_difference(theirs.T, found), 0.0, atol=1e-7
+        geometry.pose_difference(theirs.T, result), 0.0, atol=1e-7
     )  # its own iteration stops there
 
 
@@ -71,7 +71,7 @@ def test_carriages_and_poses_agree_with_lineardeltakins(oracle_folder):
         stops=-float(np.sqrt(269.0**2 - 130.25**2)), readings="height", home=PoseRecord(z=50.0),
     )  # fmt: skip
     robot, path = build(record.expand()), oracle_folder / "lineardeltakins_default_200poses.csv"
-    points, carriages, found = (
+    points, carriages, result = (
         read_columns(path, names) for names in ("x y z", "j0 j1 j2", "fk_x fk_y fk_z")
     )
     sol = inverse(robot, points)
@@ -80,5 +80,5 @@ def test_carriages_and_poses_agree_with_lineardeltakins(oracle_folder):
     assert_allclose(sol.q, carriages, rtol=0, atol=1e-9)
     back = forward(robot, carriages)
     assert_array_equal(back.status, Status.CONVERGED)
-    assert_allclose(back.T[:, :3, 3], found, rtol=0, atol=1e-9)
+    assert_allclose(back.T[:, :3, 3], result, rtol=0, atol=1e-9)
     assert_allclose(forward(robot, sol.q).T[:, :3, 3], points, rtol=0, atol=1e-10)

@@ -28,11 +28,11 @@ def test_nearest_pose_of_a_3_prs_minimizes_the_distance():
     robot, target = zoo.three_prs(), make_unreachable_poses()
     sol = inverse(robot, target)
     assert_array_equal(sol.status, Status.CONVERGED)
-    found = read_coordinates(sol.T, robot.controlled)
+    result = read_coordinates(sol.T, robot.controlled)
     best, h = squared_distance(robot, sol.T, target), 1e-5
     for i in range(3):
         ahead, behind = (
-            squared_distance(robot, inverse(robot, found + s * h * np.eye(3)[i]).T, target)
+            squared_distance(robot, inverse(robot, result + s * h * np.eye(3)[i]).T, target)
             for s in (1, -1)
         )
         # slope against curvature: how far along this coordinate the minimum still is

@@ -38,8 +38,8 @@ def test_passive_joint_derivatives_agree_with_differences(name):
     robot, sol, _ = sample_inverse(name, 1)
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
-    found = differentiate_passive_joints(robot, values, q, state)
-    assert found.names == sol.passive_names
+    result = differentiate_passive_joints(robot, values, q, state)
+    assert result.names == sol.passive_names
     dimensions = [*robot.parameters.dimensions, *(a.dimension for a in robot.actuators)]
     unit = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
     moved, p = np.diag(unit), values.shape[1]
@@ -63,7 +63,7 @@ def test_passive_joint_derivatives_agree_with_differences(name):
             axis=1,
         )
 
-    both = np.concatenate([found.parameters, found.readings], axis=-1)[0, 0] * unit
+    both = np.concatenate([result.parameters, result.readings], axis=-1)[0, 0] * unit
     check_jacobian(
         joints, both.T[..., None], np.zeros(1), scale=0.1,
         atol=1e-6, atol_reason="closure to 1e-13, condition of platform and limb 30 each, step 1e-4",  # noqa: E501
@@ -84,7 +84,7 @@ def test_passive_joint_derivatives_do_not_depend_on_row_blocks():
     whole = differentiate_passive_joints(robot, values, q, state)
     single = forward(robot, q[0, 600:601])
     alone = differentiate_passive_joints(robot, values, q[:, 600:601], single.state)
-    # numpy's matmul rounds a batch by its size; a turn per metre is about 10
+    # numpy's matmul rounds a batch by its size; a turn per meter is about 10
     np.testing.assert_allclose(whole.parameters[:, 600:601], alone.parameters, rtol=0, atol=1e-11)
     assert make_solution(robot, state, q[0]).passive_names == whole.names
 
@@ -92,11 +92,11 @@ def test_passive_joint_derivatives_do_not_depend_on_row_blocks():
 def test_failed_rows_have_nan_derivatives_of_passive_joints():
     robot, q = build_ups_hexapod(), np.zeros((1, 2, 6))
     q[0, 1, 2] = np.nan
-    found = differentiate_passive_joints(
+    result = differentiate_passive_joints(
         robot, robot.values[None], q, forward_trials(robot, robot.values[None], q)
     )
-    assert np.isfinite(found.parameters[0, 0]).all()
-    assert np.isnan(found.parameters[0, 1]).all()
+    assert np.isfinite(result.parameters[0, 0]).all()
+    assert np.isnan(result.parameters[0, 1]).all()
 
 
 def test_ups_legs_have_no_locked_joint():

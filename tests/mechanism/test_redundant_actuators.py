@@ -137,12 +137,12 @@ def test_local_minimum_far_from_home_is_left_or_marked():
     asked = (
         np.array([0, 0, 0.2, 0, 0, 0]) + np.random.default_rng(0).uniform(-1, 1, (600, 6)) * reach
     )
-    found = inverse(robot, asked)
-    found = found.take(found.converged)
-    again = forward(robot, found.q)
+    result = inverse(robot, asked)
+    result = result.take(result.converged)
+    again = forward(robot, result.q)
     # the readings are consistent, so a residual belongs to a local minimum beside the true pose
     assert again.residual[again.converged].max() < 1e-2 * robot.size
-    right = np.abs(again.T - found.T).max(axis=(1, 2)) < 1e-9
+    right = np.abs(again.T - result.T).max(axis=(1, 2)) < 1e-9
     assert 0.85 < right.mean() < 1
     assert again.converged[right].all()
     for row in np.flatnonzero(~right).tolist():

@@ -50,10 +50,10 @@ def test_pose_derivatives_of_families_agree_with_differences_and_jax(name, legs,
     robot, sol, _ = sample_inverse(name, 4)
     values, q = perturb_values(robot), sol.q[None]
     state = forward_trials(robot, values, q)
-    found = differentiate_pose(robot, values, q, state)
+    result = differentiate_pose(robot, values, q, state)
     free = list(robot.program.freedoms)
 
-    both = np.concatenate([found.parameters[0], found.readings[0]], axis=-1)
+    both = np.concatenate([result.parameters[0], result.readings[0]], axis=-1)
     scale = np.concatenate(
         [
             [1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions],
@@ -88,7 +88,7 @@ def test_pose_derivatives_of_any_mechanism_agree_with_differences(name):
     robot, sol, _ = sample_inverse(name, 1)
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
-    found = differentiate_pose(robot, values, q, state)
+    result = differentiate_pose(robot, values, q, state)
     unit = np.array(
         [robot.size if d is Dimension.LENGTH else 1.0 for d in robot.parameters.dimensions]
     )
@@ -98,7 +98,7 @@ def test_pose_derivatives_of_any_mechanism_agree_with_differences(name):
         return geometry.pose_difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
 
     check_jacobian(
-        solved, (found.parameters[0] * unit).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
+        solved, (result.parameters[0] * unit).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
         atol=1e-7, atol_reason="closure to 1e-13, condition 30, step 1e-4",
     )  # fmt: skip
 
@@ -108,8 +108,8 @@ def test_pose_derivatives_by_transmission_terms_agree_with_differences():
     _, sol, _ = sample_inverse("hexapod", 3)
     values, q = perturb_values(robot, 1e-4), sol.q[None]
     state = forward_trials(robot, values, q)
-    found = differentiate_pose(robot, values, q, state)
-    both = np.concatenate([found.parameters[0][..., 42:], found.readings[0]], axis=-1)
+    result = differentiate_pose(robot, values, q, state)
+    both = np.concatenate([result.parameters[0][..., 42:], result.readings[0]], axis=-1)
 
     def solved(x):
         v = np.concatenate([values[0, :42], x[:-6]])[None]
@@ -167,9 +167,9 @@ def test_failed_rows_have_nan_derivatives_and_do_not_change_other_rows():
     robot, q = zoo.hexapod(), np.zeros((1, 3, 6))
     q[0, 1, 2] = np.nan
     values = robot.values[None]
-    found = differentiate_pose(robot, values, q, forward_trials(robot, values, q))
-    assert np.isnan(found.parameters[0, 1]).all()
-    assert np.isfinite(found.parameters[0, [0, 2]]).all()
+    result = differentiate_pose(robot, values, q, forward_trials(robot, values, q))
+    assert np.isnan(result.parameters[0, 1]).all()
+    assert np.isfinite(result.parameters[0, [0, 2]]).all()
 
 
 # --- identifiability: an unknown frame is six additional columns
@@ -222,8 +222,8 @@ def test_each_unknown_frame_lowers_the_rank_by_six(name, count):
         ((tool,), count - 6),
         ((base, tool), count - 12),
     ):
-        found, s = rank_without(D, *unknown)
-        assert found == rank
+        result, s = rank_without(D, *unknown)
+        assert result == rank
         assert (s[rank:] < 1e-13).all()  # null to rounding; from J'J it would be 1e-7
         assert s[rank - 1] > 1e-7
 

@@ -45,15 +45,17 @@ def is_within_strokes(machine: Mechanism, q: Array) -> NDArray[np.bool_]:
 
 def generate_reachable_rows(machine: Mechanism, seed: int) -> Iterator[Solution]:
     """Yield blocks of 1e5 solutions within strokes; at least half of the workspace must be."""
-    rng, found, tried = np.random.default_rng(seed), 0, 0
-    while found < ROWS:
-        there = inverse(machine, draw_coordinates(machine, rng, BLOCK))
+    rng, result, tried = np.random.default_rng(seed), 0, 0
+    while result < ROWS:
+        solution = inverse(machine, draw_coordinates(machine, rng, BLOCK))
         tried += BLOCK
-        some = there.take(
-            np.flatnonzero(there.converged & is_within_strokes(machine, there.q))[: ROWS - found]
+        some = solution.take(
+            np.flatnonzero(solution.converged & is_within_strokes(machine, solution.q))[
+                : ROWS - result
+            ]
         )
-        found += len(some.q)
-        assert found >= 0.5 * min(tried, ROWS)
+        result += len(some.q)
+        assert result >= 0.5 * min(tried, ROWS)
         yield some
 
 
@@ -67,16 +69,16 @@ def has_returned(there: Solution, back: Solution) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(name: str) -> None:
     machine, total, home = load_cached_robot(name), 0, 0
-    for there in generate_reachable_rows(machine, seed=20):
-        back = forward(machine, there.q)
-        good = has_returned(there, back)
+    for solution in generate_reachable_rows(machine, seed=20):
+        back = forward(machine, solution.q)
+        good = has_returned(solution, back)
         total, home = total + len(good), home + int(good.sum())
         elsewhere = np.flatnonzero(~good & back.converged)
         if len(elsewhere):
             # another true mode: the loops are closed there by the same readings
             other = back.take(elsewhere)
             again = inverse(machine, other.T, start=other)
-            np.testing.assert_allclose(again.q, there.q[elsewhere], rtol=0, atol=1e-8)
+            np.testing.assert_allclose(again.q, solution.q[elsewhere], rtol=0, atol=1e-8)
         for row in np.flatnonzero(~back.converged):
             assert back.explain(int(row)).code == Status(int(back.status[row])).code
     assert total == ROWS
@@ -86,12 +88,12 @@ def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(name: str
 @pytest.mark.parametrize("name", ROBOTS)
 def test_unreachable_coordinates_are_marked_without_an_exception(name: str) -> None:
     machine = load_cached_robot(name)
-    there = inverse(machine, draw_coordinates(machine, np.random.default_rng(21), 500, wide=FAR))
+    solution = inverse(machine, draw_coordinates(machine, np.random.default_rng(21), 500, wide=FAR))
     # a converged row is closed, for any target
-    assert there.residual[there.converged].max(initial=0.0) <= 1e-9 * machine.size
-    for row in np.flatnonzero(~there.converged)[:20]:
-        assert Status(int(there.status[row])) is not Status.CONVERGED
-        assert there.explain(int(row))
+    assert solution.residual[solution.converged].max(initial=0.0) <= 1e-9 * machine.size
+    for row in np.flatnonzero(~solution.converged)[:20]:
+        assert Status(int(solution.status[row])) is not Status.CONVERGED
+        assert solution.explain(int(row))
 
 
 @pytest.mark.slow

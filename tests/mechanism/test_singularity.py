@@ -19,42 +19,42 @@ from tests import zoo
 def test_singularity_margin_of_a_hexapod_is_that_of_its_plucker_lines():
     robot, T = zoo.hexapod(), zoo.nategh_poses(np.random.default_rng(0), 5)
     T[:, 2, 3] -= 0.6
-    found = analyze_singularity(robot, T)
+    result = analyze_singularity(robot, T)
     p = np.einsum("nij,kj->nki", T[:, :3, :3], zoo.HEXAPOD_PLATFORM * zoo.MM)
     u = p + T[:, None, :3, 3] - zoo.HEXAPOD_BASE * zoo.MM
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     lines = np.concatenate([np.cross(p, u) / robot.size, u], axis=-1)
     assert_allclose(
-        found.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14
+        result.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14
     )  # [m/m] rounding
     assert (
-        found.closure_sign
-        == np.sign(np.linalg.det(lines)) * found.closure_sign[0] * np.sign(np.linalg.det(lines))[0]
+        result.closure_sign
+        == np.sign(np.linalg.det(lines)) * result.closure_sign[0] * np.sign(np.linalg.det(lines))[0]
     ).all()
     assert_allclose(
-        found.drive_margin, 1.0, atol=1e-14
+        result.drive_margin, 1.0, atol=1e-14
     )  # a rod pushes along itself, whatever the pose
 
 
 def test_hexapod_rotated_by_90_degrees_is_singular():
     # Fichter's singularity: a symmetric platform turned by 90 degrees about its normal
-    found = analyze_singularity(
+    result = analyze_singularity(
         zoo.hexapod(),
         np.array([[0.0, 0.0, 0.2, 0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]),
     )
-    assert found.margin[0] < 1e-9  # [m/m] six printed digits of the centres
-    assert found.is_near.tolist() == [True, False]
-    assert "rz" in found.motion(0)
-    assert found.explain(0).code == "singularity.distance"
+    assert result.margin[0] < 1e-9  # [m/m] six printed digits of the centers
+    assert result.is_near.tolist() == [True, False]
+    assert "rz" in result.motion(0)
+    assert result.explain(0).code == "singularity.distance"
 
 
 def test_path_through_a_singularity_warns_near_it_and_at_the_sign_change():
     robot = load_robot("hexapod-42")
     path = np.zeros((41, 6))
     path[:, 2], path[:, 5] = 0.2, np.linspace(0.0, 2.0, 41)
-    found = trace_singularity(robot, coordinates=path)
-    assert len(found.warnings) == 2
-    (first, near), (changed, sign) = found.warnings
+    result = trace_singularity(robot, coordinates=path)
+    assert len(result.warnings) == 2
+    (first, near), (changed, sign) = result.warnings
     assert path[first, 5] < np.pi / 2 < path[changed, 5] < path[changed - 1, 5] + 0.06
     assert (near.code, near.data["first"]) == ("singularity.path-near", first)
     assert (sign.code, sign.data["row"]) == ("singularity.path-crosses", changed)
@@ -67,29 +67,29 @@ def test_unreachable_step_of_a_path_is_reported():
     robot = zoo.delta()
     path = np.zeros((12, 3))
     path[:, 2], path[:, 0] = 0.1, np.linspace(0.0, 0.6, 12)
-    found = trace_singularity(robot, coordinates=path, medians=compute_median_margins(robot))
-    lost = int(np.flatnonzero(np.isnan(found.margin))[0])
-    warnings = [(step, finding.code) for step, finding in found.warnings]
+    result = trace_singularity(robot, coordinates=path, medians=compute_median_margins(robot))
+    lost = int(np.flatnonzero(np.isnan(result.margin))[0])
+    warnings = [(step, finding.code) for step, finding in result.warnings]
     assert (lost, "singularity.path-not-reached") in warnings
 
 
 def test_margins_of_a_path_agree_for_readings_and_coordinates():
     robot = zoo.planar_rrr()
     path = np.linspace(0.0, 1.0, 10)[:, None] * np.array([0.02, 0.01, 0.1])
-    there = trace_singularity(robot, coordinates=path, medians=(1.0, 1.0))
-    again = trace_singularity(robot, readings=there.solution.q, medians=(1.0, 1.0))
-    assert_allclose(again.margin, there.margin, atol=1e-11)  # [m/m] rounding through Newton
-    assert (again.closure_sign == there.closure_sign).all()
+    solution = trace_singularity(robot, coordinates=path, medians=(1.0, 1.0))
+    again = trace_singularity(robot, readings=solution.solution.q, medians=(1.0, 1.0))
+    assert_allclose(again.margin, solution.margin, atol=1e-11)  # [m/m] rounding through Newton
+    assert (again.closure_sign == solution.closure_sign).all()
 
 
 def test_outstretched_crank_is_reported_as_a_weak_actuator():
     # crank of 0.2 m and rod of 0.3 m in one line: the drive's row of closure vanishes
     robot = load_robot("five-bar")
     reach = 0.4999 * np.array([np.cos(1.0), np.sin(1.0)]) + [-0.075, 0.0]
-    found = analyze_singularity(robot, inverse(robot, reach[None]))
-    assert found.drive_margin[0] < 0.05 * found.drive_median
-    assert found.explain(0).code == "singularity.weak-actuator"
-    assert found.explain(0).data["actuator"] == "left"
+    result = analyze_singularity(robot, inverse(robot, reach[None]))
+    assert result.drive_margin[0] < 0.05 * result.drive_median
+    assert result.explain(0).code == "singularity.weak-actuator"
+    assert result.explain(0).data["actuator"] == "left"
 
 
 def test_median_margin_without_a_workspace_is_that_of_home():
@@ -100,9 +100,9 @@ def test_median_margin_without_a_workspace_is_that_of_home():
 
 
 def test_redundant_actuators_have_a_margin_but_no_closure_sign():
-    found = analyze_singularity(load_robot("cable-4"), load_robot("cable-4").home[None])
-    assert found.margin[0] > 0.5
-    assert found.closure_sign[0] == 0
+    result = analyze_singularity(load_robot("cable-4"), load_robot("cable-4").home[None])
+    assert result.margin[0] > 0.5
+    assert result.closure_sign[0] == 0
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def test_every_limb_closes_at_the_given_pose():
 def test_reading_and_passive_joint_derivatives_at_a_pose_agree_with_differences():
     robot = build_planar_robot_with_four_arms()
     values, T, state, q = solve_example_pose(robot)
-    found = differentiate_at_pose(robot, values, q, state)
+    result = differentiate_at_pose(robot, values, q, state)
     p, freedoms = values.shape[1], robot.program.freedoms
     moved = np.zeros((3, 6))
     moved[range(3), list(freedoms)] = 1.0
@@ -76,7 +76,7 @@ def test_reading_and_passive_joint_derivatives_at_a_pose_agree_with_differences(
         elbows = np.concatenate([new.joints[0][:, 0, k, 1:2] for k in range(4)], axis=1)
         return np.concatenate([readings[:, 0], elbows], axis=1)
 
-    both = [np.concatenate(parts, axis=-1)[0, 0] for parts in (found.readings, found.passive)]
+    both = [np.concatenate(parts, axis=-1)[0, 0] for parts in (result.readings, result.passive)]
     expected = np.concatenate(both).T[..., None]
     check_jacobian(
         joints,
@@ -91,10 +91,10 @@ def test_reading_and_passive_joint_derivatives_at_a_pose_agree_with_differences(
 def test_derivatives_by_pose_and_by_readings_agree():
     robot = build_planar_robot_with_four_arms()
     values, _, state, q = solve_example_pose(robot)
-    found = differentiate_at_pose(robot, values, q, state)
+    result = differentiate_at_pose(robot, values, q, state)
     by_reading = differentiate_passive_joints(robot, values, q, state)
     turned = (
-        by_reading.readings[0, 0] @ found.readings[1][0, 0]
+        by_reading.readings[0, 0] @ result.readings[1][0, 0]
     )  # passive by readings, readings by pose
-    assert_allclose(turned, found.passive[1][0, 0], atol=1e-9)  # [rad/m]
+    assert_allclose(turned, result.passive[1][0, 0], atol=1e-9)  # [rad/m]
     assert inverse(robot, np.zeros((1, 3))).converged.all()

@@ -17,15 +17,15 @@ from tests import zoo
 
 def test_samples_are_within_ranges_and_strokes_and_round_trip():
     robot = load_robot("hexapod-42")
-    found = sample_workspace(robot, 300, seed=1)
+    result = sample_workspace(robot, 300, seed=1)
     low, high = np.array([robot.assembly.workspace[name] for name in robot.controlled]).T
-    assert ((found.coordinates >= low) & (found.coordinates <= high)).all()
-    assert np.abs(found.solution.q).max() <= 0.075
+    assert ((result.coordinates >= low) & (result.coordinates <= high)).all()
+    assert np.abs(result.solution.q).max() <= 0.075
     assert_allclose(
-        forward(robot, found.solution.q).T, found.solution.T, atol=1e-12
+        forward(robot, result.solution.q).T, result.solution.T, atol=1e-12
     )  # [1, m]: rounding over Newton
-    assert 0.95 < found.reachable_share < 1.0
-    assert all(name.startswith("stroke of q") for name in found.rejected)
+    assert 0.95 < result.reachable_share < 1.0
+    assert all(name.startswith("stroke of q") for name in result.rejected)
 
 
 def test_seed_determines_the_samples():
@@ -42,8 +42,8 @@ def test_seed_determines_the_samples():
 
 def test_sampled_tilt_is_uniform_over_the_spherical_cap():
     robot = load_robot("3-prs")
-    found = sample_workspace(robot, 4000, seed=0)
-    theta = found.coordinates[:, robot.controlled.index("theta")]
+    result = sample_workspace(robot, 4000, seed=0)
+    theta = result.coordinates[:, robot.controlled.index("theta")]
     low, high = robot.assembly.workspace["theta"]
     share = (np.cos(low) - np.cos(theta)) / (np.cos(low) - np.cos(high))
     # uniform on (0, 1): the mean of 4000 is within 4 standard deviations of a half in all but 6 of

@@ -36,15 +36,6 @@ def no_penalty(d) -> np.ndarray:
     return np.zeros_like(d.singular_values)
 
 
-def test_triangular_factor_does_not_depend_on_block_sizes_up_to_signs(rows):
-    whole = np.abs(fold_rows(rows))
-    for cuts in ([1, 3, 20], [10], list(range(1, M))):
-        factor = empty_factor(T, P)
-        for block in np.split(rows, cuts, axis=1):
-            factor = fold(factor, block)
-        np.testing.assert_allclose(np.abs(factor), whole, rtol=0, atol=1e-12 * whole.max())
-
-
 def test_triangular_factor_does_not_depend_on_row_order(rows):
     shuffled = rows[:, np.random.default_rng(1).permutation(M)]
     a, b = np.abs(fold_rows(rows)), np.abs(fold_rows(shuffled))

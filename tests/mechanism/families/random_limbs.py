@@ -31,11 +31,13 @@ def random_mechanism(seed: int, limbs: int) -> Limbs:
     rng = np.random.default_rng(seed)
     taken = 6 // limbs
     allowed = [ending for ending, rows in PASSIVE.items() if rows >= taken]
-    found = tuple(_limb(rng, f"limb{i + 1}", str(rng.choice(allowed)), taken) for i in range(limbs))
+    result = tuple(
+        _limb(rng, f"limb{i + 1}", str(rng.choice(allowed)), taken) for i in range(limbs)
+    )
     controlled = {6: ("x", "y", "z", "roll", "pitch", "yaw"), 3: ("x", "y", "z"), 2: ("x", "y")}[
         limbs
     ]
-    return Limbs(name=f"random {seed}", limbs=found, controlled=controlled, error_model="complete")
+    return Limbs(name=f"random {seed}", limbs=result, controlled=controlled, error_model="complete")
 
 
 def expected_rank(record: Limbs) -> int:

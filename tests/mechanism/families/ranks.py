@@ -90,18 +90,18 @@ def frame_columns(T: Array, base: bool, tool: bool) -> Array:
     """Twists (n, 6, 0 | 6 | 12) that an unknown frame of the instrument, of the target, or both
     give, scaled as above.
     """
-    n, found = len(T), []
+    n, result = len(T), []
     if base:
         block = np.zeros((n, 6, 6))
         block[:, :3, :3] = np.eye(3)
         block[:, 3:, :3] = -geometry.hat(T[:, :3, 3]) / METERS_PER_RADIAN
         block[:, 3:, 3:] = np.eye(3)
-        found.append(block)
+        result.append(block)
     if tool:
         block = np.zeros((n, 6, 6))
         block[:, :3, :3] = block[:, 3:, 3:] = T[:, :3, :3]
-        found.append(block)
-    return np.concatenate(found, axis=2) if found else np.zeros((n, 6, 0))
+        result.append(block)
+    return np.concatenate(result, axis=2) if result else np.zeros((n, 6, 0))
 
 
 def rank(rows: Array, tolerance: float = 1e-12, gap: float = 1e3) -> int:
@@ -135,13 +135,13 @@ def ranks_with_unknown_frames(
 ) -> list[int]:
     """Return ranks with unknown frames: rank of all columns less the rank of the frame columns."""
     solution = solve_random_poses(robot, n)
-    D, found = scaled_sensitivity(robot, solution), []
+    D, result = scaled_sensitivity(robot, solution), []
     for base, tool in frames:
         F = select_measured_rows(frame_columns(solution.T, base, tool), solution.T, kind)
-        found.append(
+        result.append(
             rank(np.concatenate([select_measured_rows(D, solution.T, kind), F], axis=2)) - rank(F)
         )
-    return found
+    return result
 
 
 def null_vector(rows: Array) -> Array:

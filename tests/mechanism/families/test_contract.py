@@ -58,12 +58,12 @@ def test_shipped_robot_file_states_source_workspace_strokes_and_tolerances(name:
 def test_forward_kinematics_inverts_inverse_kinematics_in_the_workspace(name: str) -> None:
     machine = load_cached_robot(name)
     wanted = random_coordinates(machine, 1000, seed=11)
-    there = inverse(machine, wanted)
-    back = forward(machine, there.q)
-    good = there.converged & back.converged
+    solution = inverse(machine, wanted)
+    back = forward(machine, solution.q)
+    good = solution.converged & back.converged
     assert good.mean() >= 0.999
     # [m, rad] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
-    np.testing.assert_allclose(back.T[good], there.T[good], atol=1e-9)
+    np.testing.assert_allclose(back.T[good], solution.T[good], atol=1e-9)
     residual = compare_coordinates(back.T[good], wanted[good], machine.controlled, machine.size)[0]
     np.testing.assert_allclose(residual, 0.0, atol=1e-9 * machine.size)
 
@@ -72,9 +72,9 @@ def test_forward_kinematics_inverts_inverse_kinematics_in_the_workspace(name: st
 @pytest.mark.parametrize("name", ROBOTS)
 def test_random_rows_converge_or_state_why_not(name: str) -> None:
     machine = load_cached_robot(name)
-    there = inverse(machine, random_coordinates(machine, 10_000, seed=12))
-    back = forward(machine, there.q)
-    assert (there.converged & back.converged).mean() >= 0.999
+    solution = inverse(machine, random_coordinates(machine, 10_000, seed=12))
+    back = forward(machine, solution.q)
+    assert (solution.converged & back.converged).mean() >= 0.999
     for row in np.flatnonzero(~back.converged)[:5]:
         assert back.explain(int(row))
 
@@ -83,9 +83,9 @@ def test_random_rows_converge_or_state_why_not(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> None:
     machine = load_cached_robot(name)
-    there = inverse(machine, random_coordinates(machine, 3, seed=13))
-    assert there.converged.all()
-    q, values = compute_readings(machine, machine.values[None], there.state), machine.values
+    solution = inverse(machine, random_coordinates(machine, 3, seed=13))
+    assert solution.converged.all()
+    q, values = compute_readings(machine, machine.values[None], solution.state), machine.values
     state = forward_trials(machine, values[None], q)
     known = differentiate_pose(machine, values[None], q, state)
 

@@ -52,8 +52,8 @@ def build_uneven_delta() -> Mechanism:
 def position_derivatives(machine: Mechanism, q: Array) -> tuple[Array, Array]:
     """Return d position / d parameters (n, 3, p) and / d readings (n, 3, a)."""
     solution = forward(machine, q)
-    found = differentiate_pose(machine, machine.values[None], q[None], solution.state)
-    return found.parameters[0, :, 3:], found.readings[0, :, 3:]
+    result = differentiate_pose(machine, machine.values[None], q[None], solution.state)
+    return result.parameters[0, :, 3:], result.readings[0, :, 3:]
 
 
 ARM, RADIUS, STOP, TIP = 0.22, 0.105, 0.3, 0.04  # [m]
@@ -149,18 +149,18 @@ def assert_same_kinematics(three: Mechanism, six: Mechanism, atol: float) -> Non
 def test_uneven_rods_tilt_the_platform_but_reach_the_position() -> None:
     machine = build_uneven_delta()
     xyz = random_coordinates(machine, 500, seed=6)
-    there = inverse(machine, xyz)
-    assert there.converged.all()
-    np.testing.assert_allclose(there.T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
-    tilt = np.linalg.norm(geometry.log_so3(there.T[:, :3, :3]), axis=1)
+    solution = inverse(machine, xyz)
+    assert solution.converged.all()
+    np.testing.assert_allclose(solution.T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
+    tilt = np.linalg.norm(geometry.log_so3(solution.T[:, :3, :3]), axis=1)
     assert 1e-4 < np.median(tilt) < 0.1
     # both rods of a carriage at one height
-    group, joints = machine.program.groups[0], there.state.joints[0]
+    group, joints = machine.program.groups[0], solution.state.joints[0]
     for a in range(3):
         pair = joints[0][:, group.actuator[0] == a, 0]
         np.testing.assert_array_equal(pair[:, 0], pair[:, 1])
-    back = forward(machine, there.q)
-    np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-12)
+    back = forward(machine, solution.q)
+    np.testing.assert_allclose(back.T, solution.T, rtol=0, atol=1e-12)
 
 
 def test_row_of_inverse_kinematics_does_not_depend_on_other_rows() -> None:
@@ -175,9 +175,9 @@ def test_row_of_inverse_kinematics_does_not_depend_on_other_rows() -> None:
 
 def test_reachable_pose_of_an_uneven_delta_is_kept() -> None:
     machine = build_uneven_delta()
-    there = inverse(machine, random_coordinates(machine, 20, seed=8))
-    again = inverse(machine, there.T)
-    np.testing.assert_allclose(again.T, there.T, rtol=0, atol=1e-10)
+    solution = inverse(machine, random_coordinates(machine, 20, seed=8))
+    again = inverse(machine, solution.T)
+    np.testing.assert_allclose(again.T, solution.T, rtol=0, atol=1e-10)
 
 
 def test_unreachable_position_is_marked() -> None:

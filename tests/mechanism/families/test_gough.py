@@ -88,7 +88,7 @@ def test_sensitivities_equal_those_of_the_leg_equation(record: Gough) -> None:
         machine, machine.values[None], solution.q[None], solution.state
     ).parameters[0]
     value = machine.values.reshape(6, 7)
-    for T, found in zip(solution.T, D, strict=True):
+    for T, result in zip(solution.T, D, strict=True):
         N, R = T[:3, 3], T[:3, :3]
         J, G = np.zeros((6, 6)), np.zeros((6, 42))
         for leg, (b, p) in enumerate(zip(value[:, :3], value[:, 3:6], strict=True)):
@@ -98,7 +98,7 @@ def test_sensitivities_equal_those_of_the_leg_equation(record: Gough) -> None:
             G[leg, 7 * leg : 7 * leg + 7] = np.concatenate([u, -u @ R, [1.0]])
         expected = np.linalg.solve(J, G)
         # [m/m, rad/m] rounding times the condition of J, about 1e2
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_rod_legs_and_chain_legs_agree_in_poses_and_sensitivities() -> None:
@@ -112,12 +112,12 @@ def test_rod_legs_and_chain_legs_agree_in_poses_and_sensitivities() -> None:
     two = inverse(chain, one.T)
     assert two.converged.all()
     np.testing.assert_allclose(two.q, one.q, rtol=0, atol=1e-12)  # [m]
-    there, back = forward(rod, one.q), forward(chain, one.q)
-    np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-12)  # [m, 1]
-    assert max(there.residual.max(), back.residual.max()) < 1e-12  # [m]
+    solution, back = forward(rod, one.q), forward(chain, one.q)
+    np.testing.assert_allclose(back.T, solution.T, rtol=0, atol=1e-12)  # [m, 1]
+    assert max(solution.residual.max(), back.residual.max()) < 1e-12  # [m]
     D = [
-        differentiate_pose(machine, machine.values[None], one.q[None], found.state)
-        for machine, found in ((rod, there), (chain, back))
+        differentiate_pose(machine, machine.values[None], one.q[None], result.state)
+        for machine, result in ((rod, solution), (chain, back))
     ]
     size = np.abs(D[0].parameters).max()  # [rad/m] about 10
     np.testing.assert_allclose(
@@ -243,7 +243,7 @@ def test_unsupported_options_of_a_hexapod_are_refused_with_the_alternative(
 
 # --- the screw, against LinuxCNC's genhexkins
 # ------------------------------------------------------------------------
-LEAD = 4.0  # unit of the file, here taken as a metre
+LEAD = 4.0  # unit of the file, here taken as a meter
 
 
 @pytest.fixture(scope="module")

@@ -347,10 +347,10 @@ def test_invalid_limb_record_is_refused_in_one_sentence(case: str) -> None:
         record = replace(
             record, limbs=(replace(record.limbs[0], errors=(Shifts("rod", ("length",)),)),)
         )
-    with pytest.raises(MechanismError) as found:
+    with pytest.raises(MechanismError) as result:
         record.expand()
-    assert sentence in str(found.value)
-    assert "\n" not in str(found.value)
+    assert sentence in str(result.value)
+    assert "\n" not in str(result.value)
 
 
 def test_unknown_joint_kind_is_reported_with_its_line(tmp_path: Path) -> None:

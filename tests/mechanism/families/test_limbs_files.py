@@ -66,10 +66,10 @@ def test_named_error_about_another_axis_keeps_the_error_of_that_name(tmp_path: P
 # --------------------------------------------------------------------------------------------
 def read_refusal(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> str:
     """Return the message with which a changed file is refused."""
-    with pytest.raises(LoopcalError) as found:
+    with pytest.raises(LoopcalError) as result:
         load_changed_robot(tmp_path, name, *changes, more=more)
-    assert "\n" not in str(found.value)
-    return str(found.value)
+    assert "\n" not in str(result.value)
+    return str(result.value)
 
 
 FREEDOMS = {
@@ -252,6 +252,6 @@ def test_mapped_lead_is_the_advance_per_turn(tmp_path: Path) -> None:
     values[machine.parameters.index("p")] += 0.003  # [m], in one turn
     stated = load_changed_robot(tmp_path, "rotary-delta", ("axis: y,", "axis: y, lead: 3,"))
     xyz = np.array([[0.05, -0.08, -0.45], [-0.1, 0.02, -0.5]])
-    there, twin = inverse(machine.with_values(values), xyz), inverse(stated, xyz)
-    np.testing.assert_allclose(there.q, twin.q, rtol=0, atol=1e-12)  # [rad]
-    assert abs(there.q - inverse(machine, xyz).q).max() > 1e-5
+    solution, twin = inverse(machine.with_values(values), xyz), inverse(stated, xyz)
+    np.testing.assert_allclose(solution.q, twin.q, rtol=0, atol=1e-12)  # [rad]
+    assert abs(solution.q - inverse(machine, xyz).q).max() > 1e-5

@@ -92,9 +92,9 @@ def hinge_row(
 
 def guide_derivatives(w: Array, R: Array, q: float, Z: Array, tags: dict[str, str]) -> dict:
     """Return the derivatives of joint centers, offset and guide along w."""
-    found = {tags["q"]: w @ EZ, tags["thBx"]: -q * (w @ Z @ EY), tags["thBy"]: q * (w @ Z @ EX)}
-    found |= {tags[f"b{axis}"]: w @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xy"}
-    return found | {tags[f"a{axis}"]: -w @ R @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xyz"}
+    result = {tags["q"]: w @ EZ, tags["thBx"]: -q * (w @ Z @ EY), tags["thBy"]: q * (w @ Z @ EX)}
+    result |= {tags[f"b{axis}"]: w @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xy"}
+    return result | {tags[f"a{axis}"]: -w @ R @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xyz"}
 
 
 def parameter_names(i: int, joint: str) -> dict[str, str]:
@@ -116,13 +116,13 @@ def parameter_names(i: int, joint: str) -> dict[str, str]:
 
 def three_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
     """Return the six loop equations of the 3-PRS."""
-    found = []
+    result = []
     for i in range(3):
         Z = rotation_about_z(2 * np.pi / 3 * i)
         a, b, names = Z @ [0.2, 0, 0], Z @ [0.35, 0, 0], parameter_names(i + 1, "xz")
-        found.append(sphere_row(N, R, a, b, q[i], Z, names))
-        found.append(hinge_row(N, R, a, b, q[i], Z, Z @ EY, names))
-    return found
+        result.append(sphere_row(N, R, a, b, q[i], Z, names))
+        result.append(hinge_row(N, R, a, b, q[i], Z, Z @ EY, names))
+    return result
 
 
 def ru_pus_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
@@ -225,11 +225,11 @@ class Loops:
         guide = rotation_series(self.vector(f"thB{i}"))
         s = Z @ guide @ EZ
         v = N + R @ Z @ self.vector(f"a{i}") - Z @ self.vector(f"b{i}") - (self.of[f"q{i}"] + q) * s
-        found = [np.sqrt(v @ v) - self.of[f"l{i}"]]
+        result = [np.sqrt(v @ v) - self.of[f"l{i}"]]
         if hinge is not None:
             r = Z @ guide @ rotation_series(self.vector(f"thC{i}") - self.vector(f"thB{i}")) @ hinge
-            found.append(v @ r)
-        return found
+            result.append(v @ r)
+        return result
 
     def three_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
         """Return six equations, and one that fixes the unused pivot."""
@@ -282,7 +282,7 @@ def sensitivities_by_complex_steps(
 @pytest.mark.parametrize("size", [1e-3, 1e-2])
 @pytest.mark.parametrize("case", MODELS)
 def test_sensitivities_at_perturbed_parameters_equal_complex_steps(case: str, size: float) -> None:
-    # [m] and angles of 5 (50) mrad: centres, guides, joints and post all displaced, also against
+    # [m] and angles of 5 (50) mrad: centers, guides, joints and post all displaced, also against
     # each other
     record, rows = MODELS[case]
     machine = perturb(build_cached_robot(record), size, seed=11)
@@ -291,13 +291,13 @@ def test_sensitivities_at_perturbed_parameters_equal_complex_steps(case: str, si
         machine, machine.values[None], solution.q[None], solution.state
     ).parameters[0]
     kind, names = rows.__name__.removesuffix("_rows"), machine.parameters.names
-    found = [
+    result = [
         sensitivities_by_complex_steps(kind, names, machine.values, T, q)
         for T, q in zip(solution.T, solution.q, strict=True)
     ]
-    expected = np.stack([slopes for _, slopes in found])
+    expected = np.stack([slopes for _, slopes in result])
     assert (
-        max(np.abs(residual).max() for residual, _ in found) < 1e-12
+        max(np.abs(residual).max() for residual, _ in result) < 1e-12
     )  # [m, 1] the machine stands on these loops
     # [m/m, rad/m, ..] condition of the loops 1e2 times rounding
     np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -377,12 +377,12 @@ def test_unknown_frame_lowers_the_rank_of_the_ru_pus_prs_by_motions_it_can_follo
 def test_null_vector_of_the_3_prs_without_torsion_rotates_three_balls() -> None:
     machine = build_cached_robot(THREE_PRS)
     solution = solve_random_poses(machine)
-    found = null_vector(
+    result = null_vector(
         select_measured_rows(scaled_sensitivity(machine, solution), solution.T, "5-dof")
     )
     expected = np.isin(machine.parameters.names, ("a1y", "a2y", "a3y")) / np.sqrt(3)
     np.testing.assert_allclose(
-        np.abs(found @ expected), 1.0, atol=1e-9
+        np.abs(result @ expected), 1.0, atol=1e-9
     )  # rounding over the next singular value, 4e-5
 
 
@@ -437,15 +437,15 @@ def test_twenty_seven_parameters_of_the_ru_pus_prs_have_rank_26() -> None:
 def test_null_vector_of_the_ru_pus_prs_without_torsion_rotates_two_balls() -> None:
     machine = build_cached_robot(RU_PUS_PRS)
     solution = solve_random_poses(machine)
-    found = null_vector(
+    result = null_vector(
         select_measured_rows(scaled_sensitivity(machine, solution), solution.T, "5-dof")
     )
-    found *= np.sign(found[machine.parameters.index("a1y")])
+    result *= np.sign(result[machine.parameters.index("a1y")])
     # mostly a1y = a2x, and a small angle of the second axis on the platform
-    assert found[machine.parameters.index("a1y")] == pytest.approx(
-        found[machine.parameters.index("a2x")], rel=1e-6
+    assert result[machine.parameters.index("a1y")] == pytest.approx(
+        result[machine.parameters.index("a2x")], rel=1e-6
     )
-    largest = np.array(machine.parameters.names)[np.argsort(-np.abs(found))[:3]]
+    largest = np.array(machine.parameters.names)[np.argsort(-np.abs(result))[:3]]
     assert set(largest) == {"a1y", "a2x", "thU2z"}
 
 
