@@ -45,11 +45,6 @@ class PriorInformation:
         """Return variance 1 for each machine unknown and nothing for the nuisance parameters."""
         return cls(np.eye(nuisance + machine)[nuisance:], nuisance)
 
-    @property
-    def n_machine(self) -> int:
-        """Number p of machine unknowns."""
-        return self.rows.shape[1] - self.n_nuisance
-
     def with_rows(self, rows: ArrayLike) -> PriorInformation:
         """Return this with more rows (..., o + p): measured poses, or tolerances of nuisance
         parameters.
