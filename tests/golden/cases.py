@@ -700,7 +700,6 @@ add(
     "I",
     target="position",
     candidates=50,
-    hold_out=2,  # the default when the fixture was made; now at least five
 )
 
 

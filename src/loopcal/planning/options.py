@@ -34,7 +34,7 @@ class PlanOptions:
     goal : expected error of `target` to reach [m, rad], root mean square over the workspace; the
         plan then has the smallest number of poses that reaches it.
     hold_out : number of further poses for validation, drawn evenly; default one for four poses of
-        the fit, and at least five.
+        the fit.
     constraints : margin from singularities, tilt, line of sight. Strokes, joint limits and cones
         are always respected.
     allowed_poses : (n, c) controlled coordinates to choose from [m, rad]; default: about

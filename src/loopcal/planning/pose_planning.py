@@ -45,10 +45,8 @@ DIGITS = 8
 """Decimal places of the robot's size, in its unit, or of a radian, to which readings are stated."""
 EXTENSIONS = 12
 """Largest number of times that poses are added where a goal is missed because some are held out."""
-FITTED_PER_HELD_OUT, LEAST_HELD_OUT = 4, 5
-"""By default: poses of the fit for each validation pose, and the smallest number of poses or groups
-for validation, so that the validation supports a verdict.
-"""
+FITTED_PER_HELD_OUT = 4
+"""Poses of the fit for each validation pose, by default."""
 
 
 def plan(
@@ -173,8 +171,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
 def _require_numbers(problem: PlanningProblem, n_poses: int) -> int:
     """Return the number of poses to hold out; refuse impossible numbers."""
     k, hold_out = problem.poses_per_group, problem.options.hold_out
-    usual = max(n_poses // FITTED_PER_HELD_OUT // k, LEAST_HELD_OUT) * k
-    n_held_out = usual if hold_out is None else hold_out
+    n_held_out = n_poses // FITTED_PER_HELD_OUT // k * k if hold_out is None else hold_out
     for use, number, least in (("for the fit", n_poses, 1), ("to hold out", n_held_out, 0)):
         if number < least or number % k:
             multiples = (
