@@ -11,8 +11,9 @@ from itertools import permutations, product
 import numpy as np
 
 from loopcal.geometry.rigid_transforms import make_pose
-from loopcal.geometry.rotations import exp_so3, hat, project_to_rotations
-from loopcal.typing import FloatArray
+from loopcal.geometry.rotations import exp_so3, hat, left_jacobian_so3, project_to_rotations
+from loopcal.numerics.multistart import minimize_from_starts
+from loopcal.typing import FloatArray, IntArray
 
 _SIGNED_PERMUTATIONS = [
     np.eye(3)[list(order)] * sign
@@ -24,6 +25,9 @@ OCTAHEDRAL_ROTATIONS: FloatArray = np.array(
 )
 """The 24 rotations (24, 3, 3) of a cube: every rotation is within 63 degrees of one of them."""
 OCTAHEDRAL_ROTATIONS.setflags(write=False)
+
+TINY = 1e-300
+"""Divisor [1] in place of zero."""
 
 FLATNESS = 1e-6
 """Ratio of extents [1] below which points count as coplanar, or as collinear."""
@@ -73,27 +77,19 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> Flo
     count : largest number of different rotations to return.
     """
     unconstrained = project_to_rotations(solve_least_squares(H, g).reshape(3, 3))
-    R = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
+    start = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
     root = _square_root(H)
-    target = solve_least_squares(root.T, g)
-    damping = np.full((len(R), 1, 1), 1e-3 * max(float(np.trace(H)), 1e-300))
-    cost = _cost(root, target, R)
-    for _ in range(40):
-        residual = R.reshape(-1, 9) @ root.T - target
+    root = root / max(float(np.linalg.norm(root)), TINY)  # residuals of order one
+    target = solve_least_squares(root.T, g / max(float(np.trace(H)), TINY))
+
+    def linearize(vector: FloatArray, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+        R, turn = exp_so3(vector) @ start[numbers], left_jacobian_so3(vector)
         # dR = hat(w) R for w along each axis
-        J = root @ np.stack([(hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
-        A = np.swapaxes(J, -1, -2) @ J + damping * np.eye(3)
-        step = np.asarray(
-            -np.linalg.solve(A, np.swapaxes(J, -1, -2) @ residual[..., None])[..., 0], dtype=float
-        )
-        moved = exp_so3(step) @ R
-        new = _cost(root, target, moved)
-        better = new <= cost
-        R, cost = np.where(better[:, None, None], moved, R), np.where(better, new, cost)
-        damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
-        if np.abs(step).max() < 1e-9:
-            break
-    return _select_distinct(R[np.argsort(cost)])[:count]
+        by_turn = np.stack([(hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
+        return R.reshape(-1, 9) @ root.T - target, root @ by_turn @ turn
+
+    vector, cost = minimize_from_starts(linearize, np.zeros((len(start), 3)))
+    return _select_distinct((exp_so3(vector) @ start)[np.argsort(cost)])[:count]
 
 
 def _select_distinct(R: FloatArray) -> FloatArray:
@@ -310,10 +306,6 @@ def solve_directions(
     )
     order = np.argsort(error)
     return R[order][:6], a[order][:6]
-
-
-def _cost(root: FloatArray, target: FloatArray, R: FloatArray) -> FloatArray:
-    return np.sum((R.reshape(-1, 9) @ root.T - target) ** 2, axis=-1)
 
 
 def _square_root(H: FloatArray) -> FloatArray:

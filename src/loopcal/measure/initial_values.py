@@ -7,9 +7,7 @@ last descent uses all rows together. Parameters with a prior and fixed ones begi
 values.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,20 +17,8 @@ from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
-from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
+from loopcal.numerics.multistart import STEPS, minimize_from_starts, sum_squares
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-STEPS = 60
-"""Steps of damped Gauss-Newton [1]; candidates in the right basin need fewer than ten."""
-
-FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
-"""Damping of the first step [1], in columns of length one, and that at which a descent ends."""
-
-NEGLIGIBLE_STEP = 1e-6
-"""Step, in standard deviations or as a share of the residuals, that is as good as none."""
-
-SMALLEST = 1e-12
-"""Singular value of columns of length one that counts as zero."""
 
 
 def guess_nuisance_values(
@@ -164,7 +150,7 @@ def _refine_best_candidate(
         cost = sum_squares(whiten(candidates, sets)[0]).reshape(t, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
-    refined, cost = descend(lambda x, which: whiten(x, sets[which]), candidates, steps)
+    refined, cost = minimize_from_starts(lambda x, which: whiten(x, sets[which]), candidates, steps)
     return refined.reshape(t, k, -1)[np.arange(t), np.argmin(cost.reshape(t, k), axis=1)]
 
 
@@ -207,124 +193,4 @@ def _refine_together(
             [rows[..., :-1], np.broadcast_to(prior, (len(x), *prior.shape))], axis=1
         )
 
-    return descend(whiten, values[None])[0][0]
-
-
-# --- descent
-
-
-def descend(
-    whiten: Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]],
-    x: FloatArray,
-    steps: int = STEPS,
-) -> tuple[FloatArray, FloatArray]:
-    """Minimize least squares from several starts at once, by damped Gauss-Newton.
-
-    Parameters
-    ----------
-    whiten : from values (c, u) of starts, whose numbers are (c,), to residuals (c, M) and Jacobians
-        (c, M, u).
-    x : (c, u) starts. steps : at most.
-
-    Returns
-    -------
-    x : (c, u). cost : (c,) sums of squares; infinite where a start cannot be evaluated.
-    """
-    residual, jacobian = whiten(x, np.arange(len(x)))
-    start = _Point(x, residual, jacobian, sum_squares(residual))
-    damping = FixedFactors(np.full(len(x), FIRST_DAMPING))
-    point = minimize(_Candidates(whiten), start, damping, steps).point
-    return point.x, point.cost
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """Values x (c, u), whitened residuals (c, M), Jacobians (c, M, u), sums of squares (c,)."""
-
-    x: FloatArray
-    residual: FloatArray
-    jacobian: FloatArray
-    cost: FloatArray
-
-    def take(self, chosen: IntArray) -> "_Point":
-        """Return some starts."""
-        return _Point(*(array[chosen] for array in vars(self).values()))
-
-    def put(self, chosen: IntArray, other: "_Point") -> "_Point":
-        """Return these points with some taken from others."""
-        arrays = [array.copy() for array in vars(self).values()]
-        for array, new in zip(arrays, vars(other).values(), strict=True):
-            array[chosen] = new
-        return _Point(*arrays)
-
-
-class _Step(NamedTuple):
-    """A damped step (c, u), its length (c,) in whitened residuals, and its damping (c,)."""
-
-    x: FloatArray
-    length: FloatArray
-    damping: FloatArray
-
-    def take(self, chosen: BoolArray) -> "_Step":
-        """Return some steps."""
-        return _Step(*(array[chosen] for array in self))
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
-
-    whiten: Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]]
-
-    def propose(self, point: _Point, damping: FloatArray) -> _Step:
-        """Return the damped steps, from a decomposition of columns of length one."""
-        norm = np.linalg.norm(point.jacobian, axis=1)
-        scale = np.where(norm > 0.0, norm, 1.0)
-        # one triangular factor, so that the decomposition does not grow with the rows
-        columns = point.jacobian / scale[:, None, :]
-        stack = np.nan_to_num(np.concatenate([columns, point.residual[..., None]], axis=-1))
-        R = np.asarray(np.linalg.qr(stack, mode="r"), dtype=float)
-        U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
-        right = np.einsum("cmk,cm->ck", U, R[..., -1])
-        total = s * s + damping[:, None] ** 2 + SMALLEST**2
-        gain = np.where(s > SMALLEST, s / total, 0.0)
-        step = np.where(norm > 0.0, -np.einsum("cku,ck->cu", V, gain * right) / scale, 0.0)
-        return _Step(step, np.linalg.norm(step * scale, axis=1), damping)
-
-    def is_negligible(self, point: _Point, step: _Step) -> BoolArray:
-        """Return no step: all are evaluated."""
-        del point
-        return np.zeros(len(step.x), dtype=bool)
-
-    def finish(self, point: _Point, step: _Step) -> _Point:
-        """Return the points as they are."""
-        del step
-        return point
-
-    def evaluate(self, point: _Point, step: _Step, trials: IntArray) -> _Point:
-        """Return the points to which steps lead."""
-        x = point.x + step.x
-        residual, jacobian = self.whiten(x, trials)
-        return _Point(x, residual, jacobian, sum_squares(residual))
-
-    def judge(self, point: _Point, step: _Step, candidate: _Point) -> tuple[BoolArray, FloatArray]:
-        """Accept every decrease."""
-        del step
-        return candidate.cost < point.cost, np.ones(len(point.cost))
-
-    def ending(
-        self, point: _Point, step: _Step, candidate: _Point, accepted: BoolArray
-    ) -> IntArray:
-        """End where a step moves the residuals by a millionth of their sigma, or of themselves."""
-        del point, accepted
-        is_small = step.length <= NEGLIGIBLE_STEP * (1.0 + np.sqrt(candidate.cost))
-        stuck = np.where(
-            step.damping > LARGEST_DAMPING, DescentStatus.NO_DESCENT, DescentStatus.RUNNING
-        )
-        return np.where(is_small, DescentStatus.CONVERGED, stuck)
-
-
-def sum_squares(e: FloatArray) -> FloatArray:
-    """Return sums of squares (c,) of residuals (c, M); infinite where they are not finite."""
-    total = np.sum(e * e, axis=1)
-    return np.where(np.isfinite(total), total, np.inf)
+    return minimize_from_starts(whiten, values[None])[0][0]

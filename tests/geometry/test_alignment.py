@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quadratic forms of a rotation are minimized over the whole rotation group."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from loopcal.geometry.alignment import minimize_over_rotations
+
+SEEDS = range(5)
+
+
+def cost(R, A, b):
+    return float(np.sum((A @ R.ravel() - b) ** 2))
+
+
+def minimize_from_random_rotations(A, b, rng):
+    """Return the lowest cost that scipy reaches from 30 random rotations."""
+
+    def evaluate(vector):
+        return cost(Rotation.from_rotvec(vector).as_matrix(), A, b)
+
+    starts = Rotation.random(30, random_state=rng).as_rotvec()
+    return min(minimize(evaluate, start, tol=1e-14).fun for start in starts)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_lowest_minimum_is_the_one_that_scipy_reaches_from_many_starts(seed, scale):
+    rng = np.random.default_rng(seed)
+    A, b = scale * rng.normal(size=(12, 9)), scale * rng.normal(size=12)
+    R = minimize_over_rotations(A.T @ A, A.T @ b)[0]
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12)
+    lowest = minimize_from_random_rotations(A / scale, b / scale, rng)
+    assert cost(R, A / scale, b / scale) <= lowest * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rotation_of_points_in_a_plane_is_recovered(seed):
+    rng = np.random.default_rng(seed)
+    truth = Rotation.random(random_state=rng).as_matrix()
+    points = np.column_stack([rng.normal(size=(8, 2)), np.zeros(8)])
+    A = np.concatenate([np.kron(np.eye(3), point) for point in points])
+    b = (points @ truth.T).ravel()
+    R = minimize_over_rotations(A.T @ A, A.T @ b)[0]
+    assert np.abs(R - truth).max() < 1e-9
