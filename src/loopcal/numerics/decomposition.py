@@ -47,6 +47,14 @@ units of the last place.
 """
 
 
+def are_nonzero(singular_values: FloatArray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
+    """Return which singular values (.., k), largest first, count as nonzero: the rank rule.
+
+    They are those above `tolerance` times the largest. Rows are whitened, columns scaled.
+    """
+    return singular_values > tolerance * singular_values[..., :1]
+
+
 def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     """Return derivatives with zeros where they are rounding.
 
@@ -107,7 +115,7 @@ class Decomposition(TrialBatch):
     def used(self) -> BoolArray:
         """(t, p) which singular values count as nonzero."""
         s = self.singular_values
-        return s > self.tolerance * s[:, :1]
+        return are_nonzero(s, self.tolerance)
 
     @property
     def rank(self) -> IntArray:
@@ -258,7 +266,7 @@ class Decomposition(TrialBatch):
         dual = self.dual[trial]
         root = np.where(np.isfinite(variances), 1.0 / np.sqrt(variances), 0.0)
         _, s, vt = np.linalg.svd(root[:, None] * dual)
-        known = s > self.tolerance * s[0]
+        known = are_nonzero(s, self.tolerance)
         variance = np.where(known, 1.0 / np.where(known, s, 1.0) ** 2, np.inf)
         effect = np.linalg.norm(self.singular_values[trial][:, None] * (dual @ vt.T), axis=0)
         return vt.T, variance, effect > self.tolerance * self.singular_values[trial].max()

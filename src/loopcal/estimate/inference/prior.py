@@ -25,7 +25,7 @@ from loopcal.estimate.problem import Problem
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
-from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray, IntArray
 
 PARALLEL = 1e-2
@@ -144,7 +144,7 @@ class WithPrior:
         if not np.isfinite(triangle).all():
             return self.slope
         _, s, vt = np.linalg.svd(triangle)
-        null = vt[s <= RANK_TOLERANCE * s[0]].T
+        null = vt[~are_nonzero(s)].T
         outside = null - self.unknown @ (self.unknown.T @ null)
         _, sine, combine = np.linalg.svd(outside, full_matrices=True)
         sine = np.r_[sine, np.zeros(len(combine) - len(sine))]

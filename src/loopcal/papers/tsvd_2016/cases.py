@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.diagnose import Identifiability, identifiability
 from loopcal.estimate import GCV, MAP, LeastSquares, Ridge, identify_trials
-from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.papers.tsvd_2016.machines import (
     AppendixNoise,
     Study,
@@ -143,7 +143,7 @@ def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
     nominal, first = measured.robot.parameters.nominal[None], np.zeros(1, dtype=np.int64)
     decomposition, _ = linearize(measured, nominal, first)
     s = decomposition.singular_values[0]
-    rank = int((s > RANK_TOLERANCE * s[0]).sum())
+    rank = int(are_nonzero(s).sum())
     lambdas, equal = space_lambdas(s[rank - 1])
     ks = np.arange(p, p // 3, -1)
     by_lambda, by_k = (

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
 from loopcal.numerics.column_elimination import eliminate_from_triangle
-from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
@@ -145,8 +145,8 @@ def find_observable_space(
         done = eliminate_from_triangle(R[:o, :o], R[:o, o:], R[o:, o:], length)
         nuisance, rest = done.directions[done.is_observable].T / length[:, None], done.rest
     _, s, vt = np.linalg.svd(rest)
-    used = s > tolerance * (s[0] if s.size else 0.0)
-    return ObservableSpace(vt[: len(s)][used].T, nuisance, s)
+    observable = vt[: len(s)][are_nonzero(s, tolerance)]
+    return ObservableSpace(observable.T, nuisance, s)
 
 
 def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSpace) -> FloatArray:
@@ -205,7 +205,7 @@ def _prior_rank(prior: PriorInformation, space: ObservableSpace) -> int:
     if not prior.rows.any():
         return 0
     s = np.linalg.svd(space.project(prior.rows), compute_uv=False)
-    return int((s > RANK_TOLERANCE * s[0]).sum())
+    return int(are_nonzero(s).sum())
 
 
 def _pad_factor(R: FloatArray) -> FloatArray:
