@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -208,7 +209,7 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
 
     from loopcal.geometry.rotations import stack_matrix
 
-    def stack(rows: tuple[tuple[ArrayLike, ...], ...]) -> ArrayLike:
+    def stack(rows: tuple[tuple[Any, ...], ...]) -> Any:
         entries = jax.numpy.broadcast_arrays(*(entry for row in rows for entry in row))
         shape = (*entries[0].shape, len(rows), len(rows[0]))
         return jax.numpy.stack(entries, axis=-1).reshape(shape)

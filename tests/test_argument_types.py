@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+# pyright: reportArgumentType=false
+# Wrong types are passed on purpose.
 """Arguments of the wrong type or out of range: every public function says what to pass."""
 
 from typing import Any

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+# pyright: reportArgumentType=false
+# Wrong types are passed on purpose.
 """`calibrate`: verdict, findings, held-out poses, JSON document and refused options."""
 
 import json

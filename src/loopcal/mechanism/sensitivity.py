@@ -311,7 +311,7 @@ def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
     safe = A if good.all() else np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
     if A.shape[-1] == A.shape[-2]:
         try:
-            out = np.linalg.solve(safe, np.eye(A.shape[-1]))
+            out: np.ndarray = np.linalg.solve(safe, np.eye(A.shape[-1]))
         except np.linalg.LinAlgError:
             out = np.linalg.pinv(safe)
     else:

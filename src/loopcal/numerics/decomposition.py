@@ -47,12 +47,12 @@ units of the last place.
 """
 
 
-def are_nonzero(singular_values: FloatArray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
+def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
     """Return which singular values (.., k), largest first, count as nonzero: the rank rule.
 
     They are those above `tolerance` times the largest. Rows are whitened, columns scaled.
     """
-    return singular_values > tolerance * singular_values[..., :1]
+    return np.asarray(singular_values > tolerance * singular_values[..., :1])
 
 
 def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:

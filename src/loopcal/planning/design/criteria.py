@@ -63,7 +63,7 @@ class E:
 Criterion = D | I | A | E
 
 
-def is_full_rank(singular_values: FloatArray) -> bool:
+def is_full_rank(singular_values: np.ndarray) -> bool:
     """Return whether a triangular factor with these descending singular values can be inverted.
 
     The threshold is the rounding of the decomposition: a design that determines a direction barely
