@@ -7,11 +7,13 @@ is a program, not a library, and the types of click differ between the versions 
 """
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).resolve().parents[1]
 COMMAND = ("--verifytypes", "loopcal", "--ignoreexternal", "--outputjson")
 PROGRAM = "loopcal.cli"
 
@@ -41,7 +43,10 @@ def list_incomplete_types(report: dict[str, Any]) -> list[str]:
 def main() -> int:
     """Print the public symbols without a complete type; return 1 if there are any."""
     pyright = Path(sys.executable).with_name("pyright")
-    run = subprocess.run([pyright, *COMMAND], check=False, capture_output=True, text=True)
+    words = [pyright, *COMMAND, "--pythonpath", sys.executable]
+    # `--verifytypes` does not follow the link of an editable installation
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    run = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
     incomplete = list_incomplete_types(json.loads(run.stdout))
     print("\n".join(incomplete) or "Types of all public names are complete.")
     return int(bool(incomplete))
