@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +24,7 @@ HUGE = 1e150
 """Residuals, in units of sigma, whose squares cannot be summed."""
 
 
-ORIGINS = {
+ORIGINS: Mapping[type, str] = {
     Mechanism: "as from load_robot('hexapod-42')",
     Measurements: "as from load_measurements('data.csv', robot)",
     Identification: "as from identify(robot, data)",
