@@ -4,6 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.planning.design import PriorInformation
+
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
@@ -21,6 +23,12 @@ def make_grid(extra: float = 0.0) -> Array:
 def draw_rows(N: int = 12, r: int = 2, nuisance: int = 0, machine: int = 4, seed: int = 0) -> Array:
     """Return rows (N, r, nuisance + machine) of normal numbers."""
     return np.random.default_rng(seed).normal(size=(N, r, nuisance + machine))
+
+
+def make_prior(has_tolerances: bool, nuisance: int, machine: int = 4) -> PriorInformation:
+    """Return the tolerances of the machine parameters as the prior, or no prior."""
+    make = PriorInformation.from_tolerances if has_tolerances else PriorInformation.none
+    return make(machine, nuisance)
 
 
 def compute_covariance(rows: Array, start: Array, nuisance: int) -> Array:

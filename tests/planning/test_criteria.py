@@ -17,7 +17,7 @@ from loopcal.planning.design import (
 )
 from loopcal.planning.design.design_space import require_enough
 from tests.findings.expectations import expect_refusal
-from tests.planning.design_problems import compute_covariance, draw_rows
+from tests.planning.design_problems import compute_covariance, draw_rows, make_prior
 
 CLOSE = 1e-10  # relative: rounding of inverses of well-conditioned 6 x 6 matrices
 
@@ -28,11 +28,7 @@ def test_criteria_equal_those_of_the_covariance_of_machine_parameters(
     nuisance: int, prior: bool
 ) -> None:
     rows = draw_rows(nuisance=nuisance)
-    start = (
-        PriorInformation.from_tolerances(4, nuisance)
-        if prior
-        else PriorInformation.none(4, nuisance)
-    )
+    start = make_prior(prior, nuisance)
     L = np.random.default_rng(1).normal(size=(9, 4))
     space = find_observable_space(rows, start)
     factor = factor_design(rows[:5], start, space)

@@ -20,7 +20,7 @@ from loopcal.planning.design import (
     fedorov_exchange,
 )
 from tests.findings.expectations import expect_refusal
-from tests.planning.design_problems import draw_rows, make_grid, polynomial_rows
+from tests.planning.design_problems import draw_rows, make_grid, make_prior, polynomial_rows
 
 L = np.random.default_rng(1).normal(size=(9, 4))
 
@@ -51,11 +51,7 @@ def test_exchange_finds_the_best_of_all_subsets(
     criterion: Criterion, nuisance: int, prior: bool
 ) -> None:
     rows = draw_rows(nuisance=nuisance)
-    start = (
-        PriorInformation.from_tolerances(4, nuisance)
-        if prior
-        else PriorInformation.none(4, nuisance)
-    )
+    start = make_prior(prior, nuisance)
     found = fedorov_exchange(rows, 5, criterion, start, starts=20)
 
     def value(chosen: tuple[int, ...]) -> float:

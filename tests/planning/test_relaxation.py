@@ -17,7 +17,7 @@ from loopcal.planning.design import (
     relax_design,
 )
 from tests.findings.expectations import expect_refusal
-from tests.planning.design_problems import Array, draw_rows, make_grid, polynomial_rows
+from tests.planning.design_problems import Array, draw_rows, make_grid, make_prior, polynomial_rows
 
 GAP = 1e-7
 MOMENTS = np.linalg.cholesky(
@@ -95,11 +95,7 @@ def test_bound_holds_for_every_subset_and_is_tighter_without_repeats(
     criterion: Criterion, nuisance: int, prior: bool
 ) -> None:
     rows = draw_rows(nuisance=nuisance)
-    start = (
-        PriorInformation.from_tolerances(4, nuisance)
-        if prior
-        else PriorInformation.none(4, nuisance)
-    )
+    start = make_prior(prior, nuisance)
     capped = relax_design(rows, 5, criterion, start, 1e-6)
     free = relax_design(rows, 5, criterion, start, 1e-6, repeats=True)
     best = find_best_value(rows, 5, criterion, start, capped)

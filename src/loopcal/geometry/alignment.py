@@ -12,6 +12,7 @@ import numpy as np
 
 from loopcal.geometry.rigid_transforms import make_pose
 from loopcal.geometry.rotations import exp_so3, hat, left_jacobian_so3, project_to_rotations
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.multistart import minimize_from_starts
 from loopcal.typing import FloatArray, IntArray
 
@@ -317,4 +318,4 @@ def _square_root(H: FloatArray) -> FloatArray:
 def _column_space(C: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the columns of C."""
     U, s, _ = np.linalg.svd(C, full_matrices=False)
-    return U[:, s > ALIGNMENT_TOLERANCE * s[0]]
+    return U[:, are_nonzero(s, ALIGNMENT_TOLERANCE)]

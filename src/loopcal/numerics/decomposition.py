@@ -50,7 +50,8 @@ units of the last place.
 def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
     """Return which singular values (.., k), largest first, count as nonzero: the rank rule.
 
-    They are those above `tolerance` times the largest. Rows are whitened, columns scaled.
+    They are those above `tolerance` times the largest. The default is for whitened rows and scaled
+    columns.
     """
     return np.asarray(singular_values > tolerance * singular_values[..., :1])
 

@@ -24,6 +24,7 @@ from loopcal.mechanism import (
     inverse_trials,
     read_coordinates,
 )
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -252,7 +253,7 @@ def _least_squares_step(rows: FloatArray, residual: FloatArray) -> tuple[FloatAr
     step = np.zeros((k, m))
     if full.any():
         U, s, Vt = np.linalg.svd(rows[full] / length[full, None], full_matrices=False)
-        good = s[:, -1] > FULL_RANK * s[:, 0]
+        good = are_nonzero(s, FULL_RANK).all(axis=1)
         full[full] = good
         along = np.matmul(np.swapaxes(U[good], 1, 2), -residual[full][..., None])
         along = along / s[good][..., None]

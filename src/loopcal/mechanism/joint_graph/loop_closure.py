@@ -14,6 +14,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
 
 CLOSURE_RANK_TOLERANCE = 1e-8
@@ -131,7 +132,7 @@ class JointGraph:
         if not len(rows):
             return np.eye(len(self.tree))
         _, s, V = np.linalg.svd(rows)
-        return V[int((s > CLOSURE_RANK_TOLERANCE * s[0]).sum()) :].T
+        return V[int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum()) :].T
 
     def measure_firmness(self, platform: str) -> float:
         """Return how well the motors hold the passive joints and move the platform.
