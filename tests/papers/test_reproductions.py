@@ -3,6 +3,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from loopcal.errors import DataError, FileError
 from loopcal.papers import PAPERS, Paper, paper
 from loopcal.papers.printed import Comparison, Printed, Table
 from loopcal.papers.reproduction import OWN_CHECK, Figure, Reproduction, Series, Verdict
+from loopcal.papers.wording import Wording
 from loopcal.papers.writing import page, write_folder
 
 MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal": "1", "numpy": "2"}}
@@ -39,7 +41,7 @@ def build_reproduction() -> Reproduction:
         ("", ".1f"),
         shown=2,
     )
-    verdict = Verdict("It holds.", False, "It does not.", OWN_CHECK)
+    verdict = Verdict("It holds.", False, "It does not.", OWN_CHECK, draws=(False, False))
     return Reproduction(
         "small",
         "A title",
@@ -72,12 +74,51 @@ def test_page_shows_published_and_computed_numbers_and_marks_differences() -> No
         "**2.0e+00** | 0 |" in text
     )
     assert (
-        "**Not confirmed:** It holds. (our own check, not a statement of the paper)\n   It does "
-        "not." in text
+        "## Our own checks\n\n1. **Not confirmed:** It holds.\n"
+        "   True in 0 of 2 draws. It does not." in text
     )
     assert "| q | - |" in text
     assert "The first 2 of 3 rows" in text
     assert "(figures/curve.png)" in text
+
+
+def build_wording(**claim: object) -> Wording:
+    text = {"claim": "x is small.", "where": "section 1", "evidence": "x is {x:g}.", **claim}
+    return Wording((), {"small": text}, {}, {})
+
+
+def test_claim_is_undecided_between_its_two_lists_of_comparisons() -> None:
+    words = build_wording(agrees=["x < 1"], disagrees=["x > 2"])
+    verdicts = [words.judge("small", x=x) for x in (0.5, 1.5, 2.5)]
+    assert [v.agrees for v in verdicts] == [True, None, False]
+    assert [v.word for v in verdicts] == ["Agrees", "Undecided", "Does not agree"]
+    two_valued = build_wording(agrees=["x < 1"])
+    assert [two_valued.judge("small", x=x).agrees for x in (0, 2)] == [True, False]
+
+
+def test_claim_whose_draws_differ_is_labelled_so() -> None:
+    words = build_wording(agrees=["x < 1"])
+    mixed = words.judge("small", x=0.5, draws=[{"x": x} for x in (0.5, 3.0, 0.1, 0.2, 0.9)])
+    assert (mixed.agrees, mixed.word) == (None, "Depends on the draw")
+    assert mixed.stability == "True in 4 of 5 draws."
+    same = words.judge("small", x=0.5, draws=[{"x": x} for x in (3.0, 2.0)])
+    assert (same.agrees, same.word, same.why) == (False, "Does not agree", "x is 0.5.")
+    assert words.judge("small", x=0.5).stability == ""
+
+
+def test_statements_of_the_paper_and_own_checks_have_two_lists() -> None:
+    small = build_reproduction()
+    both = replace(
+        small, verdicts=(*small.verdicts, Verdict("It is said.", True, "It is.", "section 1"))
+    )
+    assert {title: len(v) for title, v in both.verdict_groups.items()} == {
+        "Statements of the paper": 1,
+        "Our own checks": 1,
+    }
+    text = page(both, MADE_BY)
+    assert text.index("1. **Agrees:** It is said. (section 1)") < text.index(
+        "2. **Not confirmed:**"
+    )
 
 
 def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> None:

@@ -108,9 +108,13 @@ def _view_reproduction(result: Reproduction) -> list[Block]:
     """Return the summary, the tables and the statements of the paper."""
     page: list[Block] = [f"{result.paper}: {result.title}"]
     page += [_make_table(table) for table in (result.summary(), *result.tables)]
-    for i, verdict in enumerate(result.verdicts, 1):
-        word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
-        page += [f"{i:2}. {word}: {verdict.claim} ({verdict.where})", f"    {verdict.why}"]
+    for title, verdicts in result.verdict_groups.items():
+        page += ["", title]
+        for number, verdict in verdicts:
+            word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
+            place = "" if verdict.is_own_check else f" ({verdict.where})"
+            why = f"{verdict.stability} {verdict.why}".strip()
+            page += [f"{number:2}. {word}: {verdict.claim}{place}", f"    {why}"]
     return page
 
 

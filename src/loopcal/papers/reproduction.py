@@ -19,11 +19,13 @@ class Verdict:
 
     Attributes
     ----------
-    claim : the statement. agrees : whether the computed numbers bear it out; None where they cannot
-        decide, see `why`.
+    claim : the statement. agrees : whether the computed numbers support it; None where they cannot
+        decide, or where the draws of a random study differ.
     why : the evidence in a sentence or two, with the numbers of this run.
     where : place of the claim in the paper; OWN_CHECK for a check of ours.
     name : of the claim in text.yaml.
+    draws : whether each repeated draw of a random study supports the claim (None: cannot decide);
+        empty where nothing was drawn again.
     """
 
     claim: str
@@ -31,15 +33,35 @@ class Verdict:
     why: str
     where: str
     name: str = ""
+    draws: tuple[bool | None, ...] = ()
+
+    @property
+    def is_own_check(self) -> bool:
+        """Whether the claim is a check of ours and not a statement of the paper."""
+        return self.where == OWN_CHECK
+
+    @property
+    def depends_on_draw(self) -> bool:
+        """Whether repeated draws lead to different answers."""
+        return len(set(self.draws)) > 1
 
     @property
     def word(self) -> str:
         """The judgement as a word: a claim of the paper agrees, a check of ours is confirmed."""
+        if self.depends_on_draw:
+            return "Depends on the draw"
         if self.agrees is None:
             return "Undecided"
-        if self.where == OWN_CHECK:
+        if self.is_own_check:
             return "Confirmed" if self.agrees else "Not confirmed"
         return "Agrees" if self.agrees else "Does not agree"
+
+    @property
+    def stability(self) -> str:
+        """How many of the repeated draws support the claim, as a sentence; else ""."""
+        if not self.draws:
+            return ""
+        return f"True in {sum(map(bool, self.draws))} of {len(self.draws)} draws."
 
 
 @dataclass(frozen=True)
@@ -93,7 +115,8 @@ class Reproduction:
     paper, title, source : which one. about : paragraphs on what was done.
     settings : seed and sizes of this run.
     comparisons : published beside computed numbers, one for each table of the paper.
-    tables : further computed numbers. verdicts : the judged claims. figures : as data.
+    tables : further computed numbers. verdicts : the judged claims, those of the paper and our own
+        checks. figures : as data.
     """
 
     paper: str
@@ -105,6 +128,16 @@ class Reproduction:
     tables: tuple[Table, ...]
     verdicts: tuple[Verdict, ...]
     figures: tuple[Figure, ...]
+
+    @property
+    def verdict_groups(self) -> dict[str, tuple[tuple[int, Verdict], ...]]:
+        """Verdicts with their numbers on a page, by title: statements of the paper, own checks."""
+        ordered = sorted(self.verdicts, key=lambda verdict: verdict.is_own_check)
+        groups: dict[str, tuple[tuple[int, Verdict], ...]] = {}
+        for number, verdict in enumerate(ordered, 1):
+            title = "Our own checks" if verdict.is_own_check else "Statements of the paper"
+            groups[title] = (*groups.get(title, ()), (number, verdict))
+        return groups
 
     def summary(self) -> Table:
         """Return how many numbers of each published table agree to one unit of their last digit."""

@@ -6,16 +6,19 @@ which the numbers are shown:
 
     about: paragraphs at the beginning of the page
     claims:
-      NAME: {claim: ..., where: place in the paper, agrees: [...], evidence: sentence}
+      NAME: {claim: ..., where: place in the paper, agrees: [...], disagrees: [...],
+             evidence: sentence}
     tables:
       NAME: {title: ..., columns: [...], formats: [...], note: ...}
     figures:
       NAME: {title: ..., x: label, y: label, caption: ..., log: y}
 
 A claim without `where` is not a statement of the paper but a check of our own. `agrees` lists
-comparisons of the numbers with each other or with limits, such as "ratio < 1.1"; the claim agrees
-where all of them hold. A claim without comparisons is judged by its module. Braces hold numbers in
-the formats of `loopcal.findings.wording`.
+comparisons of the numbers with each other or with limits, such as "ratio < 1.1". The claim agrees
+where all of them hold. Otherwise it does not agree; if it lists comparisons `disagrees`, too, it
+does not agree where all of those hold, and is undecided elsewhere. So every verdict follows from
+numbers. A claim about random numbers is judged in each of several draws; its verdict says in how
+many it holds. Braces hold numbers in the formats of `loopcal.findings.wording`.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +38,8 @@ from loopcal.papers.reproduction import OWN_CHECK, Figure, Series, Verdict
 from loopcal.typing import FloatArray
 
 RELATIONS: Mapping[str, Callable[[Any, Any], Any]] = {
-    "<": operator.lt, "<=": operator.le, "==": operator.eq, ">=": operator.ge, ">": operator.gt
+    "<": operator.lt, "<=": operator.le, "==": operator.eq, "!=": operator.ne, ">=": operator.ge,
+    ">": operator.gt,
 }  # fmt: skip
 
 
@@ -63,7 +67,8 @@ class Wording:
         evidence: str = "",
         /,
         *,
-        agrees: bool | np.bool_ | Literal["by rule"] | None = "by rule",
+        agrees: bool | np.bool_ | None = None,
+        draws: Sequence[Mapping[str, Any]] = (),
         **data: Any,
     ) -> Verdict:
         """Return the verdict on a claim.
@@ -71,18 +76,23 @@ class Wording:
         Parameters
         ----------
         claim : its name. evidence : which of several texts `evidence_NAME` of the claim to use.
-        agrees : whether the numbers support it; None where they cannot decide. By default the
-            comparisons of the claim decide. data : the numbers.
+        agrees : whether the numbers support it, for a claim without comparisons. By default its
+            comparisons decide. draws : the numbers of each repeated draw of a random study, which
+            replace those of `data` in the comparisons. data : the numbers.
         """
         text = self.claims[claim]
-        if agrees == "by rule":
-            agrees = all(compare_numbers(rule, data) for rule in text["agrees"])
+        judged = tuple(judge_numbers(text, {**data, **drawn}) for drawn in draws)
+        if judged:
+            decided = judged[0] if len(set(judged)) == 1 else None
+        else:
+            decided = judge_numbers(text, data) if agrees is None else bool(agrees)
         return Verdict(
             claim=fill_template(text["claim"], **data),
-            agrees=None if agrees is None else bool(agrees),
+            agrees=decided,
             why=fill_template(text[f"evidence_{evidence}" if evidence else "evidence"], **data),
             where=text.get("where", OWN_CHECK),
             name=claim,
+            draws=judged,
         )
 
     def table(
@@ -156,6 +166,20 @@ class Wording:
         lines = levels or {}
         log = text.get("log", "y")
         return Figure(file_name or name, title, x, y, caption, tuple(series), lines, log)
+
+
+def judge_numbers(claim: Mapping[str, Any], data: Mapping[str, Any]) -> bool | None:
+    """Return whether numbers support a claim of text.yaml; None where they cannot decide.
+
+    Examples
+    --------
+    >>> claim = {"agrees": ["lower == all"], "disagrees": ["lower == 0"]}
+    >>> [judge_numbers(claim, {"lower": n, "all": 4}) for n in (4, 0, 1)]
+    [True, False, None]
+    """
+    if all(compare_numbers(rule, data) for rule in claim["agrees"]):
+        return True
+    return False if all(compare_numbers(r, data) for r in claim.get("disagrees", ())) else None
 
 
 def compare_numbers(rule: str, data: Mapping[str, Any]) -> bool:
