@@ -9,7 +9,8 @@ import pytest
 from loopcal.cli import main
 from loopcal.errors import DataError
 from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
+from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.measure import Component, Gaussian, Instrument, Pose, Sensor, simulate
 from loopcal.mechanism import sample_workspace
 from loopcal.workflow import calibrate
 
@@ -170,3 +171,41 @@ def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(folde
     assert code == 0
     assert "note: stated.csv: " in err
     assert "frame.x at 100" in " ".join(err.split())
+
+
+FIRST_CALIBRATIONS = [
+    ("tower1.angle", np.deg2rad(2.0)),
+    ("tower2.stop", 5e-3),
+    ("tower1.stop", -8e-3),
+    ("radius", 5e-3),
+    ("radius", -8e-3),
+]
+
+
+@pytest.mark.parametrize(("parameter", "error"), FIRST_CALIBRATIONS)
+def test_first_calibration_of_a_printer_with_probed_heights_is_not_refused(
+    folder_and_run, parameter, error
+) -> None:
+    """The firmware stops at the bed, so all heights are 0; the geometry given moves the nozzle by up
+    to 8 mm.
+    """
+    folder, run = folder_and_run
+    robot = load_robot("linear-delta")
+    values = robot.values.copy()
+    values[robot.parameters.names.index(parameter)] += error
+    truth = robot.with_values(values)
+    angle = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+    rings = [0.09 * np.column_stack([np.cos(a), np.sin(a)]) for a in (angle, 2.0 * angle + 0.3)]
+    points = np.concatenate([rings[0], 0.5 * rings[1], np.zeros((1, 2))])
+    probe = Instrument((Sensor(Component(("z",)), Gaussian(np.array([2e-5]))),))
+    bed = np.column_stack([points, np.zeros(len(points))])
+    data = simulate(truth, bed, probe, 0, controller=truth)
+    save_measurements(data, folder / "data.csv", robot)
+    text = list_shipped_robots()["linear-delta"].read_text()
+    (folder / "printer.yaml").write_text(f"{text}fixed: [arm*.length]\n")
+    code, out, err = run("calibrate printer.yaml data.csv -o run --json")
+    assert code == 0, err
+    for row in json.loads(out)["fit"]["parameters"]:
+        true = float(values[robot.parameters.names.index(row["name"])])
+        true = true * 1e3 if row["unit"] == "mm" else float(np.rad2deg(true))
+        assert abs(row["estimate"] - true) < 2.0 * row["plus_minus"], row["name"]

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.findings import Quantity, report_finding
 from loopcal.measure.kinds import Kind
@@ -23,6 +24,12 @@ from loopcal.units import DISPLAY_UNITS, find_unit
 STATIC_SIGMAS, MOVING_SIGMAS = 10.0, 100.0
 """Values within the first number of standard deviations count as static; the check refuses them if
 the robot moves the target by more than the second number.
+"""
+
+CONSTANT_SHARE = 0.1
+"""Share of the motion of the robot below which values are constant by design: the poses are chosen
+so that a probe touches a surface, a bar keeps its length, or the platform stays level. A robot far
+from nominal then predicts a small change of a large motion.
 """
 
 
@@ -143,17 +150,22 @@ def check_duplicates(
             )
 
 
-def check_targets_move(measurements: Measurements, T: FloatArray, *, allow: bool = False) -> None:
+def check_targets_move(
+    measurements: Measurements, T: FloatArray, size: float, *, allow: bool = False
+) -> None:
     """Refuse a target whose values stay within the noise, although the robot moves it.
 
     A reflector on the floor, a frozen display or the column of another target give such values. Any
-    fit to them is wrong.
+    fit to them is wrong. Values that are constant by design are accepted: by the geometry given, the
+    poses change them by less than `CONSTANT_SHARE` of what the motion of the platform could.
 
     Parameters
     ----------
     measurements : Measurements
     T : (n, 4, 4)
         T_base_platform of each pose, of the nominal robot.
+    size : float [m]
+        Size of the robot, by which translations and rotations are compared.
     allow : bool
         True accepts them.
 
@@ -170,8 +182,10 @@ def check_targets_move(measurements: Measurements, T: FloatArray, *, allow: bool
             T[None, rows.rows], np.zeros((1, len(rows), len(kind.noise_columns)))
         )[0]
         expected = np.ptp(predicted[static.present][:, static.columns], axis=0)
-        if np.any(expected > MOVING_SIGMAS * static.noise):
-            worst = int(np.argmax(expected / static.noise))
+        possible = _find_possible_change(static, T[rows.rows], size)
+        moves = (expected > MOVING_SIGMAS * static.noise) & (expected > CONSTANT_SHARE * possible)
+        if np.any(moves):
+            worst = int(np.argmax(np.where(moves, expected / static.noise, 0.0)))
             shown = DISPLAY_UNITS[kind.columns[static.columns[worst]].dimension]
             moved, planned = (
                 Quantity(float(range_[worst]) / shown.factor_to_si, shown.symbol)
@@ -206,6 +220,28 @@ class _StaticTarget(NamedTuple):
     columns: list[int]
     range: FloatArray
     noise: FloatArray
+
+
+def _find_possible_change(static: _StaticTarget, T: FloatArray, size: float) -> FloatArray:
+    """Return how much columns (k,) [SI] would change by the motion of the platform between poses
+    T (r, 4, 4) if it had the direction of the largest change.
+
+    With the derivative (a, b) of a column by a rotation and a translation, and the largest rotation
+    phi and translation d between the first and another pose, the change is |a| max(phi, d / size) +
+    |b| d. Poses that keep a platform level show no rotation, so d / size is the least. The change is
+    0 for the forms of an orientation whose columns are no residuals: these cannot be constant.
+    """
+    T, kind = T[static.present], static.rows.kind
+    if len(kind.columns) != len(kind.noise_columns):
+        return np.zeros(len(static.columns))
+    J = kind.evaluate(T[None], static.rows.measured[None, static.present]).jacobian[0]
+    moved = geometry.invert_pose(T[0]) @ T
+    d = float(np.linalg.norm(moved[:, :3, 3], axis=-1).max())
+    angle = float(np.linalg.norm(geometry.log_so3(moved[:, :3, :3]), axis=-1).max())
+    by_rotation, by_translation = np.median(
+        np.linalg.norm(J[:, static.columns].reshape(len(T), -1, 2, 3), axis=-1), axis=0
+    ).T
+    return by_rotation * max(angle, d / size) + by_translation * d
 
 
 def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:

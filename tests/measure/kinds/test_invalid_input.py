@@ -11,6 +11,7 @@ from loopcal.measure import (
     KINDS,
     Autocollimation,
     Bearing,
+    Component,
     Direction,
     Distance,
     Gaussian,
@@ -142,6 +143,9 @@ def test_names_of_targets_may_contain_any_text(name):
     assert kind.nuisance_parameters[0].name == f"{name}.x"
 
 
+SIZE = 0.3  # [m]
+
+
 def test_target_that_never_moves_is_refused_by_name():
     T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     kind = Position(targets=("a", "b"), places=0.1 * np.eye(3)[:2])
@@ -153,18 +157,19 @@ def test_target_that_never_moves_is_refused_by_name():
             "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
         ),
         T,
+        SIZE,
     )
     measured[:, 3:] = measured[0, 3:] + noise[0, :, 3:]
     data = Measurements(
         "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
     )
     with pytest.raises(DataError) as error:
-        check_targets_move(data, T)
+        check_targets_move(data, T, SIZE)
     assert error.value.code == "conventions.target-never-moves"
     found = error.value.args[0].data
     assert (found["target"], found["kind"]) == ("b", "position")
     assert found["moved"].value < 0.2 < found["expected"].value  # [mm]
-    check_targets_move(data, T, allow=True)
+    check_targets_move(data, T, SIZE, allow=True)
 
 
 FOLLOWING = [
@@ -190,11 +195,48 @@ def test_constant_values_are_refused_for_every_kind_that_follows_the_robot(kind)
     good, bad = (
         Observations.from_sigma(kind, np.arange(8), values, 1e-6) for values in (true, still)
     )
-    check_targets_move(Measurements("toy", readings, (good,)), T)
+    check_targets_move(Measurements("toy", readings, (good,)), T, SIZE)
     with pytest.raises(DataError) as error:
-        check_targets_move(Measurements("toy", readings, (bad,)), T)
+        check_targets_move(Measurements("toy", readings, (bad,)), T, SIZE)
     assert error.value.code == "conventions.target-never-moves"
     assert error.value.args[0].data["kind"] == kind.name
+
+
+BALL_BAR = Distance(targets=("ball",), places=np.zeros((1, 3)), anchor=np.array([0.3, 0.0, 0.0]))
+CONSTANT_BY_DESIGN = {
+    "probed height": (Component(("z",)), [0.06, 0.06, 0.0]),
+    "ball bar": (BALL_BAR, [0.06, 0.06, 0.0]),
+    "level": (Inclination(), [0.06, 0.06, 0.06]),
+}
+
+
+@pytest.mark.parametrize("case", CONSTANT_BY_DESIGN)
+def test_values_that_are_constant_by_design_are_accepted_and_frozen_ones_are_not(case):
+    """The true machine keeps the value at these poses; by the nominal one it changes a little, since
+    the machine is inaccurate.
+    """
+    kind, half = CONSTANT_BY_DESIGN[case]
+    kind = kind.with_tool(np.eye(4))
+    rng, n = np.random.default_rng(0), 12
+    coordinates = np.zeros((n, 6))
+    coordinates[:, :3] = rng.uniform(-1.0, 1.0, (n, 3)) * half
+    if case == "ball bar":  # poses on a sphere about the anchor
+        away = rng.uniform(-1.0, 1.0, (n, 3)) - [2.0, 0.0, 0.0]
+        away *= 0.2 / np.linalg.norm(away, axis=1)[:, None]
+        coordinates[:, :3] = BALL_BAR.anchor + away
+    true = zoo.make_poses(coordinates)
+    values = kind.measure(true[None], np.zeros((1, n, len(kind.noise_columns))))[0]
+    assert np.ptp(values) < 1e-9
+    rows = Observations.from_sigma(kind, np.arange(n), values, 1e-6)
+    data = Measurements("toy", np.arange(float(n))[:, None], (rows,))
+    error = np.zeros((n, 6))
+    error[:, 3:] = 0.02 * coordinates[:, :3]  # [rad]: more than 1000 times the noise
+    error[:, 2] = 0.03 * coordinates[:, 0]
+    check_targets_move(data, zoo.make_poses(coordinates + error), SIZE)
+    random = zoo.make_poses(rng.uniform(-0.1, 0.1, (n, 6)))
+    with pytest.raises(DataError) as refused:
+        check_targets_move(data, random, SIZE)
+    assert refused.value.code == "conventions.target-never-moves"
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
@@ -234,7 +276,7 @@ def test_constant_values_are_accepted_for_surfaces_and_joints(kind):
     T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
     data = Measurements("toy", np.arange(8.0)[:, None], (rows,))
-    assert check_targets_move(data, T) is None
+    assert check_targets_move(data, T, SIZE) is None
 
 
 def test_sensor_rows_of_missing_poses_are_refused():

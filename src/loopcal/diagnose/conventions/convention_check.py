@@ -158,7 +158,8 @@ def _check_conventions(
     if not allow_still and has_static_targets(data):
         solution = forward(robot, data.readings)
         if solution.converged.any():
-            check_targets_move(data.take(solution.converged), solution.T[solution.converged])
+            T = solution.T[solution.converged]
+            check_targets_move(data.take(solution.converged), T, robot.size)
     if allow_implausible:
         return ConventionCheck(float("nan"))
     check = compare_conventions(robot, data)
