@@ -315,6 +315,50 @@ def test_misfit_of_all_rows_is_reported_although_no_outlier_is_named():
     assert [f.code for f in result.summary] == ["outliers.none-but-misfit"]
 
 
+def test_one_gross_row_does_not_make_the_right_poses_outliers():
+    """A row that is half a machine off pulls the geometry so far that half the poses misfit."""
+    robot, data = measure_five_bar()
+    wrong = move_row(data, 6, 0.3)
+    fit = identify(robot, wrong)
+    assert fit.converged
+    assert fit.residual_test.failed
+    assert find_outliers(fit, wrong).names == (data.labels[6],)
+
+
+@pytest.mark.parametrize("outlier", [None, 6])
+def test_a_sigma_that_is_far_too_small_makes_no_outliers(outlier):
+    robot, data = measure_five_bar()
+    wrong = data if outlier is None else move_row(data, outlier, 5e-4)
+    rows = wrong.observations[0]
+    wrong = replace(wrong, observations=(replace(rows, covariance=rows.covariance * 1e-6),))
+    result = find_outliers(identify(robot, wrong), wrong)
+    codes = [finding.code for finding in result.summary]
+    if outlier is None:
+        assert result.names == ()
+        assert codes == ["outliers.none-but-misfit"]
+    else:
+        assert result.names == (data.labels[outlier],)
+        assert codes == ["outliers.larger-noise", "outliers.some"]
+        assert result.summary[0].data["times"] == pytest.approx(1e3, rel=0.3)
+
+
+def measure_five_bar():
+    """Return the shipped five-bar and what a camera measures of a machine with errors."""
+    robot = load_robot("five-bar")
+    truth = robot.with_values(sample_truth(robot, 1, seed=2)[0])
+    camera = Instrument((Sensor(Component(components=("x", "y")), noise(20 * UM, 20 * UM)),))
+    poses = sample_workspace(robot, 30, seed=3).coordinates
+    return robot, simulate(truth, poses, camera, seed=4, controller=robot)
+
+
+def move_row(data, row, amount):
+    """Return the data with the second value of one row changed [m]."""
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    measured[row, 1] += amount
+    return replace(data, observations=(replace(rows, measured=measured),))
+
+
 def test_outlier_search_reports_progress():
     robot, data = probe_delta(12, {4: 1e-3})
     reports: list[tuple[int, int, str]] = []
@@ -344,6 +388,7 @@ def test_cyclic_outlier_search_is_not_converged_and_lists_its_suspects():
     assert np.flatnonzero(group).tolist() == [0, 1]
     fit = identify(*probe_delta(12, {}))
     counts = {"outliers": 0, "ambiguous": 2, "blocks": 6}
-    (finding,) = _summarize(fit, counts, 0.05, is_converged=False, single_poses=True)
+    shared = {"blocks": 6, "single_poses": True}
+    (finding,) = _summarize(fit, counts, 0.05, shared, is_converged=False)
     assert finding.code == "outliers.search-not-converged"
     assert (finding.data["count"], finding.data["blocks"]) == (2, 6)

@@ -84,6 +84,10 @@ INVALID_ASSEMBLIES = {
         lambda: replace(PRS, freedoms=("x", "w")),
         r"'w' is not a freedom of a platform; allowed are rx, ry",
     ),
+    "two rotations": (
+        lambda: replace(PRS, freedoms=("rx", "ry", "z")),
+        r"3-PRS has the freedoms rx and ry, which define no pose: .* add a limb with the joint",
+    ),
     "an unknown ending": (
         lambda: change_limb(PRS, 0, ending="magnet"),
         r"limb 'limb1' ends in 'magnet'; allowed endings are rigid, ball, distance",

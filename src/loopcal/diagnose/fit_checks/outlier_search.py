@@ -10,8 +10,8 @@ as well: with j excluded instead of i, i must still be a suspect.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_
 
 MOST_ROUNDS = 20
 """Largest number of searches with other suspects."""
+
+MOST_EXCLUDED = 0.5
+"""Largest share of excluded blocks; beyond it nothing can be said of the others."""
 
 MOST_COMPARED = 10
 """Suspects, farthest first, that are compared with others which would do as well; more suspects are
@@ -50,6 +53,11 @@ class PartialFit:
     directions: int
 
     @property
+    def tested(self) -> int:
+        """Number of blocks that have a degree of freedom."""
+        return int((self.influence.degrees > 0).sum())
+
+    @property
     def ratio(self) -> FloatArray:
         """(u,) distance per degree of freedom in units of the noise; zero without a test."""
         degrees = self.influence.degrees
@@ -68,8 +76,63 @@ class PartialFit:
         return self.directions >= whole.directions and bool(np.isfinite(self.scale))
 
 
-Refit = Callable[[BoolArray], PartialFit]
-"""From the excluded blocks (u,) to the linear fit without them."""
+class Refit(Protocol):
+    """From the excluded blocks (u,) to the linear fit without them."""
+
+    def __call__(self, excluded: BoolArray) -> PartialFit:
+        """Fit without these blocks."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSearch:
+    """A search for blocks that do not fit.
+
+    Attributes
+    ----------
+    refit : see `Refit`. whole : the fit to all blocks. limit : p-value below which a block is a
+        suspect. fits : the fit without the suspects, or all fits of a cycle.
+    """
+
+    refit: Refit
+    whole: PartialFit
+    limit: float
+    fits: tuple[PartialFit, ...]
+
+    @property
+    def end(self) -> PartialFit:
+        """The last fit."""
+        return self.fits[-1]
+
+    @property
+    def is_converged(self) -> bool:
+        """Whether the same blocks were suspected twice."""
+        return len(self.fits) == 1
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether as many blocks are excluded as may be; then it is no matter of single blocks."""
+        most = int(MOST_EXCLUDED * self.whole.tested)
+        return any(int(fit.excluded.sum()) >= max(most, 1) for fit in self.fits)
+
+
+def search_blocks(
+    refit: Refit, low_weight: BoolArray, level: float, progress: Progress = report_no_progress
+) -> BlockSearch:
+    """Search the blocks that the others do not explain.
+
+    Parameters
+    ----------
+    low_weight : (u,) blocks with a small weight in a robust fit; the search begins without them.
+    level : probability of any suspect where all blocks are right.
+    """
+    whole = first = refit(np.zeros_like(low_weight))
+    if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
+        first = without
+    limit = -float(np.expm1(np.log1p(-level) / max(whole.tested, 1)))
+    most = int(MOST_EXCLUDED * whole.tested)
+    fits = search_suspects(refit, whole, first, limit, most, progress)
+    return BlockSearch(refit, whole, limit, fits)
 
 
 def fit_without(
@@ -79,13 +142,15 @@ def fit_without(
     excluded: BoolArray,
     deviation: FloatArray,
     start: Start,
+    noise: str,
 ) -> PartialFit:
     """Fit linearly without the excluded blocks (u,), and compute the influence of every block.
 
     Parameters
     ----------
-    fit : its method, rank tolerance and noise are used. problem : of its data, unweighted.
-    member : (n,) block of each pose. deviation, start : (1, p) of the fit, and its warm start.
+    fit : its method and rank tolerance are used. problem : of its data, unweighted.
+    member : (n,) block of each pose. deviation, start : (1, p) to linearize at, and a warm start.
+    noise : "given", or "estimated" from the fitted blocks.
     """
     weight = (~excluded).astype(np.float64)
     kept = problem.weighted(weight[member]).linearize(deviation, start)
@@ -97,7 +162,7 @@ def fit_without(
     solved = d.deviation(d.solution(penalty))
     influence = compute_influence(problem, kept, member, d, penalty, weight, solved)
     inside, scale = (influence.degrees > 0) & ~excluded, 1.0
-    if fit.residual_test.noise == "estimated":
+    if noise == "estimated":
         distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
         scale = estimate_scale_of(distance, degrees.astype(np.float64)) if inside.any() else np.nan
     return PartialFit(excluded, influence, scale, int(np.isfinite(penalty).sum()))
@@ -138,18 +203,13 @@ def search_suspects(
     return tuple(fits)
 
 
-def find_rivals(
-    refit: Refit,
-    end: PartialFit,
-    whole: PartialFit,
-    limit: float,
-    progress: Progress = report_no_progress,
-) -> list[BoolArray]:
+def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) -> list[BoolArray]:
     """Return groups (u,) of blocks of which excluding one does as well as excluding another.
 
     With i back in the fit, excluding block j lowers chi-square by d_j^2, and excluding i after that
     by at least d_i^2 - d_j^2; so only a j whose d_j^2 comes near d_i^2 can replace i.
     """
+    refit, whole, end, limit = search.refit, search.whole, search.end, search.limit
     groups: list[BoolArray] = []
     suspects = np.flatnonzero(end.excluded)
     suspects = suspects[np.argsort(-end.ratio[suspects], kind="stable")][:MOST_COMPARED]

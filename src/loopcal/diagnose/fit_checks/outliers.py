@@ -7,33 +7,39 @@ distance is below 1 - (1 - level)^(1/u), u blocks tested (Sidak), so that data w
 raise no alarm in 95 % of cases. Several wrong blocks hide each other: see `outlier_search`. With
 one degree of freedom every block explains the misfit of all, and none is named. Nothing is removed
 from the data: the result names the blocks for whoever decides.
+
+A fit that contradicts the stated noise is no good reference: one wrong row of a meter pulls the
+geometry so far that right poses seem wrong. Blocks are then compared at a robust fit (Tukey). Where
+even so as many blocks as may be excluded exceed the stated noise, it is not a matter of single
+poses: the noise is then the one that the residuals show, and the result says by how much it is
+larger.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from loopcal.diagnose.fit_checks.influence import Influence
 from loopcal.diagnose.fit_checks.outlier_search import (
-    PartialFit,
     find_rivals,
     fit_without,
     list_suspected_in_turn,
-    search_suspects,
+    search_blocks,
 )
+from loopcal.errors import LoopcalError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import identify
+from loopcal.estimate.methods.losses import Tukey
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.typing import BoolArray, Progress, report_no_progress
-
-MOST_EXCLUDED = 0.5
-"""Largest share of excluded blocks; beyond it nothing can be said of the others."""
+from loopcal.typing import Progress, report_no_progress
 
 
 @dataclass(frozen=True)
@@ -161,28 +167,26 @@ def find_outliers(
     numbers, member = np.unique(linked_blocks(data), return_inverse=True)
     names = np.array(data.labels)
     labels = tuple(tuple(names[member == i].tolist()) for i in range(len(numbers)))
-    z = fit.free_parameters.deviation(fit.robot.values[None])
+    reference = _refit_robustly(fit, data) if fit.residual_test.failed else fit
+    z = fit.free_parameters.deviation(reference.robot.values[None])
     start = problem.linearize(z, problem.start(z)).next_start
-
-    def refit(excluded: BoolArray) -> PartialFit:
-        return fit_without(fit, problem, member, excluded, z, start)
-
-    whole = first = refit(np.zeros(len(numbers), dtype=bool))
-    tested = int((whole.influence.degrees > 0).sum())
-    limit = -np.expm1(np.log1p(-level) / max(tested, 1))
     low_weight = np.zeros(len(numbers), dtype=bool)
-    low_weight[member] = fit.pose_weights < 0.5
-    if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
-        first = without
-    fits = search_suspects(refit, whole, first, limit, int(MOST_EXCLUDED * tested), progress)
-    end, is_converged = fits[-1], len(fits) == 1
-    if is_converged:
-        groups = find_rivals(refit, end, whole, limit, progress)
+    low_weight[member] = reference.pose_weights < 0.5
+
+    refit = partial(fit_without, fit, problem, member, deviation=z, start=start)
+    noise = fit.residual_test.noise
+    search = search_blocks(partial(refit, noise=noise), low_weight, level, progress)
+    if fit.residual_test.failed and search.is_exhausted:
+        noise = "estimated"
+        search = search_blocks(partial(refit, noise=noise), low_weight, level, progress)
+    if search.is_converged:
+        groups = find_rivals(search, progress)
     else:
-        groups = list_suspected_in_turn(fits)
+        groups = list_suspected_in_turn(search.fits)
+    fits, end, tested = search.fits, search.end, search.whole.tested
     always = np.all([partial.excluded for partial in fits], axis=0)
     ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
-    p_value, ratio, influence = end.p_value(), np.sqrt(whole.ratio), end.influence
+    p_value, ratio, influence = end.p_value(), np.sqrt(search.whole.ratio), end.influence
     outliers = tuple(
         Outlier(
             labels[i],
@@ -199,19 +203,41 @@ def find_outliers(
     )
     counts = {"outliers": len(outliers), "ambiguous": int(ambiguous.sum()), "blocks": tested}
     single = all(len(poses) == 1 for poses in labels)
-    summary = _summarize(fit, counts, level, is_converged=is_converged, single_poses=single)
+    shared = {"blocks": tested, "single_poses": single}
+    summary = _summarize(fit, counts, level, shared, is_converged=search.is_converged)
+    if noise != fit.residual_test.noise and outliers:
+        times = report_finding("outliers.larger-noise", times=end.scale, **shared)
+        summary = (times, *summary)
     return OutlierCheck(
-        outliers, conflicts, is_converged, level, tested, labels, influence, end.scale, summary
+        outliers,
+        conflicts,
+        search.is_converged,
+        level,
+        tested,
+        labels,
+        influence,
+        end.scale,
+        summary,
     )
+
+
+def _refit_robustly(fit: Identification, data: Measurements) -> Identification:
+    """Return a robust fit of the same data; the fit itself where it does not converge."""
+    options = replace(fit.options, loss=Tukey(), noise="estimated")
+    try:
+        robust = identify(fit.initial, data, options=options)
+    except LoopcalError:
+        return fit
+    return robust if robust.converged else fit
 
 
 def _summarize(
     fit: Identification,
     counts: dict[str, int],
     level: float,
+    shared: dict[str, Any],
     *,
     is_converged: bool,
-    single_poses: bool,
 ) -> tuple[Finding, ...]:
     """Return the findings on all blocks together."""
     blocks, ambiguous = counts["blocks"], counts["ambiguous"]
@@ -221,7 +247,6 @@ def _summarize(
         return (report_finding("outliers.single-block"),)
     if fit.residual_test.noise == "estimated" and round(fit.residual_test.dof) <= 1:
         return (report_finding("outliers.unknown-noise"),)
-    shared = {"blocks": blocks, "single_poses": single_poses}
     findings = []
     if count := counts["outliers"]:
         findings.append(report_finding("outliers.some", count=count, level=level, **shared))
