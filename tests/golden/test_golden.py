@@ -17,7 +17,12 @@ PER_LEG = (
     "leg by leg now solves with the pose's sensitivities instead of the engine's closure rows: the "
     "same numbers, rounded elsewhere, and magnified by condition numbers of 5000 per leg"
 )
+ROBUST_REFERENCE = (
+    "a fit that contradicts its noise is no longer the point at which outliers are judged: it is "
+    "a robust fit of the same data; the outliers are the same"
+)
 EXCEPTIONS: dict[str, tuple[float, str]] = {
+    "outliers/least-squares": (1e6, ROBUST_REFERENCE),  # shares of 5e-4 of the distances
     "papers/hexapod-42/exact": (1e3, PER_LEG),  # shares of 5e-10 of errors of 0.05 mm
     "papers/hexapod-42/presumed-noise": (1e3, PER_LEG),
     "papers/hexapod-42/stated-noise": (1e3, PER_LEG),
