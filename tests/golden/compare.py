@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,11 @@ def plain(value: Any) -> Any:
     return value
 
 
-def differences(golden: Flat, found: Flat, factor: float = 1.0) -> Iterator[str]:
-    """Yield a sentence for every value that is not what it was; tolerances are multiplied by
-    `factor`.
+def differences(
+    golden: Flat, found: Flat, factor: float = 1.0, pattern: str = "*"
+) -> Iterator[str]:
+    """Yield a sentence for every value that is not what it was; tolerances of paths that match
+    `pattern` are multiplied by `factor`.
     """
     for path in sorted(golden.keys() ^ found.keys()):
         yield f"{path}: {'is missing' if path in golden else 'is new'}"
@@ -72,7 +75,9 @@ def differences(golden: Flat, found: Flat, factor: float = 1.0) -> Iterator[str]
         was, now = np.array(a, dtype=float), np.array(b, dtype=float)
         if was.shape != now.shape:
             yield f"{path}: shape {now.shape} was {was.shape}"
-        elif (off := distance(path, was, now, golden)) > factor:
+            continue
+        allowed = factor if fnmatchcase(path, pattern) else 1.0
+        if (off := distance(path, was, now, golden)) > allowed:
             yield f"{path}: differs by {off:.3g} times its tolerance"
 
 
