@@ -12,6 +12,8 @@ from loopcal.diagnose.cross_validation import cross_validate as cross_validate
 from loopcal.diagnose.cross_validation import score_leave_one_out as score_leave_one_out
 from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
 from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
+from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck as ClusterCheck
+from loopcal.diagnose.fit_checks.cluster_covariance import check_clusters as check_clusters
 from loopcal.diagnose.fit_checks.correlations import (
     find_correlated_groups as find_correlated_groups,
 )

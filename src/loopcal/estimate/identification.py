@@ -21,8 +21,8 @@ from loopcal.estimate.fit_input import (
 )
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import describe_null_space
-from loopcal.estimate.inference.posterior import compute_posterior
-from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
+from loopcal.estimate.inference.posterior import compute_posterior, scale_variances
+from loopcal.estimate.inference.residual_test import run_residual_test
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
@@ -241,7 +241,8 @@ def _assemble(
         fit.decomposition, fit.penalty, options.noise, options.loss is not None, converged
     )
     solution = _solve_unweighted(problem, weighted, fit)
-    conflict, d, penalty, variance = _scale_noise(free, fit, test, options.method)
+    conflict = _test_prior(free, fit, _method(options))
+    d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
     nuisance = _estimate_nuisance(weighted, robot, fit, d, penalty, variance)
@@ -297,23 +298,12 @@ def _method(options: FitOptions) -> Method:
     return options.method
 
 
-def _scale_noise(
-    free: FreeParameters, fit: Descent, test: ResidualTest, method: Method | None
-) -> tuple[PriorConflict | None, Decomposition, FloatArray, float]:
-    """Return the test of the prior, and decomposition, penalty and noise variance for variances.
-
-    With an estimated noise the penalty of MAP contains its variance. Decomposition and penalty are
-    divided by it, so that the variance of the rows is 1 again.
-    """
-    d, penalty = fit.decomposition, fit.penalty
-    variance = test.sigma_scale**2 if test.intervals else np.nan
+def _test_prior(free: FreeParameters, fit: Descent, method: Method) -> PriorConflict | None:
+    """Return the test of the prior, where the method uses one."""
     if not isinstance(method, MAP):
-        return None, d, penalty, variance
-    sigma = float(method.sigma(d)[0])
-    conflict = assess_prior_conflict(free, d, penalty, sigma, fit.deviation[0])
-    if test.intervals and test.noise == "estimated":
-        return conflict, d.divided(np.full(1, test.sigma_scale)), penalty / variance, 1.0
-    return conflict, d, penalty, variance
+        return None
+    sigma = float(method.sigma(fit.decomposition)[0])
+    return assess_prior_conflict(free, fit.decomposition, fit.penalty, sigma, fit.deviation[0])
 
 
 def _estimate_nuisance(

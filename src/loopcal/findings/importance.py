@@ -43,6 +43,7 @@ IMPORTANCE = (
     "model.nothing-gained",
     "residuals.lack-of-fit",
     "residuals.repeatability-larger",
+    "residuals.common-errors",
     "noise.no-degrees-of-freedom",
     "noise.consistent",
     "noise.estimated",
@@ -55,6 +56,7 @@ IMPORTANCE = (
     "residuals.start-not-calibrated",
     "residuals.start-within-noise",
     "residuals.start-is-best",
+    "residuals.independent-errors",
 )
 """Codes of findings, most important first. Codes that are absent here come after these."""
 

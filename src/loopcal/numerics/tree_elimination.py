@@ -190,7 +190,7 @@ def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
             rest = engine.fold(rest, rows)
         else:
             places = np.repeat(structure.parent_place, left.shape[2])
-            arrays[structure.parent] = _fold(arrays[structure.parent], rows, places)
+            arrays[structure.parent] = fold_at(arrays[structure.parent], rows, places)
     nodes = tuple(reversed(solutions))
     values = _back_substitute(factors, nodes)
     is_unobservable, values = _remove_unobservable(tree, nodes, length, values)
@@ -290,7 +290,7 @@ def _carry_inwards(
     return carried, clusters
 
 
-def _fold(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
+def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
     """Return factors (a, n, h, w) with rows (a, k, w) folded in at places (k,)."""
     used = factor.shape[2]
     out = _with_height(factor, max(used, _folded_height(factor, used, places)))

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Examine a fit in one call: outliers, lack of fit, correlated parameters and expected gain."""
+"""Examine a fit in one call: outliers, lack of fit, common errors, correlations, expected gain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck, check_clusters
 from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_correlated_groups
 from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimate_calibration_gain
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck, find_outliers
@@ -23,17 +24,20 @@ class FitExamination:
     Attributes
     ----------
     outliers : poses that do not fit the others. lack_of_fit : the test against repeated poses.
+    clusters : the uncertainty that allows for common errors of a day, session or pose.
     correlated : groups of strongly correlated parameters. gain : expected errors before and after.
     """
 
     outliers: OutlierCheck
     lack_of_fit: LackOfFit
+    clusters: ClusterCheck
     correlated: tuple[CorrelatedGroup, ...]
     gain: CalibrationGain
 
     JSON_FIELDS = {  # noqa: RUF012
         "outliers": "outliers",
         "lack_of_fit": "lack_of_fit",
+        "clusters": "clusters",
         "correlated": "correlated",
         "worth": "gain",
         "findings": "findings",
@@ -51,6 +55,7 @@ class FitExamination:
             findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
         if self.lack_of_fit.groups:
             findings += self.lack_of_fit.findings
+        findings.append(self.clusters.finding)
         return (*findings, *(group.finding for group in self.correlated))
 
 
@@ -68,6 +73,7 @@ def examine_fit(
     return FitExamination(
         find_outliers(fit, data, progress=progress),
         check_lack_of_fit(fit, data),
+        check_clusters(fit, data),
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data),
     )

@@ -10,10 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.inference.residual_test import ResidualTest
+from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.findings import report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
@@ -94,6 +97,29 @@ def compute_posterior(
         variance=variance,
         determined=determined,
     )
+
+
+class ScaledNoise(NamedTuple):
+    """Decomposition, penalty and noise variance from which the variances of a fit are read."""
+
+    decomposition: Decomposition
+    penalty: FloatArray
+    noise: float
+
+
+def scale_variances(
+    decomposition: Decomposition, penalty: FloatArray, test: ResidualTest, method: Method
+) -> ScaledNoise:
+    """Return what the variances of a fit are read from, the noise scaled as the test says.
+
+    With an estimated noise the penalty of MAP contains its variance. Decomposition and penalty are
+    divided by it, so that the variance of the rows is 1 again. The noise is NaN without intervals.
+    """
+    noise = test.sigma_scale**2 if test.intervals else np.nan
+    if isinstance(method, MAP) and test.intervals and test.noise == "estimated":
+        divided = decomposition.divided(np.full(len(penalty), test.sigma_scale))
+        return ScaledNoise(divided, penalty / noise, 1.0)
+    return ScaledNoise(decomposition, penalty, noise)
 
 
 def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the covariance of a fit with one that allows common errors within a day, session or pose.
+
+The rows of a cluster g, whitened, nuisance parameters and poses eliminated, are A_g with residuals
+r_g and leverage H_gg. With the bread B = (A'A + P)^-1 (P the penalty) and the covariance C of the
+fit, whose rows have variance sigma^2, the cluster-robust covariance is
+
+    C_robust = C + B sum_g (u_g u_g' - sigma^2 A_g' A_g) B,     u_g = A_g' (I - H_gg)^(-1/2) r_g
+
+The factor (I - H_gg)^(-1/2) is the small-sample correction CR2 of Bell and McCaffrey (2002): for
+independent errors the expectation of C_robust is exactly C, however few clusters there are. Its
+scatter is that of a chi-square whose degrees of freedom have the moments of the quadratic form
+(Satterthwaite; Pustejovsky and Tipton, 2018). B is never formed: all is computed in the directions
+of the decomposition. See docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loopcal.diagnose.fit_checks.independent_units import (
+    FEWEST_CLUSTERS,
+    Clusters,
+    divide_into_clusters,
+)
+from loopcal.diagnose.fit_checks.influence import TESTABLE
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.inference.posterior import scale_variances
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.mechanism import Status, differentiate_pose, forward_trials
+from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.numerics.decomposition import decompose
+from loopcal.numerics.tree_elimination import fold_at
+from loopcal.typing import FloatArray
+
+LIMIT = 1.5
+"""Ratio of standard uncertainties above which the stated ones are too small."""
+
+SIGNIFICANCE = 0.005
+"""Probability, for independent errors, of a ratio as large as that of position or orientation,
+below which the ratio is reported: 1 % of data sets for the two together.
+"""
+
+JUDGED = 0.5
+"""Share of the variance of poses that residuals must be able to judge. The rest depends on
+directions that one cluster alone determines.
+"""
+
+COMMON = 1e-9
+"""Share of its own size below which a variance of poses is zero."""
+
+
+class Ratio(NamedTuple):
+    """Cluster-robust standard uncertainty of poses over the stated one.
+
+    Attributes
+    ----------
+    ratio : of the root mean square over the measured poses; NaN without uncertainty.
+    degrees : degrees of freedom of its square for independent errors. share : of the variance that
+        residuals can judge. p_value : probability of a larger ratio for independent errors.
+    """
+
+    ratio: float
+    degrees: float
+    share: float
+    p_value: float
+
+
+NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterCheck:
+    """The cluster-robust covariance of a fit against the stated one.
+
+    Attributes
+    ----------
+    unit : what is taken as independent: "day", "session", "block" or "pose"; empty where nothing
+        could be compared. clusters : their number.
+    position, orientation : ratios for the measured poses, from the directions that the data
+        determine.
+    parameter : the parameter with the largest ratio, and that ratio; empty and NaN without any.
+    finding : the result.
+    """
+
+    unit: str
+    clusters: int
+    position: Ratio
+    orientation: Ratio
+    parameter: tuple[str, float]
+    finding: Finding
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result by name for JSON."""
+        ratios = {name: getattr(self, name)._asdict() for name in ("position", "orientation")}
+        name, ratio = self.parameter
+        return {
+            "unit": self.unit,
+            "clusters": self.clusters,
+            **ratios,
+            "parameter": {"name": name, "ratio": ratio},
+            "finding": self.finding,
+        }
+
+
+def check_clusters(fit: Identification, data: Measurements) -> ClusterCheck:
+    """Compare the stated uncertainty with one that allows common errors within clusters of poses.
+
+    The clusters are the largest independent units of which there are enough, see
+    `divide_into_clusters`.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    """
+    check_fitted_data(fit, data)
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    units = divide_into_clusters(data)
+    if not units:
+        return _not_compared("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
+    if not fit.residual_test.intervals:
+        return _not_compared("residuals.clusters-without-intervals")
+    checks = (_compare(fit, data, clusters) for clusters in units)
+    judged = (check for check in checks if check is not None)
+    return next(judged, _not_compared("residuals.clusters-not-judged"))
+
+
+@dataclass(frozen=True, eq=False)
+class RobustSpread:
+    """The cluster-robust covariance C_robust = L (I + spread) L' of a fit with C = L L'.
+
+    Each of G clusters has h rows, turned into the eigenvectors of its leverage H_gg. With a
+    correction of one the sum of scores' scores' is `spread` + sum_g parts_g parts_g'.
+
+    Attributes
+    ----------
+    root : (p, k) L in tolerances, for the k directions that the fit estimates.
+    scores : (G, k) h_g = B-scaled u_g, of unit variance in all for independent errors.
+    parts : (G, k, h) the rows in units of L; zero where no residual can judge them.
+    correction : (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h).
+    columns : (G, h, w) rows by everything that is estimated, in standard deviations: their products
+        are the leverages.
+    """
+
+    root: FloatArray
+    scores: FloatArray
+    parts: FloatArray
+    correction: FloatArray
+    leverage: FloatArray
+    columns: FloatArray
+
+    def compare(self, effect: FloatArray) -> Ratio:
+        """Return the ratio for quantities whose change is effect (m, p) times the deviation in
+        tolerances.
+        """
+        root = effect @ self.root
+        total = float((root**2).sum())
+        if not total > 0.0:
+            return NO_RATIO
+        # Q = sum_g |E' h_g|^2 with E E' = root' root; for independent errors its mean is `mean`
+        _, s, vt = np.linalg.svd(root, full_matrices=False)
+        E = vt[s > COMMON * s[0]].T * s[s > COMMON * s[0]]
+        parts = np.matmul(E.T, self.parts)
+        mean, observed = float((parts**2).sum()), float(((self.scores @ E) ** 2).sum())
+        if not mean > 0.0:
+            return NO_RATIO
+        ratio = float(np.sqrt(max(total + observed - mean, 0.0) / total))
+        degrees = self._degrees(parts, mean)
+        p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
+        return Ratio(ratio, degrees, mean / total, p_value)
+
+    def parameter_ratios(self) -> FloatArray:
+        """Return the ratio (p,) of each parameter; NaN without a standard deviation."""
+        stated = (self.root**2).sum(axis=1)
+        observed = ((self.scores @ self.root.T) ** 2).sum(axis=0)
+        expected = np.zeros(len(stated))
+        for parts in self.parts:
+            expected += ((self.root @ parts) ** 2).sum(axis=1)
+        square = np.divide(
+            observed - expected, stated, out=np.full(len(stated), np.nan), where=stated > 0.0
+        )
+        return np.asarray(np.sqrt(np.maximum(1.0 + square, 0.0)))
+
+    def _degrees(self, parts: FloatArray, mean: float) -> float:
+        """Return the degrees of freedom 2 mean^2 / variance of Q for independent normal errors.
+
+        `parts` (G, r, h) are E' parts. Q = e' K e of all rows e has the variance 2 tr (K K). With
+        D the corrections, Z the columns and F_g = D_g parts_g' parts_g D_g, the blocks of two
+        clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and those of one |parts_g' parts_g|^2.
+        """
+        products = np.matmul(parts.swapaxes(-1, -2), parts)
+        F = products * self.correction[:, :, None] * self.correction[:, None, :]
+        width = self.columns.shape[-1]
+        joint = self.columns.reshape(-1, width).T @ np.matmul(F, self.columns).reshape(-1, width)
+        single = (np.matmul(F * self.leverage[:, None, :], F) * self.leverage[:, None, :]).trace(
+            axis1=1, axis2=2
+        )
+        trace = float((joint * joint.T).sum() - single.sum() + (products**2).sum())
+        return mean**2 / trace if trace > 0.0 else np.inf
+
+
+def compute_robust_spread(
+    fit: Identification, data: Measurements, clusters: Clusters
+) -> RobustSpread:
+    """Return the cluster-robust covariance of a fit, beside the stated one.
+
+    Parameters
+    ----------
+    fit : with intervals. data : its measurements, with the sigma of their readings, without
+        excluded poses. clusters : the cluster of each pose.
+    """
+    problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
+    problem = problem.weighted(fit.pose_weights)
+    z = fit.free_parameters.deviation(fit.robot.values[None])
+    prior = fit.options.prior
+    whole = problem if prior is None else prior.added(problem)
+    linearization = whole.linearize(z, problem.start(z))
+    method, p = fit.method, problem.parameters
+    d = decompose(
+        linearization.factor,
+        linearization.equations,
+        z,
+        method.scale(p),
+        fit.spectrum.tolerance,
+        method.unpenalized(p),
+    )
+    penalty = np.array(method.penalty(d), dtype=np.float64)
+    scaled = scale_variances(d, penalty, fit.residual_test, method)
+    variance = scaled.decomposition.variances(scaled.penalty, scaled.noise)[0]
+    used = np.isfinite(variance) & (d.singular_values[0] > 0.0) & d.used[0]
+    V = d.scale[:, None] * d.directions[0][:, used]
+    total, sd = (d.singular_values[0] ** 2 + penalty[0])[used], np.sqrt(variance[used])
+    sigma = fit.residual_test.sigma_scale
+    rows = (
+        _fold_clusters(problem, linearization, clusters)
+        / np.r_[np.ones(_width(problem)), np.ones(p), sigma]
+    )
+    nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
+    half = np.concatenate([nuisance, (A @ V) / np.sqrt(total)], axis=2)
+    P = (A @ V) * (sigma / (total * sd))
+    leverage, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
+    remaining = 1.0 - leverage
+    is_tested = remaining > TESTABLE
+    correction = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
+    parts = np.matmul(P.swapaxes(-1, -2), vectors) * is_tested[:, None, :]
+    residual = correction * np.matmul(r[:, None, :], vectors)[:, 0]
+    scores = np.matmul(parts, residual[..., None])[..., 0]
+    columns = np.matmul(vectors.swapaxes(-1, -2), half)
+    return RobustSpread(V * sd, scores, parts, correction, leverage, columns)
+
+
+def _width(problem: Problem) -> int:
+    """Return the number of columns of nuisance parameters in `Problem.leverage_rows`."""
+    return 0 if problem.nuisance is None else len(problem.nuisance)
+
+
+def _fold_clusters(
+    problem: Problem, linearization: Linearization, clusters: Clusters
+) -> FloatArray:
+    """Return the rows (G, h, U + p + 1) of each cluster, folded."""
+    width = _width(problem) + problem.parameters + 1
+    factor = np.zeros((1, clusters.count, 0, width))
+    for rows_of_block in problem.leverage_rows(linearization):
+        for part in rows_of_block:
+            k, m, _ = part.rows.shape
+            if k and m:
+                places = np.repeat(clusters.member[part.poses], m)
+                factor = fold_at(factor, part.rows.reshape(1, k * m, width), places)
+    return factor[0]
+
+
+def _compare(fit: Identification, data: Measurements, clusters: Clusters) -> ClusterCheck | None:
+    """Return the comparison for clusters; None where residuals cannot judge enough of the poses."""
+    spread = compute_robust_spread(fit, data, clusters)
+    effects = _pose_effects(fit, data)
+    angle, position = (spread.compare(effect) for effect in effects)
+    sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
+    if not sizes or max(ratio.share for ratio in sizes) < JUDGED:
+        return None
+    ratios = spread.parameter_ratios()
+    largest = int(np.nanargmax(ratios))
+    parameter = (fit.names[largest], float(ratios[largest]))
+    beyond = [r for r in sizes if r.ratio > LIMIT and r.p_value < SIGNIFICANCE]
+    finding = report_finding(
+        "residuals.common-errors" if beyond else "residuals.independent-errors",
+        unit=clusters.unit,
+        count=clusters.count,
+        ratio=max(r.ratio for r in beyond or sizes),
+        parameter=parameter[0],
+        parameter_ratio=parameter[1],
+    )
+    return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
+
+
+def _pose_effects(fit: Identification, data: Measurements) -> tuple[FloatArray, FloatArray]:
+    """Return changes of orientation (3 n, p) and position (3 n, p) of the measured poses."""
+    readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
+    values, readings = fit.robot.values[None], readings[None]
+    state = forward_trials(fit.robot, values, readings)
+    is_reached = np.asarray(state.status == Status.CONVERGED)[0]
+    D = differentiate_pose(fit.robot, values, readings, state).parameters[0, is_reached]
+    D = D[..., fit.free_parameters.places] * fit.tolerance
+    p = D.shape[-1]
+    return D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
+
+
+def _not_compared(code: str, **data: int) -> ClusterCheck:
+    """Return the reason why there is no comparison."""
+    return ClusterCheck("", 0, NO_RATIO, NO_RATIO, ("", np.nan), report_finding(code, **data))

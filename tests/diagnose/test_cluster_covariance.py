@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that days, sessions or poses share: the cluster-robust covariance against the stated one.
+
+The reference is a dense computation in numpy: the rows by all parameters from finite differences of
+the residuals, an explicit hat matrix, and matrix roots from scipy.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import sqrtm
+from scipy.stats import binom
+
+from loopcal.diagnose import examine_fit
+from loopcal.diagnose.fit_checks.cluster_covariance import (
+    LIMIT,
+    check_clusters,
+    compute_robust_spread,
+)
+from loopcal.diagnose.fit_checks.independent_units import Clusters, divide_into_clusters
+from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
+from loopcal.estimate.problem_construction import problem_of
+from loopcal.measure import Instrument, Measurements, Pose, Position, Sensor, simulate
+from tests import zoo
+from tests.estimate.problems import UM, URAD, hexapod, hexapod_poses, noise
+
+THREE = np.array([[0.03, -0.02, 0.05], [-0.04, 0.02, 0.05], [0.0, 0.05, 0.06]])
+KNOWN_POSE = Sensor(Pose(), noise(*[50 * URAD] * 3, *[10 * UM] * 3))
+THREE_TARGETS = Sensor(
+    Position(targets=("a", "b", "c"), places=THREE, unknown=("frame",)), noise(*[10 * UM] * 9)
+)
+RANK = 1e-7
+"""Share of the largest singular value that finite differences leave in null directions, at most."""
+
+
+def measure(
+    sensor: Sensor, poses: int, seed: int, sessions: int = 0, common: np.ndarray | float = 0.0
+) -> Measurements:
+    """Measure the true hexapod; `common` [m, rad] is the size of an error that the values of one
+    session, or else of one pose, share.
+    """
+    truth = zoo.hexapod().with_values(zoo.hexapod_truth())
+    data = simulate(truth, hexapod_poses(poses, seed), Instrument((sensor,)), seed)
+    (rows,) = data.observations
+    unit = np.arange(poses) * sessions // poses if sessions else np.arange(poses)
+    labels = np.array([f"s{i}" for i in unit]) if sessions else rows.session
+    drawn = np.random.default_rng([seed, 1]).standard_normal((poses, 3))[unit]
+    columns = rows.measured.shape[1]
+    shared = np.tile(drawn, columns // 3) if sensor is THREE_TARGETS else np.tile(drawn, 2)
+    measured = rows.measured + common * shared
+    return replace(data, observations=(replace(rows, measured=measured, session=labels),))
+
+
+def fit_and_check(data: Measurements, **options):
+    """Fit by least squares, and return the fit and its check."""
+    fit = identify(hexapod(), data, LeastSquares(), options=FitOptions(**options))
+    return fit, check_clusters(fit, data)
+
+
+def stack_rows(fit: Identification, data: Measurements) -> tuple[np.ndarray, np.ndarray]:
+    """Return dense whitened rows (m, U + p) by central differences, and residuals (m,), in the
+    order of poses.
+    """
+    problem = problem_of(fit.free_parameters, data)
+    z = fit.free_parameters.deviation(fit.robot.values[None])
+    start, u = problem.start(z), fit.nuisance.estimate
+    U = len(u)
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        values = x[None, :U] if U else None
+        solution = problem.solve(x[None, U:], start, values)
+        (kind,) = problem.residuals(x[None, U:], solution)
+        return kind.whitened[0].ravel()
+
+    at = np.r_[u, z[0]]
+    step = np.r_[np.full(U, 1e-6), np.full(z.shape[1], 1e-2)]
+    columns = [
+        (residuals(at + h * e) - residuals(at - h * e)) / (2.0 * h)
+        for h, e in zip(step, np.eye(len(at)), strict=True)
+    ]
+    return np.column_stack(columns), residuals(at)
+
+
+class DenseReference:
+    """Sandwich covariance with the correction CR2 of dense rows J by U + p unknowns."""
+
+    def __init__(self, J: np.ndarray, r: np.ndarray, cluster: np.ndarray, prior: np.ndarray):
+        length = np.linalg.norm(J, axis=0)
+        X = J / length
+        _, s, vt = np.linalg.svd(np.vstack([X, np.diag(np.sqrt(prior) / length)]))
+        B = (vt[s > RANK * s[0]].T / s[s > RANK * s[0]] ** 2) @ vt[s > RANK * s[0]]
+        H = X @ B @ X.T
+        self.stated = (B / length) / length[:, None]
+        meat, root, K = np.diag(prior / length**2), np.zeros((len(J), len(J))), []
+        for g in np.unique(cluster):
+            rows = np.flatnonzero(cluster == g)
+            adjust = np.linalg.inv(np.real(sqrtm(np.eye(len(rows)) - H[np.ix_(rows, rows)])))
+            score = X[rows].T @ adjust @ r[rows]
+            meat = meat + np.outer(score, score)
+            root[np.ix_(rows, rows)] = adjust
+            K.append(rows)
+        self.robust = (B @ meat @ B / length) / length[:, None]
+        self.linear, self.clusters = (B @ X.T) / length[:, None], K
+        self.H, self.root = H, root
+
+    def degrees(self, effect: np.ndarray) -> float:
+        """2 mean^2 / variance of the sum over clusters of |effect B u_g|^2."""
+        W = np.zeros_like(self.H)
+        for rows in self.clusters:
+            S = effect @ self.linear[:, rows]
+            W[np.ix_(rows, rows)] = S.T @ S
+        # residuals have the covariance I - H, with a prior too: its parameters are random
+        K = self.root @ W @ self.root @ (np.eye(len(W)) - self.H)
+        return float(np.trace(K) ** 2 / np.trace(K @ K))
+
+
+@pytest.mark.parametrize("sensor", [KNOWN_POSE, THREE_TARGETS], ids=["pose", "three targets"])
+@pytest.mark.parametrize("sessions", [0, 6])
+@pytest.mark.parametrize("method", [LeastSquares(), MAP()], ids=["least squares", "MAP"])
+def test_covariance_and_degrees_equal_a_dense_computation(sensor, sessions, method):
+    data = measure(sensor, 24, 3, sessions)
+    if sensor is THREE_TARGETS and sessions:  # one frame for all sessions
+        (rows,) = data.observations
+        data = replace(data, observations=(replace(rows, session=np.array([""] * 24)),))
+    fit = identify(hexapod(), data, method)
+    member = np.arange(24) * sessions // 24 if sessions else np.arange(24)
+    spread = compute_robust_spread(fit, data, Clusters("pose", member, int(member.max()) + 1))
+    J, r = stack_rows(fit, data)
+    U, p = len(fit.nuisance), len(fit.names)
+    prior = np.r_[np.zeros(U), np.full(p, 1.0 if isinstance(method, MAP) else 0.0)]
+    dense = DenseReference(J, r, np.repeat(member, len(r) // 24), prior)
+    root = spread.root
+    effect = np.random.default_rng(0).standard_normal((5, p))
+    F, A = J[:, :U], J[:, U:]
+    left = A - F @ np.linalg.lstsq(F, A)[0] if U else A
+    effect = effect @ np.linalg.pinv(left, rcond=RANK) @ left  # quantities that the rows determine
+    wide = np.column_stack([np.zeros((5, U)), effect])
+    # the reference has finite differences of 1e-6
+    stated, robust = (np.trace(wide @ C @ wide.T) for C in (dense.stated, dense.robust))
+    assert np.isclose(((effect @ root) ** 2).sum(), stated, rtol=1e-4)
+    ratio = spread.compare(effect)
+    assert np.isclose(ratio.ratio, np.sqrt(robust / stated), rtol=1e-3)
+    assert np.isclose(ratio.degrees, dense.degrees(wide), rtol=1e-2)
+
+
+def test_the_ratio_is_one_on_average_for_independent_errors():
+    """CR2 is unbiased, with 5 sessions as with 30 poses."""
+    for sessions in (0, 5):
+        checks = [fit_and_check(measure(KNOWN_POSE, 30, seed, sessions))[1] for seed in range(25)]
+        assert {check.clusters for check in checks} == {sessions or 30}
+        squares = [check.position.ratio**2 for check in checks]
+        degrees = np.mean([check.position.degrees for check in checks])
+        assert abs(np.mean(squares) - 1.0) < 4.0 * np.sqrt(2.0 / degrees / len(squares))
+        assert np.allclose(np.std(squares), np.sqrt(2.0 / degrees), rtol=0.6)  # 4 sd of 25 draws
+        alarms = sum(check.finding.code == "residuals.common-errors" for check in checks)
+        assert alarms <= binom.isf(1e-3, len(checks), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "poses", "sessions", "common", "unit"),
+    [
+        (THREE_TARGETS, 40, 0, 40 * UM, "pose"),
+        (KNOWN_POSE, 60, 6, np.array([0.0] * 3 + [40 * UM] * 3), "session"),
+    ],
+    ids=["targets of a pose", "offset of a session"],
+)
+def test_common_errors_are_reported(sensor, poses, sessions, common, unit):
+    data = measure(sensor, poses, 1, sessions, common)
+    fit, check = fit_and_check(data)
+    assert check.finding.code == "residuals.common-errors"
+    assert (check.unit, check.clusters) == (unit, sessions or poses)
+    assert check.position.ratio > LIMIT
+    assert check.position.p_value < 1e-4
+    _, independent = fit_and_check(measure(sensor, poses, 1, sessions))
+    assert independent.finding.code == "residuals.independent-errors"
+    assert check.finding in examine_fit(fit, data).findings
+
+
+def test_days_and_sessions_are_found_and_the_largest_unit_with_enough_clusters_is_used():
+    data = measure(KNOWN_POSE, 24, 1, sessions=12)
+    (rows,) = data.observations
+    hours = np.repeat([0.0, 25.0, 49.0, 72.0, 99.0, 120.0], 4) + np.tile([0.0, 1.0, 3.0, 5.0], 6)
+    timed = replace(data, observations=(replace(rows, context={"time": 3600.0 * hours}),))
+    divisions = [(c.unit, c.count) for c in divide_into_clusters(timed)]
+    assert divisions == [("day", 6), ("session", 12), ("pose", 24)]
+    assert [(c.unit, c.count) for c in divide_into_clusters(data)] == [
+        ("session", 12),
+        ("pose", 24),
+    ]
+    few = measure(KNOWN_POSE, 24, 1, sessions=4)
+    assert [c.unit for c in divide_into_clusters(few)] == ["pose"]
+    blocks = replace(few, block=np.arange(24) // 3)
+    assert [(c.unit, c.count) for c in divide_into_clusters(blocks)] == [("block", 8)]
+
+
+def test_sessions_that_measure_the_same_poses_are_not_independent():
+    data = measure(KNOWN_POSE, 24, 1)
+    (rows,) = data.observations
+    left = replace(rows, session=np.array([f"left{i // 4}" for i in range(24)]))
+    right = replace(rows, session=np.array([f"right{i // 8}" for i in range(24)]))
+    both = replace(data, observations=(left, right))
+    assert [(c.unit, c.count) for c in divide_into_clusters(both)] == [("pose", 24)]
+
+
+def test_too_few_poses_and_fits_without_intervals_are_named():
+    data = measure(KNOWN_POSE, 30, 1)
+    blocks = replace(data, block=np.arange(30) // 10)
+    _, check = fit_and_check(blocks)
+    assert check.finding.code == "residuals.clusters-too-few"
+    _, check = fit_and_check(data.take(np.arange(7)), noise="estimated")
+    assert check.finding.code == "residuals.clusters-without-intervals"
+    assert np.isnan(check.position.ratio)
