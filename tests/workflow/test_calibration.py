@@ -217,7 +217,6 @@ def test_wrong_argument_type_is_refused_with_advice(arguments, word):
 @pytest.mark.parametrize(
     ("options", "code"),
     [
-        ({"limit_position": 1e-3}, "workflow.limit-needs-held-out-poses"),
         ({"free_limb": "leg3"}, "workflow.free-limb-needs-prior"),
         ({"hold_out": 1.0}, None),
         ({"hold_out": 0.25, "held_out": ("1",)}, None),
@@ -227,6 +226,12 @@ def test_contradictory_options_are_refused(options, code):
     with pytest.raises(DataError) as refused:
         CalibrationOptions(**options)
     assert refused.value.code == code
+
+
+def test_limit_without_held_out_poses_is_refused():
+    with pytest.raises(DataError) as refused:
+        calibrate(hexapod(), hexapod_data(20), CalibrationOptions(limit_position=1e-3))
+    assert refused.value.code == "workflow.limit-needs-held-out-poses"
 
 
 def test_held_out_poses_as_a_single_text_are_refused():

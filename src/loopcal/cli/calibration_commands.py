@@ -29,7 +29,6 @@ from loopcal.cli.options import (
     seed_option,
     verbose_option,
 )
-from loopcal.errors import DataError
 
 TAKEN_OPTIONS = ("limit_position", "limit_angle", "choose_model", "free_limb", "allow_still")
 """Options of the command that options of the library have by the same name."""
@@ -107,18 +106,14 @@ def calibrate(
     """  # noqa: D301
     from loopcal import workflow
     from loopcal.io import load_robot
-    from loopcal.io.data.measurement_file import read_held_out_poses
     from loopcal.io.runs.run_folder import build_document, load_prior, refuse_run_folder, save_run
     from loopcal.report.calibration_view import view_calibration
 
-    held_out = read_held_out_poses(data)
-    _refuse_two_choices(held_out, hold_out)
     inputs = _list_inputs(robot, data, prior)
     settings = workflow.CalibrationOptions(
         make_fit_options(options),
         hold_out,
-        held_out,
-        seed,
+        seed=seed,
         prior=None if prior is None else load_prior(prior, data),
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},
@@ -138,15 +133,6 @@ def calibrate(
         terminal.print_page([*view_calibration(report, verbose, hint_for), "", written])
     terminal.print_failures(report.failures, shown=not as_json)
     return report.exit_code
-
-
-def _refuse_two_choices(held_out: Sequence[str], hold_out: float) -> None:
-    """Raise DataError where both the data and an option choose the held-out poses."""
-    if held_out and hold_out:
-        raise DataError(
-            f"the column 'use' of the data already holds out {len(held_out)} poses; leave out "
-            "--hold-out, or remove the column"
-        )
 
 
 def _list_inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, Path]:

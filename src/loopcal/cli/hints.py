@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 HINTS = {
     "data.duplicate-rows": "use --allow-duplicates to accept them",
+    "data.held-out-twice": "leave out --hold-out",
     "data.outside-stroke": "use --allow-outside-stroke to accept it",
     "conventions.other-interpretation": "use --allow-implausible to accept the data as written",
     "conventions.stated-values-contradicted": "use --allow-implausible to accept the statement",

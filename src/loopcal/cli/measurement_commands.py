@@ -28,6 +28,7 @@ from loopcal.cli.options import (
     force_option,
     is_given,
     json_option,
+    leave_out_held_out,
     read_checked_measurements,
     refuse_given,
     robot_argument,
@@ -105,7 +106,9 @@ def identifiability(
     refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
     machine, drawn = load_robot(robot), []
     if data:
-        measurements = read_checked_measurements(data, machine, **take_flags(options))
+        measurements = leave_out_held_out(
+            read_checked_measurements(data, machine, **take_flags(options))
+        )
     else:
         if poses is None:
             drawn = [_name_drawn_poses(machine, draw, seed)]
@@ -246,11 +249,7 @@ def _fill_in(
 ) -> tuple[SimulatedMeasurements, str]:
     """Return the filled-in data file of a plan."""
     from loopcal.io import load_measurements
-    from loopcal.io.data.measurement_file import (
-        load_instrument,
-        read_pose_use,
-        refuse_empty_readings,
-    )
+    from loopcal.io.data.measurement_file import load_instrument, refuse_empty_readings
     from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.workflow.simulated_measurements import fill_in_measurements
 
@@ -267,4 +266,4 @@ def _fill_in(
         seed=seed,
     )
     title = f"simulated by loopcal: {sheet.name}, seed {seed}"
-    return result, format_measurements(result.data, result.truth, title, read_pose_use([sheet]))
+    return result, format_measurements(result.data, result.truth, title)

@@ -213,8 +213,19 @@ def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None
         terminal.print_note(f"{' and '.join(map(str, paths))}: {check.finding}")
 
 
+def leave_out_held_out(data: Measurements) -> Measurements:
+    """Return the poses that a fit would use; print a note where others are held out."""
+    from loopcal.cli import terminal
+    from loopcal.findings import report_finding
+
+    if count := int(data.is_held_out.sum()):
+        terminal.print_note(str(report_finding("data.held-out-not-counted", count=count)))
+    return data.fitted
+
+
 def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
-    """Read measurement files as one set; print a note where a file names another robot.
+    """Read measurement files as one set; print a note where a file names another robot, or contains
+    no measured value.
 
     Raises
     ------
@@ -225,6 +236,7 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
     from loopcal.findings import report_finding
     from loopcal.io import load_measurements
     from loopcal.io.core.csv_table import read_robot_name
+    from loopcal.io.data.measurement_file import list_unfilled_files
 
     for path in paths:
         stated = read_robot_name(path)
@@ -232,4 +244,7 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
             code = "workflow.robot-of-other-name"
             note = report_finding(code, file=str(path), stated=stated, used=robot.name)
             terminal.print_note(str(note))
-    return load_measurements(paths, robot, **allowed)
+    data = load_measurements(paths, robot, **allowed)
+    for file in list_unfilled_files(paths, data):
+        terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
+    return data

@@ -239,19 +239,15 @@ def _read_earlier(
     measured: Sequence[Path], robot: Mechanism
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the fitted poses of earlier files, and the names of all their poses."""
-    from loopcal.io.data.measurement_file import read_held_out_poses
-
     data = read_checked_measurements(measured, robot)
     files = " ".join(map(str, measured))
     if not data.n_rows:
         raise DataError(
             f"--measured {files} contains no measured value; fill it in, or leave it out"
         )
-    held_out = set(read_held_out_poses(measured))
-    fitted = [i for i, label in enumerate(data.labels) if label not in held_out]
-    if not fitted:
+    if data.is_held_out.all():
         raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
-    return (data.take(fitted) if held_out else data), data.labels
+    return data.fitted, data.labels
 
 
 def _list_inputs(

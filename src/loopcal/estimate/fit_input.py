@@ -99,14 +99,17 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
 
 
 def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
-    """Refuse readings of another robot, a robot without free parameters, and data without any row.
+    """Refuse readings of another robot, held-out poses, a robot without free parameters, and data
+    without any row.
 
     Raises
     ------
-    DataError : wrong number of actuators.
+    DataError : wrong number of actuators, or `data.held-out-fitted`.
     EstimationError : `fit.no-free-parameter` or `fit.no-measured-value`.
     """
     check_actuators(data, robot)
+    if count := int(data.is_held_out.sum()):
+        raise DataError(report_finding("data.held-out-fitted", count=count))
     if problem.parameters == 0:
         raise EstimationError(
             report_finding("fit.no-free-parameter", robot=robot.name, total=len(robot.parameters))

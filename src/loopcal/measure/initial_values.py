@@ -90,25 +90,43 @@ def guess_nuisance_values_batch(
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
     sets = max((len(m) for m in measured), default=1)
     values = np.tile(nuisance.values(), (sets, 1))
+    for i, members, indices in _list_groups(measurements, nuisance):
+        if known[indices].all():
+            continue
+        chosen = measurements.observations[i].take(members)
+        values[:, indices] = _refine_best_candidate(
+            chosen,
+            measured[i][:, members],
+            T[:, chosen.rows],
+            values[:, indices],
+            known[indices],
+            most,
+            steps,
+        )
+        known[indices] = True
+    return values
+
+
+def _list_groups(
+    measurements: Measurements, nuisance: NuisanceParameters
+) -> list[tuple[int, IntArray, IntArray]]:
+    """Return the groups of rows that use the same parameters: number of the observations, indices
+    of its rows that measured something, and the parameters.
+
+    They are in the order of the observations. Of the same kind, the group with the most rows is
+    first, so that a file with few rows does not determine the parameters that it shares.
+    """
+    kinds = [type(rows.kind) for rows in measurements.observations]
+    groups = []
     for i, rows in enumerate(measurements.observations):
         if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
             continue
+        counts = (rows.weight > 0.0) & rows.present.any(axis=1)
         for members, indices in _group_rows(nuisance.indices[i]):
-            if not known[indices].all():
-                counted = members[rows.weight[members] > 0.0]
-                if len(counted):
-                    chosen = rows.take(counted)
-                    values[:, indices] = _refine_best_candidate(
-                        chosen,
-                        measured[i][:, counted],
-                        T[:, chosen.rows],
-                        values[:, indices],
-                        known[indices],
-                        most,
-                        steps,
-                    )
-                known[indices] = True
-    return values
+            counted = members[counts[members]]
+            if len(counted):
+                groups.append((i, counted, indices))
+    return sorted(groups, key=lambda group: (kinds.index(kinds[group[0]]), -len(group[1])))
 
 
 def _group_rows(indices: IntArray) -> list[tuple[IntArray, IntArray]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
+from loopcal.findings import report_finding
 from loopcal.measure.array_checks import (
     check_array,
     check_number,
@@ -20,7 +21,7 @@ from loopcal.measure.array_checks import (
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,12 +46,15 @@ class Measurements:
         the sigma of its actuators.
     stated_values : tuple of StatedValue, optional
         Priors and fixed values of nuisance parameters. Default: all are estimated from the data.
+    is_held_out : (n,) bool, optional
+        Poses that are held out for validation, as the column `use` of a file states. A calibration
+        validates on them, and no fit uses them. Default: none.
 
     Raises
     ------
     DataError
-        If shapes differ, a reading is not finite though its sigma is, a sigma is negative, or a row
-        refers to a pose that does not exist.
+        If shapes differ, a reading is not finite though its sigma is, a sigma is negative, a row
+        refers to a pose that does not exist, or a block is partly held out.
     """
 
     robot_name: str
@@ -60,6 +64,7 @@ class Measurements:
     labels: tuple[str, ...] = ()
     reading_sigma: FloatArray | None = None
     stated_values: tuple[StatedValue, ...] = ()
+    is_held_out: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def __post_init__(self) -> None:
         readings = _check_readings(self.readings, self.reading_sigma is not None)
@@ -87,6 +92,7 @@ class Measurements:
             _check_poses(rows, n)
         set_fields(self, readings=readings, block=block, labels=labels)
         set_fields(self, observations=tuple(self.observations))
+        set_fields(self, is_held_out=_check_held_out(self.is_held_out, block, labels))
         if self.reading_sigma is not None:
             sigma = check_reading_sigma(self.reading_sigma, readings, labels)
             set_fields(self, reading_sigma=sigma)
@@ -136,6 +142,11 @@ class Measurements:
             )
         return means
 
+    @property
+    def fitted(self) -> Self:
+        """The measurements without the held-out poses; raises DataError where none is left."""
+        return self.take(~self.is_held_out) if self.is_held_out.any() else self
+
     def take(self, poses: ArrayLike) -> Self:
         """Return the measurements of these poses, in this order, without rows of any other pose.
 
@@ -180,6 +191,7 @@ class Measurements:
             block=self.block[chosen],
             labels=tuple(self.labels[i] for i in chosen),
             reading_sigma=None if self.reading_sigma is None else self.reading_sigma[chosen],
+            is_held_out=self.is_held_out[chosen],
         )
 
     def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
@@ -245,6 +257,23 @@ class Measurements:
             observations=observations,
             reading_sigma=weight_reading_sigma(self.reading_sigma, given),
         )
+
+
+def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, ...]) -> BoolArray:
+    """Return the mask of held-out poses (n,), read-only; none where it is empty."""
+    given = np.array(is_held_out, dtype=bool)
+    mask = given if given.size else np.zeros(len(block), dtype=bool)
+    if mask.shape != block.shape:
+        raise DataError(
+            f"is_held_out has shape {mask.shape}; give one boolean for each of {len(block)} poses"
+        )
+    for i in np.flatnonzero(mask):
+        for j in np.flatnonzero((block == block[i]) & ~mask):
+            raise DataError(
+                report_finding("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
+            )
+    mask.setflags(write=False)
+    return mask
 
 
 def _check_readings(readings: ArrayLike, uncertain: bool) -> FloatArray:

@@ -77,6 +77,10 @@ def calibrate(
     options = CalibrationOptions() if options is None else options
     check_types(robot, data)
     check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
+    kept = exclude_poses(data, options.fit.excluded_poses)
+    split = split_data(kept, options.hold_out, options.seed, options.held_out)
+    if options.has_limit and split.held_out is None:
+        raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
     count = StepCounter(progress, STEPS)
     count.begin("checking conventions")
     conventions = check_conventions(
@@ -85,8 +89,6 @@ def calibrate(
         allow_still=options.allow_still,
         allow_implausible=not options.check_conventions,
     )
-    kept = exclude_poses(data, options.fit.excluded_poses)
-    split = split_data(kept, options.hold_out, options.seed, options.held_out)
     if not split.fitted.n_rows:
         raise DataError("the data hold no measured value; fill in what the instrument showed")
     if split.held_out is not None and not split.held_out.n_rows:

@@ -24,7 +24,8 @@ class CalibrationOptions:
     fit : how parameters are estimated, and which poses are excluded.
     hold_out : share of the poses to keep out of the fit for validation, from 0 to below 1. The
         sets are those of `data.split(hold_out=hold_out, seed=seed)`.
-    held_out : labels of the poses to keep out, instead of a share.
+    held_out : labels of the poses to keep out, instead of a share. Neither is allowed where the
+        data state their held-out poses (`Measurements.is_held_out`).
     seed : of the random choice of held-out poses.
     limit_position, limit_angle : largest allowed errors [m], [rad] on held-out poses.
     choose_model : free only as many parameters as held-out predictions justify.
@@ -66,13 +67,15 @@ class CalibrationOptions:
             )
         check_limit("limit_position", self.limit_position)
         check_limit("limit_angle", self.limit_angle)
-        has_limit = self.limit_position is not None or self.limit_angle is not None
-        if has_limit and not self.hold_out and not self.held_out:
-            raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
         if self.free_limb is not None and self.prior is None:
             raise DataError(report_finding("workflow.free-limb-needs-prior", limb=self.free_limb))
         if self.prior is not None:
             self._check_prior()
+
+    @property
+    def has_limit(self) -> bool:
+        """Whether an error on held-out poses is limited."""
+        return self.limit_position is not None or self.limit_angle is not None
 
     def _check_prior(self) -> None:
         """Refuse what is no earlier calibration, and options that cannot be combined with it."""

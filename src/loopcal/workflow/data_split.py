@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from loopcal.errors import DataError, suggest_names
+from loopcal.findings import report_finding
 from loopcal.measure import Measurements
 
 
@@ -39,6 +40,8 @@ def split_data(
 ) -> DataSplit:
     """Divide measurements into a set to fit and a set for validation.
 
+    Measurements that state their held-out poses are divided so, and no other choice is allowed.
+
     Parameters
     ----------
     hold_out : share of the poses to hold out, drawn by whole blocks as `data.split` does. 0 holds
@@ -47,8 +50,12 @@ def split_data(
 
     Raises
     ------
-    DataError : a label that the data do not have, or no pose is left to fit.
+    DataError : a label that the data do not have, two choices of poses, or no pose is left to fit.
     """
+    stated = tuple(label for label, out in zip(data.labels, data.is_held_out, strict=True) if out)
+    if stated and (hold_out or set(held_out) - set(stated)):
+        raise DataError(report_finding("data.held-out-twice", count=len(stated)))
+    held_out = stated or held_out
     if held_out:
         for label in held_out:
             if label not in data.labels:

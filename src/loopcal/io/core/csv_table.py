@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
+from loopcal.findings import Finding
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
@@ -131,7 +132,7 @@ class Table:
         """Return an error at the header line."""
         return FileError(sentence, self.path, self.header_line)
 
-    def row_error(self, row: int, sentence: str) -> FileError:
+    def row_error(self, row: int, sentence: str | Finding) -> FileError:
         """Return an error at the line of a row."""
         return FileError(sentence, self.path, self.lines[row])
 

@@ -210,8 +210,8 @@ def _parse_date(table: Table, row: int, cell: str) -> float:
 
 
 USE_COLUMN = TextColumn("use", (FIT, HELD_OUT))
-"""What a pose is for; a plan fills it in before anything is measured, so that the choice does not
-depend on the results. A row that compares poses is held out with any of its poses.
+"""What the poses of a row are for, see `pose_use`; a plan fills it in before anything is measured,
+so that the choice does not depend on the results.
 """
 
 
@@ -284,7 +284,9 @@ RULES: tuple[ColumnRule, ...] = (
         TextColumn("pose"),
     ),
     _text_rule(
-        f"`{FIT}` or `{HELD_OUT}`: what the pose is for; an empty cell means `{FIT}`", USE_COLUMN
+        f"`{FIT}` or `{HELD_OUT}`: what the pose is for, in every file alike; `{FIT}` where no row "
+        "of the pose states it",
+        USE_COLUMN,
     ),
     _text_rule("poses of a block are never split between fit and validation", TextColumn("block")),
     _text_rule("label of the kind, in files with several kinds", TextColumn("kind")),

@@ -23,21 +23,24 @@ from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, read_table, require_columns
 from loopcal.io.core.text_file import as_path, name_files
-from loopcal.io.data.columns import HELD_OUT, USE_COLUMN, get_dimension, read_context
+from loopcal.io.data.columns import get_dimension, read_context
 from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
 from loopcal.io.data.nuisance_settings import read_stated_values
 from loopcal.io.data.pose_rows import read_pose_rows
+from loopcal.io.data.pose_use import read_held_out
 from loopcal.io.robot.robot_file import check_format, require_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
-    from loopcal.measure import Instrument, Measurements
+    from loopcal.measure import Instrument, Measurements, Observations
 
 FORMAT = 1
 WHAT = "measurement file"
 Paths = str | Path | Sequence[str | Path]
+FileRows = list[tuple["Observations", tuple[str, ...]]]
+"""Observations of a file, with the place of each row."""
 
 
 def load_measurements(
@@ -86,9 +89,11 @@ def load_measurements(
             tables, kinds, poses.members, context, strict=True
         )
     ]
+    read = _leave_out_unfilled(read)
     settings = [
         (table.settings, [rows for rows, _ in of_file])
         for table, of_file in zip(tables, read, strict=True)
+        if of_file
     ]
     with name_files(*(table.path for table in tables)):
         data = Measurements(
@@ -99,6 +104,7 @@ def load_measurements(
             poses.labels,
             poses.sigma,
             read_stated_values(settings, poses.labels),
+            read_held_out(tables, poses),
         )
         check_strokes(data, robot, allow=allow_outside_stroke)
         places = [places for of_file in read for _, places in of_file]
@@ -106,26 +112,28 @@ def load_measurements(
     return data
 
 
-def read_pose_use(paths: Sequence[Path]) -> dict[str, str]:
-    """Return pose -> `fit` or `held-out`, for the poses whose use is stated, in order.
+def _leave_out_unfilled(read: list[FileRows]) -> list[FileRows]:
+    """Return the rows of each file, none of a file in which nothing was measured yet.
 
-    Raises
-    ------
-    FileError : another cell, or two different uses of one pose.
+    Such a file, the sheet of a plan, only contributes its poses, readings and uses to the others.
+    If no file has a measured value, all rows are kept.
     """
-    uses: dict[str, str] = {}
-    for table in map(read_table, paths):
-        cells = USE_COLUMN.parse(table)
-        for row, (name, cell) in enumerate(zip(table.pose_names(), cells, strict=True)):
-            if cell and uses.setdefault(name, cell) != cell:
-                sentence = f"pose {name!r} is {cell} here and {uses[name]} in another row"
-                raise table.row_error(row, f"{sentence}; correct one")
-    return uses
+    is_filled = [any(rows.n_residuals for rows, _ in of_file) for of_file in read]
+    if not any(is_filled):
+        return read
+    return [of_file if filled else [] for of_file, filled in zip(read, is_filled, strict=True)]
 
 
-def read_held_out_poses(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Return the names of the poses that files hold out; raise as `read_pose_use`."""
-    return tuple(name for name, use in read_pose_use(paths).items() if use == HELD_OUT)
+def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
+    """Return the files of `load_measurements` that state a kind, but only hold poses and readings.
+
+    Parameters
+    ----------
+    path : the files. data : that were read from them.
+    """
+    sources = {rows.source for rows in data.observations}
+    tables = (table for table in _read_tables(path) if has_measured_values(table))
+    return tuple(table.path for table in tables if str(table.path) not in sources)
 
 
 def list_measurement_files(path: Paths) -> dict[str, Path]:

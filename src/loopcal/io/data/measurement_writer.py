@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.columns import (
+    FIT,
+    HELD_OUT,
     LINK,
     SIGMA,
     USE_COLUMN,
@@ -68,13 +70,13 @@ def save_measurements(
 
 
 def format_measurements(
-    data: Measurements, robot: Mechanism, remark: str = "", uses: Mapping[str, str] | None = None
+    data: Measurements, robot: Mechanism, remark: str = "", states_use: bool = False
 ) -> str:
     """Return the text of a measurement file; see `save_measurements`.
 
     Parameters
     ----------
-    uses : pose -> cell of the column `use`, which the file has only where there are any.
+    states_use : write the column `use` also where no pose is held out.
     """
     require_robot(robot)
     _refuse_names(data)
@@ -88,7 +90,8 @@ def format_measurements(
     for key, text in (("unknowns", knowledge), ("reading_noise", reading_noise)):
         lines += [f"# {key}: {text}"] if text else []
 
-    names = ["pose", *([USE_COLUMN.name] if uses else [])]
+    has_use = states_use or bool(data.is_held_out.any())
+    names = ["pose", *([USE_COLUMN.name] if has_use else [])]
     names += [*(["block"] if len(set(data.block.tolist())) < data.n_poses else [])]
     for name in ("session", "group"):
         is_stated = any((getattr(rows, name) != "").any() for rows in data.observations)
@@ -109,8 +112,9 @@ def format_measurements(
     body = [([pose], {}) for pose in range(data.n_poses) if pose not in measured] + body
     for poses, cells in body:
         pose = LINK.join(data.labels[pose] for pose in poses)
-        cells |= {"pose": pose, USE_COLUMN.name: (uses or {}).get(pose, "")}
+        cells |= {"pose": pose}
         if len(poses) == 1:
+            cells[USE_COLUMN.name] = HELD_OUT if data.is_held_out[poses[0]] else FIT
             cells |= {name: values[poses[0]] for name, values in of_poses.items()}
             cells["block"] = data.block[poses[0]]
         lines.append(",".join(c.format(cells[c.name]) if c.name in cells else "" for c in columns))
@@ -147,7 +151,7 @@ def format_data_sheet(
     instrument: Instrument,
     readings: ArrayLike,
     labels: Sequence[str] = (),
-    uses: Mapping[str, str] | None = None,
+    is_held_out: ArrayLike | None = None,
 ) -> str:
     """Return a measurement file with poses and empty measured values, to be filled in.
 
@@ -156,7 +160,8 @@ def format_data_sheet(
     robot : its actuators become columns.
     instrument : states the poses, session and group of each kind.
     readings : (n, a) [SI] of the poses to be measured.
-    labels : names of the poses; default "1", "2", ... uses : see `format_measurements`.
+    labels : names of the poses; default "1", "2", ...
+    is_held_out : (n,) poses to hold out; without it, the file has no column `use`.
 
     Raises
     ------
@@ -176,8 +181,14 @@ def format_data_sheet(
                 sensor.kind, sensor.rows, empty, sigma, sensor.session, sensor.group
             )
         )
-    data = Measurements(robot.name, np.asarray(readings), tuple(rows), labels=tuple(labels))
-    return format_measurements(data, robot, uses=uses)
+    data = Measurements(
+        robot.name,
+        np.asarray(readings),
+        tuple(rows),
+        labels=tuple(labels),
+        is_held_out=np.array([] if is_held_out is None else is_held_out, dtype=bool),
+    )
+    return format_measurements(data, robot, states_use=is_held_out is not None)
 
 
 def _label_kinds(kinds: Sequence[Kind]) -> list[str]:

@@ -91,9 +91,7 @@ def format_plan_data(plan: Plan) -> str:
     ]
     instrument = replace(plan.instrument, sensors=sensors)
     labels = plan.poses.labels
-    held_out = zip(labels, plan.poses.held_out, strict=True)
-    uses = {label: HELD_OUT if is_held_out else FIT for label, is_held_out in held_out}
-    return format_data_sheet(plan.robot, instrument, readings, labels, uses)
+    return format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
 
 
 def refuse_plan_folder(path: Path, force: bool) -> None:
