@@ -8,13 +8,24 @@ import numpy as np
 import pytest
 
 from loopcal.apply import validate
-from loopcal.diagnose import compute_pose_errors, find_moved_setups
+from loopcal.diagnose import compute_noise_floor, compute_row_errors, find_moved_setups
 from loopcal.errors import DataError
 from loopcal.estimate import identify
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
+from loopcal.measure import (
+    KINDS,
+    Gaussian,
+    Instrument,
+    Observations,
+    Pose,
+    Position,
+    Sensor,
+    simulate,
+)
+from loopcal.measure.kinds.error_groups import list_error_groups
 from tests import zoo
 from tests.estimate.problems import (
+    UM,
     bed_points,
     hexapod,
     hexapod_data,
@@ -43,24 +54,60 @@ def validation(split_data):
     return validate(identify(hexapod(), split_data[0]), split_data[1])
 
 
+def make_pose_rows(measured: np.ndarray) -> Observations:
+    """Return rows of full poses (r, 6) whose residuals are given separately."""
+    kind = Pose().with_tool(np.eye(4))
+    return Observations.from_sigma(kind, np.arange(len(measured)), measured, UM)
+
+
 def test_error_indices_equal_their_formulas():
-    errors = compute_pose_errors(np.array([[3.0, 0.0, -4.0]]) * MM, np.array([[2e-3, 0.0, 0.0]]))
+    residual = np.array([[2e-3, 0.0, 0.0, 3.0 * MM, 0.0, -4.0 * MM]])
+    errors = compute_row_errors([make_pose_rows(np.zeros((1, 6)))], [residual])
     assert errors.position[0] == pytest.approx(5 * MM)
     assert errors.orientation[0] == pytest.approx(2e-3)
-    assert errors.position_balance[0] == pytest.approx(7 * MM)
-    assert errors.orientation_balance[0] == pytest.approx(2e-3)
+    assert errors["position"].balance[0] == pytest.approx(7 * MM)
+    assert errors["orientation"].balance[0] == pytest.approx(2e-3)
 
 
 def test_unmeasured_quantities_have_no_error_index():
-    heights = compute_pose_errors(
-        np.array([[np.nan, np.nan, 1.0], [np.nan, np.nan, np.nan]]) * MM, np.zeros((2, 0))
-    )
-    assert heights.position[0] == pytest.approx(MM)
-    assert np.isnan(heights.position[1])
-    assert np.isnan(heights.orientation).all()
-    assert np.isnan(heights.position_balance).all()
-    assert heights.statistics("position").count == 1
-    assert heights.statistics("orientation").count == 0
+    measured = np.full((2, 6), np.nan)
+    measured[0, 5] = 0.0
+    errors = compute_row_errors([make_pose_rows(measured)], [np.full((2, 6), MM)])
+    assert errors.position == pytest.approx([MM])
+    assert errors["position"].measured == ("z",)
+    assert np.isnan(errors["position"].balance).all()
+    assert errors.statistics("position").count == 1
+    assert errors.statistics("orientation").count == 0
+    assert list(errors.quantities) == ["position"]
+
+
+def test_position_errors_are_those_of_each_target():
+    """One row with three targets has three position errors; the noise floor uses the same rows."""
+    places = np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+    kind = Position(targets=("a", "b", "c"), places=places)
+    rows = Observations.from_sigma(kind, np.arange(2), np.zeros((2, 9)), 2 * UM)
+    residual = np.zeros((2, 9))
+    residual[0] = 3 * MM, 0.0, 4 * MM, 0.0, MM, 0.0, 0.0, 0.0, 2 * MM
+    errors = compute_row_errors([rows], [residual])
+    assert errors.position == pytest.approx([5 * MM, 0.0, MM, 0.0, 2 * MM, 0.0], abs=1e-18)
+    assert errors["position"].targets == ("a", "a", "b", "b", "c", "c")
+    assert errors["position"].rows.tolist() == [0, 1] * 3
+    floor = compute_noise_floor([rows])
+    assert floor.position == pytest.approx(2 * UM * np.sqrt(3.0))
+    noise = np.random.default_rng(0).normal(size=(20000, 6, 3)) * 2 * UM
+    largest = np.linalg.norm(noise, axis=2).max(axis=1)
+    assert floor.max["position"] == pytest.approx(np.median(largest), rel=0.01)
+
+
+@pytest.mark.parametrize("kind_class", KINDS.values(), ids=list(KINDS))
+def test_every_residual_of_a_kind_belongs_to_one_error(kind_class):
+    for kind in kind_class.examples():
+        groups = list_error_groups(kind)
+        columns = [i for group in groups for i in group.columns]
+        assert sorted(columns) == list(range(len(kind.noise_columns)))
+        assert all(len(group.columns) <= 3 for group in groups)
+        length = kind.name in ("distance", "separation")
+        assert all((group.quantity == "length") == length for group in groups)
 
 
 def test_errors_of_held_out_poses_are_at_the_noise_after_calibration(validation):

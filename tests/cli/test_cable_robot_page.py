@@ -45,7 +45,7 @@ def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, cap
         capsys.readouterr()
         assert main([*command.split(), *["--verbose"] * command.startswith("calibrate")]) == 0
     printed = read_table_rows(capsys.readouterr().out)
-    assert len(printed) == 28  # errors, 21 parameters, 4 motors, 2 statistics
+    assert len(printed) == 32  # 2 errors, 3 kinds, 21 parameters, 4 motors, 2 statistics
     assert [
         row
         for block in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)

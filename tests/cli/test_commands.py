@@ -54,7 +54,7 @@ def test_calibrate_estimates_the_truth_and_writes_a_complete_run_folder(run, tmp
     code, out, err = run("calibrate hexapod-42 measurements.csv -o out/run --hold-out 0.25")
     assert code == 0, err
     assert "leg6.length" in out
-    assert "Error on 10 held-out rows" in out
+    assert "Errors at 10 held-out poses" in out
     assert sorted(p.name for p in (tmp_path / "out" / "run").iterdir()) == [
         "arrays.npz",
         "result.json",
@@ -120,7 +120,7 @@ def test_validate_needs_measurements_that_were_not_fitted(run) -> None:
     assert run(SIMULATE.replace("--seed 3", "--seed 43"))[0] == 0
     code, out, _ = run("validate run again.csv")
     assert code == 0
-    assert "Error on 40 measured rows" in out
+    assert "Errors at 40 measured poses" in out
     assert run("validate run again.csv --limit-angle 1urad")[0] == 2
     assert json.loads(run("validate run again.csv --json")[1])["passed"] is True
 

@@ -30,7 +30,7 @@ def test_calibrate_prints_the_numbers_of_the_page(page, capsys) -> None:
     assert printed
     assert main(command[1].split()) == 0
     rows = read_table_rows(capsys.readouterr().out)
-    assert len(rows) == 7  # the error and six parameters
+    assert len(rows) == 8  # rms and largest error, and six parameters
     assert read_table_rows(printed[1]) == rows
     result = json.loads(Path("run/result.json").read_text())
     assert result["verdict"] == "undecided"

@@ -167,7 +167,7 @@ def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root)
     out = capsys.readouterr().out
     # heights and distances mixed in millimeters increase, though chi-square decreases from 18.9
     assert "larger after calibration" not in out
-    assert "Error divided by sigma (rms): 1.21 times smaller after calibration" in out
+    assert "Error divided by sigma (rms): within the noise before and after calibration" in out
     rows = read_table_rows(out)
     table = read_table_rows(page.split("for each kind and for all:")[1].split("\n## ")[0])
     assert len(table) == 3
@@ -204,7 +204,7 @@ def test_seven_contradictory_heights_fail_without_naming_an_outlier(
     import_record, capsys, name, height, times
 ) -> None:
     """Two printers as probed, and one with an error of 0.3 mm (15 sigma) in one height."""
-    import_record(name)
+    import_record(name, " --sigma-height 0.02mm")
     lines = Path("probes.csv").read_text().split("\n")
     for i, line in enumerate(lines):
         if line.startswith(f"height{height},"):
@@ -218,6 +218,42 @@ def test_seven_contradictory_heights_fail_without_naming_an_outlier(
     (conflict,) = checked["undecided"]
     assert len(conflict["poses"]) == 7
     assert conflict["times"] == pytest.approx(times, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "times"), [(CALIBRATED[0], 10.0), (CALIBRATED[1], 4.39), (CALIBRATED[2], 0.838)]
+)
+def test_assumed_sigma_of_few_heights_is_a_note_that_asks_for_it(
+    import_record, capsys, name, times
+) -> None:
+    """With one degree of freedom the noise cannot be estimated, and no gate depends on it."""
+    import_record(name)
+    assert "# noise_source: assumed" in Path("probes.csv").read_text()
+    assert main(["calibrate", "printer.yaml", "probes.csv", "-o", "run"]) == 0
+    assert capsys.readouterr().out.startswith("Undecided: ")
+    result = json.loads(Path("run/result.json").read_text())
+    (noise,) = [f for f in result["findings"] if f["code"].startswith("noise.")]
+    assert (noise["code"], noise["severity"]) == ("noise.assumed", "warning")
+    assert noise["data"]["ratio"] == pytest.approx(times, rel=5e-3)
+    (sigma,) = noise["data"]["sigmas"]
+    assert sigma["assumed"] == {"value": pytest.approx(0.02), "unit": "mm"}
+    assert sigma["estimated"]["value"] == pytest.approx(0.02 * times, rel=5e-3)
+
+
+def test_assumed_sigma_is_estimated_where_the_data_can(import_record, capsys) -> None:
+    """Ten degrees of freedom: heights and distances are 3.2 times as bad as assumed."""
+    import_record(WITH_DISTANCES)
+    words = "calibrate printer.yaml probes.csv -o run --method ls"
+    assert main(words.split()) == 0
+    result = json.loads(Path("run/result.json").read_text())
+    assert result["fit"]["noise"] == "estimated"
+    assert result["fit"]["sigma_scale"] == pytest.approx(3.18, rel=5e-3)
+    (noise,) = [f for f in result["findings"] if f["code"] == "noise.assumed-replaced"]
+    assert noise["severity"] == "info"
+    assert [s["kind"] for s in noise["data"]["sigmas"]] == ["component", "separation"]
+    # a stated sigma is tested: the gate is not met
+    import_record(WITH_DISTANCES, " --sigma-height 0.02mm --sigma-distance 0.1mm")
+    assert main([*words.split(), "--force"]) == 2
 
 
 @pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])

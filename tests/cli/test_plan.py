@@ -49,7 +49,7 @@ def test_filled_in_plan_is_calibrated_with_its_held_out_poses(folder, capsys):
         == 0
     )
     assert run("calibrate linear-delta filled.csv -o run --limit-position 0.5mm") == 0
-    assert "Error on 3 held-out rows" in capsys.readouterr().out
+    assert "Errors at 3 held-out poses" in capsys.readouterr().out
     plan = json.loads((folder / "plan" / "plan.json").read_text())
     held = [pose["name"] for pose in plan["poses"] if pose["use"] == "held-out"]
     result = json.loads((folder / "run" / "result.json").read_text())
@@ -333,7 +333,7 @@ def test_second_plan_builds_on_the_measurements_of_the_first(folder, capsys):
     assert known == pytest.approx(promised, rel=1e-3)
     assert run(fill.format("two", "two")) == 0
     assert run("calibrate linear-delta one.csv two.csv -o run") == 0
-    assert "Error on 5 held-out rows" in capsys.readouterr().out
+    assert "Errors at 5 held-out poses" in capsys.readouterr().out
 
 
 def test_data_file_and_sheet_state_the_same_digits(folder):

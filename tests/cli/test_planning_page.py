@@ -40,7 +40,7 @@ def test_commands_of_the_page_run_and_calibrate_the_machine(page, capsys) -> Non
         if "-o plan " in command:
             assert said.startswith(printed[1])
         if " calibrate " in command:
-            assert "Error on 5 held-out rows" in said
+            assert "Errors at 5 held-out poses" in said
             assert said.startswith("Calibrated")
         if "--accuracy" in command:
             assert "poses reach an expected position error of 0.02 mm (rms)" in said

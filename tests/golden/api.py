@@ -530,6 +530,18 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
     return result
 
 
+def add_millimeters_and_radians(errors: diagnose.PoseErrors) -> Array:
+    """Return position [mm] plus orientation error [rad], which core has no more, of the rows that
+    measure both.
+    """
+    position, orientation = errors["position"], errors["orientation"]
+    single = np.array([not target for target in position.targets], dtype=bool)
+    rows = position.rows[single]
+    both = np.isin(orientation.rows, rows)
+    millimeters = position.size[single][np.isin(rows, orientation.rows)] / 1e-3
+    return millimeters + orientation.size[both]
+
+
 def report_validation(found: Fit, data: Data) -> Report:
     """Report held-out errors."""
     checked = apply.validate(found, data)
@@ -537,7 +549,7 @@ def report_validation(found: Fit, data: Data) -> Report:
         name.replace(" ", "_"): {
             "position": e.position,
             "orientation": e.orientation,
-            "integrated": e.position / 1e-3 + e.orientation,  # mm + rad, which core has no more
+            "integrated": add_millimeters_and_radians(e),
         }
         for name, e in checked.errors().items()
         if name.startswith("predicted")

@@ -31,12 +31,24 @@ EXCEPTIONS: dict[str, tuple[float, str, str]] = {
 }
 """Case: (factor on tolerances, pattern of the paths that have them, reason)."""
 
+BY_TARGET = (
+    "errors are those of each target and quantity: three targets have three position errors, and "
+    "wires have length errors; rows that measure no such quantity have no entry in place of NaN"
+)
+REDEFINED: dict[str, str] = {
+    "validation/hexapod-42/targets": BY_TARGET,
+    "validation/hexapod-42/three-kinds": BY_TARGET,
+}
+"""Case with another meaning than in the first version: reason. Only its errors of poses were
+collected again.
+"""
+
 GOLDEN = compare.read()
 
 
 def test_fixture_has_exactly_the_registered_cases():
     assert list(GOLDEN) == list(CASES)
-    assert set(CASES) >= set(EXCEPTIONS)
+    assert set(CASES) >= set(EXCEPTIONS) | set(REDEFINED)
 
 
 @pytest.mark.parametrize(

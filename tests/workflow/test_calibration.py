@@ -291,7 +291,7 @@ def test_held_out_poses_without_a_value_that_counts_are_refused(robot, data) -> 
 
 def test_errors_on_fitted_poses_are_not_called_a_validation(robot, data) -> None:
     text = str(calibrate(robot, data))
-    assert "Errors on the fitted poses (rms), which are optimistic:\n  position: " in text
+    assert "Errors at the fitted poses, which are optimistic:\n  position (rms): " in text
     assert "Validation" not in text
 
 

@@ -11,6 +11,6 @@ from loopcal.apply.compensation import Compensation as Compensation
 from loopcal.apply.compensation import compensate as compensate
 from loopcal.apply.reused_rows import collect_fitted_rows as collect_fitted_rows
 from loopcal.apply.reused_rows import find_reused_rows as find_reused_rows
-from loopcal.apply.validation import NoiseFloor as NoiseFloor
 from loopcal.apply.validation import Validation as Validation
 from loopcal.apply.validation import validate as validate
+from loopcal.diagnose import NoiseFloor as NoiseFloor

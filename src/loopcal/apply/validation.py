@@ -8,6 +8,10 @@ calibration predicts at the measured readings, so the machine's answer before ca
 measured. After calibration the readings change slightly; the machine is assumed to differ from the
 identified model as it does at the measured readings. The part of the commanded error that no
 actuator can remove is reported as not compensable.
+
+"Before" is a baseline of the setup alone: the geometry before calibration with the frames, targets,
+surfaces and offsets that fit it best, on the same rows to which the calibration was fitted. So it
+contains no error of the setup, and before and after differ by the geometry only.
 """
 
 from __future__ import annotations
@@ -20,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from loopcal.apply.validation_findings import (
-    DIMENSIONS,
-    QUANTITIES,
+    ErrorChange,
     check_limit,
     check_limits,
+    describe_frame,
     group_setup,
     owner_of,
     report_few_rows,
@@ -33,56 +37,44 @@ from loopcal.apply.validation_findings import (
 )
 from loopcal.diagnose import (
     KindErrors,
+    NoiseFloor,
     PoseErrors,
     compare_predictions,
-    compute_kind_errors,
+    compute_noise_floor,
     compute_row_errors,
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
-from loopcal.measure import Measurements, Observations, check_actuators
+from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
-from loopcal.units import Dimension, Unit
-
-
-@dataclass(frozen=True)
-class NoiseFloor:
-    """Expected rms of the prediction errors of an exact geometry, NaN for what no row measures.
-
-    floor^2 = mean over rows of sum over components sigma^2, with the length components for the
-    position and the angles for the orientation. The noise of uncertain joint readings is not part
-    of it, so with such readings the true floor is higher.
-
-    Attributes
-    ----------
-    position : [m]. orientation : [rad].
-    """
-
-    position: float
-    orientation: float
+from loopcal.units import Unit
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
     """Errors on measured poses before and after calibration, over the r rows of all kinds.
 
+    Positions are compared target by target in the frame of their instrument, see `frame`.
+
     Attributes
     ----------
-    poses : (r,) labels.
-    before, after : prediction errors. commanded_before, commanded_after : pose errors of the
+    poses : (r,) labels of the rows.
+    before, after : prediction errors by quantity. commanded_before, commanded_after : errors of the
         commanded machine. not_compensable : the part of `commanded_after` that no actuator removes.
-    noise_floor : the error that the measurement noise alone causes.
+    noise_floor : the errors that the measurement noise alone causes.
     unreachable : labels of poses that one of the two geometries cannot reach; no statistic contains
         them.
-    limit_position, limit_angle : limits [m], [rad] on the largest prediction error after
-        calibration; None for no limit.
-    units : of each quantity (position, orientation), in which it is shown.
+    limit_position, limit_angle : limits [m], [rad] on the largest prediction error of a position
+        and of an orientation after calibration; None for no limit.
+    units : of each quantity, in which it is shown.
     findings : limits that are exceeded (failures), and notes.
     alignment : names of frames, targets and surfaces: `kept` from the fit, `fitted` to these rows.
     kinds : prediction errors divided by sigma, of each kind and, last, of all.
     setup_count : number of setup parameters that were fitted to these rows.
+    absorbed : number of residuals that estimated poses take up, where a reading is missing.
+    judged : number of poses whose rows or redundant readings are compared.
     """
 
     poses: tuple[str, ...]
@@ -102,6 +94,8 @@ class Validation:
     )
     kinds: tuple[KindErrors, ...] = ()
     setup_count: int = 0
+    absorbed: int = 0
+    judged: int = 0
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -115,8 +109,8 @@ class Validation:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What the rows measure: position, orientation, or both."""
-        return tuple(q for q in QUANTITIES if self.after.statistics(q).count)
+        """What the rows measure: "position", "orientation", "length" and others."""
+        return tuple(self.after.quantities)
 
     @property
     def has_several_kinds(self) -> bool:
@@ -126,30 +120,45 @@ class Validation:
         return len(self.kinds) > 2
 
     @property
-    def n_judged(self) -> int:
-        """Largest number of rows that measure one quantity."""
-        return max((self.after.statistics(q).count for q in self.quantities), default=0)
-
-    @property
     def values_left(self) -> int:
         """Measured values that are left to check the geometry: all, less one for each setup
-        parameter that was fitted to them. With none left every geometry predicts these rows.
+        parameter that was fitted to them, and less those that estimated poses take up. With none
+        left every geometry predicts these rows.
         """
-        return self.kinds[-1].count - self.setup_count
+        return self.kinds[-1].count - self.setup_count - self.absorbed
+
+    @property
+    def frame(self) -> str:
+        """In which frame the errors are, in words: "absolute", or the setup that was fitted."""
+        return describe_frame(self.after, (*self.alignment["kept"], *self.alignment["fitted"]))
 
     def improvement(self, index: str = "position", statistic: str = "rms") -> float:
         """Return how many times smaller a statistic of the prediction error became."""
         after = getattr(self.after.statistics(index), statistic)
         return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
 
-    def improvements(self) -> dict[str, float]:
-        """Return how many times smaller (rms) the error of each quantity became.
+    def changes(self) -> dict[str, ErrorChange]:
+        """Return the change of the rms error of each quantity.
 
-        The key is "weighted", the error of all kinds divided by sigma, where kinds are mixed.
+        The key is "weighted", the error of all kinds divided by sigma, where kinds are mixed or
+        only actuator readings are compared.
         """
-        if self.has_several_kinds:
-            return {"weighted": self.kinds[-1].improvement}
-        return {quantity: self.improvement(quantity) for quantity in self.quantities}
+        if self.has_several_kinds or not self.quantities:
+            every = self.kinds[-1]
+            return {"weighted": ErrorChange(every.before, every.after, 1.0, every.count)}
+        return {
+            quantity: ErrorChange(
+                self.before.statistics(quantity).rms,
+                errors.statistics.rms,
+                self.noise_floor.rms[quantity],
+                int(np.isfinite(errors.components).sum()),
+            )
+            for quantity, errors in self.after.quantities.items()
+        }
+
+    def improvements(self) -> dict[str, float]:
+        """Return how many times smaller (rms) the error of each quantity became; see `changes`."""
+        return {quantity: change.times for quantity, change in self.changes().items()}
 
     def errors(self) -> dict[str, PoseErrors]:
         """Return the errors by name."""
@@ -164,23 +173,20 @@ class Validation:
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
         rows = "row" if len(self.poses) == 1 else "rows"
-        lines = [f"Validation on {len(self.poses)} {rows} (rms):", *self.describe_rms()]
+        lines = [f"Validation on {len(self.poses)} {rows}, {self.frame}:", *self.describe_rms()]
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
 
     def describe_rms(self) -> list[str]:
         """Return one line for each quantity: its rms before and after, and the noise floor."""
         lines = []
-        for quantity in self.quantities:
-            shown = self.units[quantity]
-            values = [
-                self.before.statistics(quantity).rms,
-                self.after.statistics(quantity).rms,
-                getattr(self.noise_floor, quantity),
-            ]
-            before, after, floor = (f"{value / shown.factor_to_si:.3g}" for value in values)
+        for quantity, change in self.changes().items():
+            unit = self.units.get(quantity)
+            factor, symbol = (1.0, "sigma") if unit is None else (unit.factor_to_si, unit.symbol)
+            name = "all kinds" if unit is None else quantity
+            values = (change.before, change.after, change.noise_floor)
+            before, after, floor = (f"{value / factor:.3g} {symbol}" for value in values)
             lines.append(
-                f"  {quantity}: {before} {shown} before, {after} {shown} after calibration "
-                f"(noise floor {floor} {shown})"
+                f"  {name} (rms): {before} before, {after} after calibration (noise floor {floor})"
             )
         return lines
 
@@ -200,6 +206,7 @@ class Validation:
             "reasons": [str(finding) for finding in self.failures],
             "notes": [str(f) for f in self.findings if f.severity is not Severity.FAILURE],
             "findings": self.findings,
+            "frame": self.frame,
             "alignment": self.alignment,
             "kinds": [vars(kind) for kind in self.kinds],
         }
@@ -251,7 +258,7 @@ def validate(
     missed = compared.before.differences(rows, compared.reached)
     after, usable = compute_row_errors(rows, errors_after), compared.usable
     limits = {"position": limit_position, "orientation": limit_angle}
-    units = dict(zip(QUANTITIES, map(robot.get_unit, DIMENSIONS), strict=True))
+    units = {name: robot.get_unit(errors.dimension) for name, errors in after.quantities.items()}
     left_out = ~usable & compared.predictable
     return Validation(
         poses=compared.rows,
@@ -262,7 +269,7 @@ def validate(
             rows, [m - r for m, r in zip(missed, errors_after, strict=True)]
         ),
         not_compensable=compute_row_errors(rows, missed),
-        noise_floor=_compute_noise_floor(rows),
+        noise_floor=compute_noise_floor(rows),
         unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
         limit_position=limit_position,
         limit_angle=limit_angle,
@@ -270,13 +277,15 @@ def validate(
         findings=(
             *check_limits(after, compared.rows, limits, units),
             *report_moved_setup(robot, compared, kept),
-            *report_left_out(data, usable, compared.predictable),
+            *report_left_out(data, compared),
             *report_few_rows(after),
             *report_setup(compared.before, compared.after),
         ),
         alignment=group_setup(compared.after),
-        kinds=compute_kind_errors(rows, errors_before, errors_after),
+        kinds=compared.kind_errors(),
         setup_count=compared.after.fitted_count,
+        absorbed=int(compared.absorbed.sum()),
+        judged=compared.count_judged(),
     )
 
 
@@ -318,20 +327,3 @@ def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, 
         for name, value in values.items()
         if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
     }
-
-
-def _compute_noise_floor(rows: Sequence[Observations]) -> NoiseFloor:
-    """Return the noise floor of rows with their stated covariances."""
-    return NoiseFloor(_rms_noise(rows, Dimension.LENGTH), _rms_noise(rows, Dimension.ANGLE))
-
-
-def _rms_noise(rows: Sequence[Observations], dimension: Dimension) -> float:
-    """Return the root mean square over the rows that measure this dimension."""
-    squares = []
-    for o in rows:
-        chosen = np.array([column.dimension is dimension for column in o.kind.noise_columns])
-        present = o.present & chosen
-        variance = np.where(present, np.diagonal(o.covariance, axis1=1, axis2=2), 0.0)
-        squares.append(variance.sum(axis=1)[present.any(axis=1)])
-    square = np.concatenate(squares) if squares else np.zeros(0)
-    return float(np.sqrt(square.mean())) if len(square) else float("nan")

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,23 +17,61 @@ from loopcal.diagnose import (
 )
 from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings.wording import list_names
 from loopcal.measure import Measurements
 from loopcal.measure.array_checks import check_number
 from loopcal.mechanism import Mechanism
-from loopcal.typing import BoolArray
-from loopcal.units import Dimension, Unit
-
-QUANTITIES: tuple[str, ...] = ("position", "orientation")
-"""Indices of errors that every validation shows."""
-
-DIMENSIONS = (Dimension.LENGTH, Dimension.ANGLE)
-"""Their dimensions."""
+from loopcal.numerics.chi_square import compute_chi_square_quantile
+from loopcal.units import Unit
 
 FEW_ROWS = 5
 """Number of rows below which an error cannot be judged.
 
 At 4 rows the rms of noise alone varies by a third.
 """
+
+
+GREW = 1.1
+"""Factor by which an error must grow to be called larger."""
+
+NOISE_LEVEL = 1e-3
+"""Probability that noise alone exceeds what is called the noise."""
+
+
+@dataclass(frozen=True)
+class ErrorChange:
+    """The rms error of one quantity before and after calibration.
+
+    Attributes
+    ----------
+    before, after, noise_floor : [m], [rad] or [sigma]. values : number of measured components.
+    """
+
+    before: float
+    after: float
+    noise_floor: float
+    values: int
+
+    @property
+    def times(self) -> float:
+        """How many times smaller the error became."""
+        return self.before / self.after if self.after > 0.0 else np.inf
+
+    @property
+    def largest_noise(self) -> float:
+        """The rms that noise alone exceeds with the probability `NOISE_LEVEL`."""
+        square = compute_chi_square_quantile(max(self.values, 1), NOISE_LEVEL) / max(self.values, 1)
+        return self.noise_floor * float(np.sqrt(square))
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether noise alone explains the error before and after."""
+        return max(self.before, self.after) <= self.largest_noise
+
+    @property
+    def has_grown(self) -> bool:
+        """Whether the error became larger by more than a tenth, and noise does not explain it."""
+        return self.after > GREW * self.before and self.after > self.largest_noise
 
 
 def owner_of(name: str) -> str:
@@ -49,6 +88,21 @@ def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
     return {"kept": tuple(kept), "fitted": tuple(fitted)}
 
 
+def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
+    """Return the frame of errors in words.
+
+    Parameters
+    ----------
+    setup : frames, targets and surfaces that were estimated. Without any, positions and
+        orientations are those in the stated frame of the instrument.
+    """
+    if setup:
+        return f"after the best fit of {list_names(setup, 3)}"
+    if {"position", "orientation"} & errors.quantities.keys():
+        return "absolute (stated frame)"
+    return "without any frame"
+
+
 def report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]:
     """Report where the setup parameters come from."""
     before, after = group_setup(first), group_setup(last)
@@ -63,7 +117,7 @@ def report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]
 
 def report_few_rows(after: PoseErrors) -> list[Finding]:
     """Report quantities that too few rows measure."""
-    counts = {quantity: after.statistics(quantity).count for quantity in QUANTITIES}
+    counts = {name: len(np.unique(errors.rows)) for name, errors in after.quantities.items()}
     return [
         report_finding("validation.few-rows", quantity=quantity, count=count)
         for quantity, count in counts.items()
@@ -71,18 +125,21 @@ def report_few_rows(after: PoseErrors) -> list[Finding]:
     ]
 
 
-def report_left_out(data: Measurements, valid: BoolArray, determined: BoolArray) -> list[Finding]:
-    """Report poses with rows that no statistic contains."""
+def report_left_out(data: Measurements, compared: PredictionComparison) -> list[Finding]:
+    """Report poses with rows that no statistic contains, and poses that were estimated."""
     has_rows = np.zeros(data.n_poses, dtype=bool)
     for o in data.observations:
         has_rows[o.rows[o.weight > 0.0]] = True
+    estimated = compared.estimated & compared.usable
     cases = {
-        "validation.unreachable-poses": ~valid & determined,
-        "validation.missing-readings": has_rows & ~determined,
+        "validation.unreachable-poses": ~compared.usable & compared.predictable,
+        "validation.missing-readings": has_rows & ~compared.predictable,
+        "validation.poses-estimated": estimated,
     }
     named = {code: [data.labels[i] for i in np.flatnonzero(out)] for code, out in cases.items()}
+    extra = {"validation.poses-estimated": {"absorbed": int(compared.absorbed.sum())}}
     return [
-        report_finding(code, names=tuple(f"pose {name}" for name in names))
+        report_finding(code, names=tuple(f"pose {name}" for name in names), **extra.get(code, {}))
         for code, names in named.items()
         if names
     ]
@@ -138,18 +195,19 @@ def check_limits(
     for quantity, limit in limits.items():
         if limit is None:
             continue
-        values = getattr(after, quantity)
-        if not np.isfinite(values).any():
+        errors = after[quantity]
+        if not len(errors.rows):
             findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
             continue
-        worst, unit = int(np.nanargmax(values)), units[quantity]
-        if values[worst] > limit:
+        worst, unit = int(np.argmax(errors.size)), units[quantity]
+        if errors.size[worst] > limit:
             findings.append(
                 report_finding(
                     "gates.limit-exceeded",
                     quantity=quantity,
-                    pose=poses[worst],
-                    error=Quantity(float(values[worst]) / unit.factor_to_si, unit.symbol),
+                    pose=poses[errors.rows[worst]],
+                    target=errors.targets[worst],
+                    error=Quantity(float(errors.size[worst]) / unit.factor_to_si, unit.symbol),
                     limit=Quantity(limit / unit.factor_to_si, unit.symbol),
                 )
             )

@@ -45,6 +45,8 @@ HINTS = {
     "fit.low-weights": "exclude a pose with --drop POSE",
     "fit.no-prior": "use --method map",
     "fit.too-few-equations": "use --method map",
+    "noise.assumed": "use --sigma-height or another --sigma option of loopcal import, or write the "
+    "noise in the file",
     "noise.residuals-too-large": "exclude a pose with --drop POSE, or use --loss huber",
     "noise.residuals-too-small": "use --noise estimated",
     "noise.too-few-degrees": "use --noise given",

@@ -46,15 +46,17 @@ from loopcal.diagnose.parameter_subset import (
 )
 from loopcal.diagnose.parameter_subset import choose_model as choose_model
 from loopcal.diagnose.parameter_subset import nest_parameter_sets as nest_parameter_sets
-from loopcal.diagnose.prediction_errors import KindErrors as KindErrors
-from loopcal.diagnose.prediction_errors import PoseErrors as PoseErrors
 from loopcal.diagnose.prediction_errors import PosePredictions as PosePredictions
 from loopcal.diagnose.prediction_errors import PredictionComparison as PredictionComparison
 from loopcal.diagnose.prediction_errors import compare_predictions as compare_predictions
-from loopcal.diagnose.prediction_errors import compute_kind_errors as compute_kind_errors
-from loopcal.diagnose.prediction_errors import compute_pose_errors as compute_pose_errors
-from loopcal.diagnose.prediction_errors import compute_row_errors as compute_row_errors
 from loopcal.diagnose.prediction_errors import predict_poses as predict_poses
+from loopcal.diagnose.row_errors import KindErrors as KindErrors
+from loopcal.diagnose.row_errors import NoiseFloor as NoiseFloor
+from loopcal.diagnose.row_errors import PoseErrors as PoseErrors
+from loopcal.diagnose.row_errors import QuantityErrors as QuantityErrors
+from loopcal.diagnose.row_errors import compute_kind_errors as compute_kind_errors
+from loopcal.diagnose.row_errors import compute_noise_floor as compute_noise_floor
+from loopcal.diagnose.row_errors import compute_row_errors as compute_row_errors
 from loopcal.diagnose.suggestions import MeasurementSuggestion as MeasurementSuggestion
 from loopcal.diagnose.suggestions import describe_missing_equations as describe_missing_equations
 from loopcal.diagnose.suggestions import suggest_measurements as suggest_measurements

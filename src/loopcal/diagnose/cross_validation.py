@@ -18,12 +18,8 @@ from typing import Any
 import numpy as np
 
 from loopcal.diagnose.fit_checks.influence import iterate_blocks
-from loopcal.diagnose.prediction_errors import (
-    PoseErrors,
-    compare_predictions,
-    compute_row_errors,
-    join_errors,
-)
+from loopcal.diagnose.prediction_errors import compare_predictions
+from loopcal.diagnose.row_errors import PoseErrors, compute_row_errors, join_errors
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -174,9 +170,10 @@ def cross_validate(
         if held_out.n_rows:  # readings alone, of redundant actuators, have a score but no errors
             comparison = compare_predictions(robot, fitted, held_out)
             rows = comparison.data.observations
+            first = len(labels)
             labels += comparison.rows
-            before.append(compute_row_errors(rows, comparison.before.residuals(rows)))
-            after.append(compute_row_errors(rows, comparison.after.residuals(rows)))
+            before.append(compute_row_errors(rows, comparison.before.residuals(rows), first))
+            after.append(compute_row_errors(rows, comparison.after.residuals(rows), first))
         scores.append(_mean_square(fitted, held_out))
         scores_before.append(_mean_square(robot, held_out))
     return CrossValidation(

@@ -1,32 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors with which two geometries of a robot predict the same measurements, and their statistics.
+"""Predict the same measurements with two geometries of a robot.
 
 A prediction error is what a model predicts at the readings that were recorded, minus what was
-measured. With the components (dx, dy, dz) and (da, db, dc) of one measured row:
-
-    position     dQ1 = sqrt(dx^2 + dy^2 + dz^2)          [m]
-    orientation  dQ2 = sqrt(da^2 + db^2 + dc^2)          [rad]
-    balance      largest minus smallest component of one group
-
-Source: "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism", section
-4. Where only some components are measured, the sums run over those.
-
-Kinds of measurement are compared in units of their sigma: the root mean square of W r over all
-measured components, r the residuals and W the inverse Cholesky factor of their covariance. It is 1
-where the geometry explains everything but the noise. Without this division the least accurate
-instrument would decide alone.
+measured; `loopcal.diagnose.row_errors` has its statistics. Where readings do not determine a pose,
+because one is missing, the pose is estimated together with the rows at it; its errors are then
+residuals, and the pose takes up some of them. Readings of redundant actuators must agree on one
+pose, so they are rows themselves: true minus recorded readings at the pose that fits them best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from loopcal.diagnose.row_errors import READINGS, KindErrors, compute_kind_errors, summarize_kinds
 from loopcal.errors import DataError
-from loopcal.estimate.poses.prediction import predict_from_readings
+from loopcal.estimate.poses.prediction import PoseFit, fit_poses, predict_from_readings
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import (
     Measurements,
@@ -36,77 +27,10 @@ from loopcal.measure import (
     list_sensed_joints,
     select_joint_values,
 )
-from loopcal.mechanism import Mechanism, Solution, inverse
+from loopcal.mechanism import Mechanism, Solution, inverse, make_solution
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
-from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import Dimension
-
-INDICES = ("position", "orientation", "position_balance", "orientation_balance")
-
-
-@dataclass(frozen=True, eq=False)
-class Statistics:
-    """Maximum, root mean square, mean and standard deviation of an error over `count` rows.
-
-    All are NaN where no row has the error.
-    """
-
-    max: float
-    rms: float
-    mean: float
-    sd: float
-    count: int
-
-
-@dataclass(frozen=True, eq=False)
-class PoseErrors:
-    """Errors of r rows; NaN where a row measures no component of the group.
-
-    Attributes
-    ----------
-    position, orientation : (r,) [m], [rad].
-    position_balance, orientation_balance : (r,) [m], [rad].
-    """
-
-    position: FloatArray
-    orientation: FloatArray
-    position_balance: FloatArray
-    orientation_balance: FloatArray
-
-    def statistics(self, index: str) -> Statistics:
-        """Return the statistics of one of `INDICES`."""
-        values = getattr(self, index)
-        values = values[np.isfinite(values)]
-        if len(values) == 0:
-            return Statistics(np.nan, np.nan, np.nan, np.nan, 0)
-        sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
-        rms = float(np.sqrt(np.mean(values**2)))
-        return Statistics(float(values.max()), rms, float(values.mean()), sd, len(values))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return statistics and rows of every index, SI."""
-        return {i: {**vars(self.statistics(i)), "rows": getattr(self, i)} for i in INDICES}
-
-
-@dataclass(frozen=True)
-class KindErrors:
-    """Whitened errors of one kind of measurement, or of all kinds.
-
-    Attributes
-    ----------
-    kind : its name; "all" for all kinds. count : measured components over all its rows.
-    before, after : root mean square of the whitened residuals [sigma].
-    """
-
-    kind: str
-    count: int
-    before: float
-    after: float
-
-    @property
-    def improvement(self) -> float:
-        """Factor by which the error became smaller."""
-        return self.before / self.after if self.after > 0.0 else np.inf
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,19 +89,43 @@ class PredictionComparison:
     Attributes
     ----------
     data : the measurements with the compared rows only. rows : (r,) labels of those rows.
-    usable : (n,) poses that are compared. predictable : (n,) poses whose readings determine them.
+    usable : (n,) poses that are compared. predictable : (n,) poses that the data determine.
+    estimated : (n,) poses of these that were estimated together with their rows.
+    absorbed : (n,) number of residuals that each of these takes up.
     solution : poses of the geometry after. before, after : predictions of the two geometries.
     reached : poses that the geometry after reaches when it is commanded to those of `before`.
+    readings : errors of the readings of redundant actuators; None where there are none.
     """
 
     data: Measurements
     rows: tuple[str, ...]
     usable: BoolArray
     predictable: BoolArray
+    estimated: BoolArray
+    absorbed: IntArray
     solution: Solution
     before: PosePredictions
     after: PosePredictions
     reached: PosePredictions
+    readings: KindErrors | None
+
+    def count_judged(self) -> int:
+        """Return the number of poses that rows or redundant readings check."""
+        judged = np.zeros(len(self.usable), dtype=bool)
+        for o in self.data.observations:
+            judged[o.rows] = True
+        return int((self.usable if self.readings is not None else judged & self.usable).sum())
+
+    def kind_errors(self) -> tuple[KindErrors, ...]:
+        """Return the errors of each kind, readings among them, and last of all kinds."""
+        rows = self.data.observations
+        kinds = compute_kind_errors(rows, self.before.residuals(rows), self.after.residuals(rows))
+        if self.readings is None:
+            return kinds
+        some = (*kinds[:-1], self.readings)
+        return summarize_kinds(
+            {k.kind: np.array([1.0, k.before**2, k.after**2]) * k.count for k in some if k.count}
+        )
 
 
 def compare_predictions(
@@ -200,37 +148,78 @@ def compare_predictions(
     DataError
         No row counts, or no pose is reached by both geometries.
     """
-    rows = [
-        counted
-        for o in data.observations
-        if len(counted := o.take((o.weight > 0.0) & o.present.any(axis=1)))
-    ]
-    if not rows:
+    rows = tuple(o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
+    data = replace(data, observations=rows)
+    if not data.n_rows and after.program.sigma is None:
         raise DataError(report_finding("residuals.no-rows-to-predict"))
-    first, _ = predict_from_readings(before, data)
-    last, predictable = predict_from_readings(after, data)
-    commanded = inverse(after, first.T)
-    usable = first.converged & last.converged & commanded.converged & predictable
+    first, last = (
+        _locate_poses(robot, data, setup or {})
+        for robot, setup in ((before, setup_before), (after, setup_after))
+    )
+    predictable = first.is_determined & last.is_determined
+    commanded = inverse(after, first.solution.T)
+    reached = first.solution.converged & last.solution.converged & commanded.converged
+    usable = reached & predictable
     if not usable.any():
-        finding = _explain_unreached(after, predictable, first.converged, last.converged)
-        raise DataError(finding)
-    rows = [o.take(usable[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
+        solutions = (first.solution.converged, last.solution.converged)
+        raise DataError(_explain_unreached(after, predictable, *solutions))
+    rows = tuple(o.take(usable[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows)
     labels = tuple(
         "/".join(data.labels[i] for i in poses)
         for o in rows
         for poses in o.rows.reshape(len(o), -1)
     )
-    data = replace(data, observations=tuple(rows))
+    data = replace(data, observations=rows)
     return PredictionComparison(
         data,
         labels,
         usable,
         predictable,
-        last,
-        predict_poses(before, data, first, usable, setup_before or {}),
-        predict_poses(after, data, last, usable, setup_after or {}),
+        last.estimated,
+        np.where(last.estimated & usable, last.absorbed, 0),
+        last.solution,
+        predict_poses(before, data, first.solution, usable, setup_before or {}),
+        predict_poses(after, data, last.solution, usable, setup_after or {}),
         predict_poses(before, data, commanded, usable, None),
+        _compare_readings(first.readings, last.readings, usable),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _LocatedPoses:
+    """Poses of a geometry: from readings, or where `estimated` (n,) together with their rows.
+
+    `readings` is the fit of redundant readings alone; None where they are not redundant.
+    """
+
+    solution: Solution
+    is_determined: BoolArray
+    estimated: BoolArray
+    absorbed: IntArray
+    readings: PoseFit | None
+
+
+def _locate_poses(
+    robot: Mechanism, data: Measurements, setup: Mapping[str, float]
+) -> _LocatedPoses:
+    """Return the poses of a geometry, with setup parameters that are kept."""
+    solution, known = predict_from_readings(robot, data)
+    readings = None if robot.program.sigma is None else fit_poses(robot, data)
+    nothing = np.zeros(data.n_poses, dtype=np.int64)
+    if known.all() or not data.n_rows:
+        return _LocatedPoses(solution, known, np.zeros_like(known), nothing, readings)
+    fitted = fit_poses(robot, data, _fix_nuisance(data.nuisance_parameters, setup))
+    reached = fitted.solution.converged
+    estimated = ~known & fitted.is_determined & reached & (fitted.left > 0)
+
+    def choose(predicted: np.ndarray, of_rows: np.ndarray) -> np.ndarray:
+        mask = estimated.reshape(1, -1, *[1] * (predicted.ndim - 2))
+        return np.where(mask, of_rows, predicted)
+
+    state = map_arrays(choose, solution.state, fitted.solution.state)
+    q = np.where(estimated[:, None], fitted.solution.q, solution.q)
+    mixed = make_solution(robot, state, q)
+    return _LocatedPoses(mixed, known | estimated, estimated, fitted.absorbed, readings)
 
 
 def predict_poses(
@@ -254,95 +243,28 @@ def predict_poses(
     values, kept = unknowns.values(), ()
     if setup is not None and len(unknowns):
         kept = tuple(name for name in unknowns.table.names if name in setup)
-        entries = tuple(
-            p if p.name not in kept else replace(p, nominal=setup[p.name], free=False)
-            for p in unknowns.table.entries
-        )
-        values = guess_nuisance_values(
-            data, T, replace(unknowns, table=ParameterTable(entries)), joints
-        )
+        values = guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 
-def compute_row_errors(
-    observations: Sequence[Observations], residuals: Sequence[FloatArray]
-) -> PoseErrors:
-    """Return the errors of the rows of all kinds, one kind after the other.
-
-    Parameters
-    ----------
-    observations : of every kind. residuals : (r, m) [SI] of each.
-    """
-    kinds = []
-    for o, residual in zip(observations, residuals, strict=True):
-        shown = np.where(o.present, residual, np.nan)
-        length = np.array([column.dimension is Dimension.LENGTH for column in o.kind.noise_columns])
-        angle = np.array([column.dimension is Dimension.ANGLE for column in o.kind.noise_columns])
-        kinds.append(compute_pose_errors(shown[:, length], shown[:, angle]))
-    return join_errors(kinds)
-
-
-def compute_pose_errors(position: FloatArray, orientation: FloatArray) -> PoseErrors:
-    """Return the errors of rows from the components of the differences.
-
-    Parameters
-    ----------
-    position : (r, 3) [m] and orientation : (r, 3) [rad] components (or fewer columns, or none); NaN
-        where not measured. Orientation components may be a rotation vector or differences of
-        declared angles.
-    """
-    return PoseErrors(
-        _length(position), _length(orientation), _balance(position), _balance(orientation)
+def _fix_nuisance(nuisance: NuisanceParameters, kept: Mapping[str, float]) -> NuisanceParameters:
+    """Return the nuisance parameters with those that are kept fixed at their values [SI]."""
+    entries = tuple(
+        p if p.name not in kept else replace(p, nominal=kept[p.name], free=False)
+        for p in nuisance.table.entries
     )
+    return replace(nuisance, table=ParameterTable(entries))
 
 
-def join_errors(errors: Sequence[PoseErrors]) -> PoseErrors:
-    """Return the errors of several sets of rows as one set."""
-    joined = (
-        np.concatenate([np.zeros(0), *(getattr(rows, index) for rows in errors)])
-        for index in INDICES
-    )
-    return PoseErrors(*joined)
-
-
-def compute_kind_errors(
-    observations: Sequence[Observations], before: list[FloatArray], after: list[FloatArray]
-) -> tuple[KindErrors, ...]:
-    """Return the whitened errors of each kind and, last, of all kinds.
-
-    Parameters
-    ----------
-    observations : of every kind. before, after : residuals (r, m) [SI] of each.
-    """
-    totals: dict[str, FloatArray] = {}
-    for o, *residuals in zip(observations, before, after, strict=True):
-        squares = [
-            ((o.whitener @ np.where(o.present, r, 0.0)[..., None]) ** 2).sum() for r in residuals
-        ]
-        total = totals.setdefault(o.kind.name, np.zeros(3))
-        total += [o.present.sum(), *squares]
-    totals["all"] = np.sum(list(totals.values()), axis=0)
-    return tuple(
-        KindErrors(
-            name, int(n), *(float(np.sqrt(square / n)) if n else np.nan for square in squares)
-        )
-        for name, (n, *squares) in totals.items()
-    )
-
-
-def _length(components: FloatArray) -> FloatArray:
-    """Return the root of the sum of squares of the measured components, NaN without any."""
-    length = np.sqrt(np.nansum(components**2, axis=1))
-    return np.where(np.isfinite(components).any(axis=1), length, np.nan)
-
-
-def _balance(components: FloatArray) -> FloatArray:
-    """Return the largest minus the smallest measured component, NaN with fewer than two."""
-    present = np.isfinite(components)
-    high = np.where(present, components, -np.inf).max(axis=1, initial=-np.inf)
-    low = np.where(present, components, np.inf).min(axis=1, initial=np.inf)
-    enough = present.sum(axis=1) > 1
-    return np.where(enough, np.where(enough, high, 0.0) - np.where(enough, low, 0.0), np.nan)
+def _compare_readings(
+    first: PoseFit | None, last: PoseFit | None, usable: BoolArray
+) -> KindErrors | None:
+    """Return the whitened errors of redundant readings of two geometries, at usable poses."""
+    if first is None or last is None:
+        return None
+    squares = [(fit.reading_residuals[usable] ** 2).sum() for fit in (first, last)]
+    count = int(last.left[usable].sum())
+    return summarize_kinds({READINGS: np.array([count, *squares])})[0]
 
 
 def _explain_unreached(

@@ -118,6 +118,12 @@ def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
         raise EstimationError(report_finding("fit.no-measured-value"))
 
 
+def count_spare_equations(problem: Problem) -> int:
+    """Return the number of equations less that of parameters and nuisance parameters."""
+    nuisance = 0 if problem.nuisance is None else problem.nuisance.unpenalized_count
+    return int(problem.equations[0]) - problem.parameters - nuisance
+
+
 def check_count(problem: Problem, data: Measurements, method: Method, allow_fewer: bool) -> None:
     """Refuse fewer equations than parameters where the method has no prior to fill the gap.
 

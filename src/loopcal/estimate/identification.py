@@ -17,9 +17,11 @@ from loopcal.estimate.fit_input import (
     check_rows,
     check_start,
     check_types,
+    count_spare_equations,
     exclude_poses,
 )
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import compute_posterior, scale_variances
 from loopcal.estimate.inference.residual_test import run_residual_test
@@ -89,11 +91,12 @@ def identify(
     options = merge_options(options, method, loss)
     free = select_free_parameters(robot)
     default = LeastSquares() if options.prior is not None else None
-    method = adapt_method(options.method or default, free.assumed, options.noise)
-    options = replace(options, method=method)
     data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
     problem = problem_of(free, data, options.nuisance)
     check_rows(problem, data, robot)
+    options = choose_noise(options, data, count_spare_equations(problem))
+    method = adapt_method(options.method or default, free.assumed, options.noise)
+    options = replace(options, method=method)
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
@@ -237,8 +240,9 @@ def _assemble(
     """
     status = DescentStatus(int(fit.status[0]))
     converged = status is DescentStatus.CONVERGED
+    noise = name_noise(options, data)
     test = run_residual_test(
-        fit.decomposition, fit.penalty, options.noise, options.loss is not None, converged
+        fit.decomposition, fit.penalty, noise, options.loss is not None, converged
     )
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = _test_prior(free, fit, _method(options))
@@ -258,7 +262,7 @@ def _assemble(
     )
     findings = [
         *([] if converged else [history.finding]),
-        test.finding,
+        report_noise(data, robot, test),
         *report_divergence(free, fit.deviation[0], _method(options), converged),
         *([conflict.finding] if converged and conflict is not None and conflict.conflict else []),
         *(combination.finding for combination in unidentifiable),

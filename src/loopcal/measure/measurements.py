@@ -118,6 +118,12 @@ class Measurements:
         return sum(rows.n_residuals for rows in self.observations)
 
     @property
+    def noise_source(self) -> str:
+        """Whether the noise of the rows is "stated", "assumed", or "mixed"."""
+        assumed = {rows.is_noise_assumed for rows in self.observations}
+        return "mixed" if len(assumed) > 1 else "assumed" if True in assumed else "stated"
+
+    @property
     def nuisance_parameters(self) -> NuisanceParameters:
         """The nuisance parameters of the observations, with their stated values."""
         return collect_nuisance_parameters(self.observations, self.labels, self.stated_values)

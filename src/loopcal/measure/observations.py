@@ -46,6 +46,9 @@ class Observations:
         [degC], NaN where missing.
     source : text, optional
         Where the rows come from, such as the name of a file; for messages.
+    is_noise_assumed : bool, optional
+        Whether nobody stated the covariance: a program that wrote the rows assumed it. It then
+        decides no quality gate.
 
     Attributes
     ----------
@@ -71,6 +74,7 @@ class Observations:
     group: TextArray = field(default_factory=lambda: np.array(""))
     context: Mapping[str, FloatArray] = field(default_factory=dict)
     source: str = ""
+    is_noise_assumed: bool = False
     present: BoolArray = field(init=False)
     whitener: FloatArray = field(init=False)
 

@@ -19,11 +19,7 @@ from loopcal.report.numbers import (
 )
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block, format_list
-from loopcal.report.validation_view import (
-    build_error_summary,
-    describe_improvements,
-    view_error_statistics,
-)
+from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
 from loopcal.workflow import CalibrationReport
 
 Hint = Callable[[Finding], str | None]
@@ -65,14 +61,11 @@ def view_calibration(
 
 
 def _view_errors(report: CalibrationReport) -> list[Block]:
-    """Return the table of errors, on held-out poses or else on the fitted ones."""
+    """Return the tables of errors, at held-out poses or else at the fitted ones."""
     if report.validation is not None:
-        n = len(report.validation.poses)
-        caption = f"Error on {n} held-out {'row' if n == 1 else 'rows'} (rms)"
-        return [build_error_summary(report.validation, caption)]
+        return view_errors(report.validation, "held-out")
     if report.fitted_errors is not None:
-        caption = "Error on the fitted poses (rms), which is optimistic"
-        return [build_error_summary(report.fitted_errors, caption)]
+        return view_errors(report.fitted_errors, "fitted (optimistic)")
     return []
 
 

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from loopcal.apply import Validation
+from loopcal.apply.validation_findings import FEW_ROWS, ErrorChange
 from loopcal.findings import Severity
 from loopcal.report.numbers import ROUNDING, format_number
 from loopcal.report.tables import Column, Table, word_column
@@ -14,33 +17,59 @@ SIMILAR = 5e-3
 
 
 def build_error_summary(validation: Validation, caption: str, with_before: bool = True) -> Table:
-    """Return the rms errors before and after calibration beside the noise floor.
-
-    Where several kinds of measurement are mixed, the errors are divided by sigma and the noise
-    floor is 1.
-    """
-    before = (Column("before"),) if with_before else ()
-    numbers = (*before, Column("after" if with_before else "error"), Column("noise floor"))
-    columns = (word_column("error"), *numbers, word_column("unit"))
+    """Return rms and largest error of each quantity before and after, beside the noise floor."""
+    floor = validation.noise_floor
     rows = []
-    if validation.has_several_kinds:
-        for kind in validation.kinds:
-            name = "all kinds" if kind.kind == "all" else kind.kind
-            rows.append((name, (kind.before, kind.after, 1.0), "sigma"))
-    else:
-        for quantity in validation.quantities:
-            unit = validation.units[quantity]
-            values = (
-                validation.before.statistics(quantity).rms / unit.factor_to_si,
-                validation.after.statistics(quantity).rms / unit.factor_to_si,
-                getattr(validation.noise_floor, quantity) / unit.factor_to_si,
-            )
-            rows.append((quantity, values, unit.symbol))
-    cells = tuple(
-        (name, *(format_number(x, 3) for x in values[0 if with_before else 1 :]), unit)
-        for name, values, unit in rows
+    for quantity in validation.quantities:
+        before, after = (e.statistics(quantity) for e in (validation.before, validation.after))
+        name, unit = name_quantity(validation, quantity), validation.units[quantity]
+        for metric, key, noise in (("rms", "rms", floor.rms), ("largest", "max", floor.max)):
+            values = (getattr(before, key), getattr(after, key), noise[quantity])
+            shown = (format_number(x / unit.factor_to_si, 3) for x in values)
+            rows.append((name, metric, str(after.count), *shown, unit.symbol))
+    return _drop_before(_build(caption, "quantity", tuple(rows)), with_before)
+
+
+def build_kind_summary(validation: Validation, with_before: bool = True) -> list[Table]:
+    """Return the errors of each kind divided by sigma; no table where one quantity says it all."""
+    if not validation.has_several_kinds and validation.quantities:
+        return []
+    rows = tuple(
+        (
+            "all kinds" if kind.kind == "all" else kind.kind,
+            "rms",
+            str(kind.count),
+            *(format_number(x, 3) for x in (kind.before, kind.after, kind.noise_floor)),
+            "sigma",
+        )
+        for kind in validation.kinds
     )
-    return Table(caption, columns, cells)
+    return [_drop_before(_build("Errors divided by sigma", "kind", rows), with_before)]
+
+
+def name_quantity(validation: Validation, quantity: str) -> str:
+    """Return the name of a quantity, with the components of a position that is measured in part."""
+    measured = validation.after[quantity].measured
+    is_part = quantity == "position" and len(measured) < 3
+    return f"{quantity} {' '.join(measured)}" if is_part else quantity
+
+
+def _build(caption: str, subject: str, rows: tuple[tuple[str, ...], ...]) -> Table:
+    """Return a table of errors."""
+    numbers = (Column("count"), Column("before"), Column("after"), Column("noise floor"))
+    words = (word_column(subject), word_column("metric"))
+    return Table(caption, (*words, *numbers, word_column("unit")), rows)
+
+
+def _drop_before(table: Table, with_before: bool) -> Table:
+    """Return a table without the errors before calibration, where there is no such geometry."""
+    if with_before:
+        return table
+    place = [column.title for column in table.columns].index("before")
+    columns = tuple(c for i, c in enumerate(table.columns) if i != place)
+    named = tuple(replace(c, title="error") if c.title == "after" else c for c in columns)
+    rows = tuple(tuple(cell for i, cell in enumerate(row) if i != place) for row in table.rows)
+    return Table(table.caption, named, rows)
 
 
 def _build_error_statistics(validation: Validation, with_before: bool) -> Table:
@@ -61,9 +90,10 @@ def _build_error_statistics(validation: Validation, with_before: bool) -> Table:
             numbers = (statistics.max, statistics.rms, statistics.mean, statistics.sd)
             cells = (format_number(x / unit.factor_to_si, 3) for x in numbers)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
-    numeric = (Column(title) for title in ("rows", "max", "rms", "mean", "sd"))
+    numeric = (Column(title) for title in ("count", "largest", "rms", "mean", "sd"))
     columns = (word_column("error"), word_column("of"), *numeric, word_column("unit"))
-    return Table("Error statistics", columns, tuple(rows))
+    caption = f"Error statistics (rows x targets), {validation.frame}"
+    return Table(caption, columns, tuple(rows))
 
 
 def view_error_statistics(validation: Validation, with_before: bool = True) -> list[Block]:
@@ -77,7 +107,7 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
 def is_fully_compensable(validation: Validation) -> bool:
     """Return whether the actuators can correct all of the measured error."""
     errors = validation.not_compensable
-    return all(
+    return bool(validation.quantities) and all(
         errors.statistics(quantity).max / validation.units[quantity].factor_to_si < ROUNDING
         for quantity in validation.quantities
     )
@@ -85,11 +115,30 @@ def is_fully_compensable(validation: Validation) -> bool:
 
 def describe_improvements(validation: Validation) -> list[str]:
     """Return how much each error changed by calibration, as lines."""
+    if validation.judged < FEW_ROWS:
+        return []
     lines = []
-    for quantity, smaller in validation.improvements().items():
-        name = "Error divided by sigma" if quantity == "weighted" else f"{quantity} error"
-        lines.append(f"{name[0].upper()}{name[1:]} (rms): {_compare(smaller)}.")
+    for quantity, change in validation.changes().items():
+        name = "error divided by sigma" if quantity == "weighted" else f"{quantity} error"
+        lines.append(f"{name[0].upper()}{name[1:]} (rms): {_compare(change)}.")
     return lines
+
+
+def view_errors(validation: Validation, what: str, with_before: bool = True) -> list[Block]:
+    """Return the tables of errors; their captions name the rows, the count and the frame.
+
+    Parameters
+    ----------
+    what : of the rows, such as "held-out". with_before : whether there is a geometry before
+        calibration to compare with.
+    """
+    n = validation.judged
+    poses = f"{n} {what} {'pose' if n == 1 else 'poses'}"
+    blocks: list[Block] = []
+    if validation.quantities:
+        caption = f"Errors at {poses}, {validation.frame}"
+        blocks.append(build_error_summary(validation, caption, with_before))
+    return [*blocks, *build_kind_summary(validation, with_before)]
 
 
 def view_validation(validation: Validation, with_before: bool, verbose: bool) -> list[Block]:
@@ -99,9 +148,7 @@ def view_validation(validation: Validation, with_before: bool, verbose: bool) ->
     ----------
     with_before : whether there is a geometry before calibration to compare with.
     """
-    n = len(validation.poses)
-    caption = f"Error on {n} measured {'row' if n == 1 else 'rows'} (rms)"
-    blocks: list[Block] = [build_error_summary(validation, caption, with_before)]
+    blocks = view_errors(validation, "measured", with_before)
     if with_before:
         blocks += describe_improvements(validation)
     notes = [f for f in validation.findings if f.severity is not Severity.FAILURE]
@@ -112,12 +159,14 @@ def view_validation(validation: Validation, with_before: bool, verbose: bool) ->
     return blocks
 
 
-def _compare(smaller: float) -> str:
-    """Return in words how many times smaller an error became."""
-    if abs(smaller - 1.0) < SIMILAR:
+def _compare(change: ErrorChange) -> str:
+    """Return in words how much an error changed."""
+    if change.is_noise:
+        return "within the noise before and after calibration"
+    if abs(change.times - 1.0) < SIMILAR:
         return "the same before and after calibration"
-    if smaller > 1.0:
-        return f"{smaller:.3g} times smaller after calibration"
-    if smaller > 0.0:
-        return f"{1.0 / smaller:.3g} times larger after calibration"
+    if change.times > 1.0:
+        return f"{change.times:.3g} times smaller after calibration"
+    if change.times > 0.0:
+        return f"{1.0 / change.times:.3g} times larger after calibration"
     return "larger after calibration"

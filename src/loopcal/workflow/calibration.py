@@ -35,9 +35,6 @@ from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import DataSplit, split_data
 
-GREW = 1.1
-"""Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
-
 STEPS = 5
 """Steps that the progress callback counts: conventions, model, fit, examination, suggestions."""
 
@@ -236,20 +233,21 @@ def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Fin
         return [report_finding("workflow.no-held-out-poses"), *unreachable]
     if errors is None:
         return []
-    findings = list(errors.findings)
-    if errors.n_judged < FEW_ROWS:
-        findings.append(
-            report_finding("workflow.few-held-out-poses", count=errors.n_judged, needed=FEW_ROWS)
-        )
-    elif errors.values_left < FEW_ROWS:
+    if errors.judged < FEW_ROWS:
+        few = report_finding("workflow.few-held-out-poses", count=errors.judged, needed=FEW_ROWS)
+        return [*errors.findings, few]
+    if errors.values_left < FEW_ROWS:
         values, setup = errors.kinds[-1].count, errors.setup_count
         held_out_setup = report_finding("workflow.held-out-setup", values=values, setup=setup)
-        return [*findings, held_out_setup]  # such errors may grow from rounding to rounding
-    for quantity, smaller in errors.improvements().items():
-        larger = 1.0 / smaller if smaller > 0.0 else float("inf")
-        if larger > GREW:
-            findings.append(report_finding("gates.errors-grew", quantity=quantity, times=larger))
-    return findings
+        return [*errors.findings, held_out_setup]
+    return [
+        *errors.findings,
+        *(
+            report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
+            for quantity, change in errors.changes().items()
+            if change.has_grown
+        ),
+    ]
 
 
 def _report_freedoms(fit: Identification) -> list[Finding]:

@@ -31,7 +31,7 @@ from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
 TOP = 3
 """Findings that a summary shows."""
 
-FITTED_ERRORS = "Errors on the fitted poses (rms), which are optimistic:"
+FITTED_ERRORS = "Errors at the fitted poses, which are optimistic:"
 """Heading of the errors where no pose was held out."""
 
 

@@ -162,7 +162,7 @@ def fit_without(
     solved = d.deviation(d.solution(penalty))
     influence = compute_influence(problem, kept, member, d, penalty, weight, solved)
     inside, scale = (influence.degrees > 0) & ~excluded, 1.0
-    if noise == "estimated":
+    if noise != "given":
         distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
         scale = estimate_scale_of(distance, degrees.astype(np.float64)) if inside.any() else np.nan
     return PartialFit(excluded, influence, scale, int(np.isfinite(penalty).sum()))

@@ -245,7 +245,7 @@ def _summarize(
         return (report_finding("outliers.not-testable"),)
     if blocks == 1:
         return (report_finding("outliers.single-block"),)
-    if fit.residual_test.noise == "estimated" and round(fit.residual_test.dof) <= 1:
+    if fit.residual_test.noise != "given" and round(fit.residual_test.dof) <= 1:
         return (report_finding("outliers.unknown-noise"),)
     findings = []
     if count := counts["outliers"]:

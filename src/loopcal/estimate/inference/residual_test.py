@@ -40,7 +40,7 @@ class ResidualTest:
     degrees : degrees of freedom of chi_square if model, noise and prior are right.
     p_value : probability of a larger chi_square; NaN where nothing can be tested.
     dof : equations minus the number of parameters that the method effectively uses.
-    noise : "given" or "estimated".
+    noise : "given", "estimated", or "assumed" where nobody stated it.
     sigma_scale : factor on the stated sigmas. With given noise it is 1, unless the test rejects the
         residuals: then the intervals are wider by this factor.
     intervals : whether intervals are given at all.
@@ -106,7 +106,8 @@ def run_residual_test(
 
     Parameters
     ----------
-    decomposition, penalty : of the fit. noise : "given" or "estimated".
+    decomposition, penalty : of the fit. noise : "given", "estimated" or "assumed"; with assumed
+        noise the test is a note.
     weighted : whether a loss chose the weights by the residuals, so that chi_square has no known
         distribution.
     converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor

@@ -9,14 +9,16 @@ docs/theory/uncertain-readings.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.problem_construction import make_problem
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, NuisanceParameters, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism, Solution, forward, make_solution
 from loopcal.parameters import ParameterTable
-from loopcal.typing import BoolArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SAME_RATIO = 1e-9
 """Relative difference of sigma ratios below which a pose's readings are weighted as the robot
@@ -45,19 +47,62 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
     ratio = sigma / np.array(robot.program.sigma)
     if np.isfinite(ratio).all() and np.ptp(ratio, axis=1).max() <= SAME_RATIO * ratio.min():
         return forward(robot, data.readings), np.ones(data.n_poses, dtype=bool)
-    return _fit_readings(robot, fill_in_reading_sigma(robot, data))
+    located = fit_poses(robot, data)
+    return located.solution, located.is_determined
 
 
-def _fit_readings(robot: Mechanism, data: Measurements) -> tuple[Solution, BoolArray]:
-    """Return poses where redundant readings fit best by their sigmas, and which are determined."""
-    nothing = np.zeros(0)
-    fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-    no_nuisance = NuisanceParameters(ParameterTable(()), ())
-    problem = make_problem(
-        fixed, data.readings[None], data.reading_sigma, (), 1, no_nuisance, lambda _: data
-    )
-    z = np.zeros((1, 0))
-    estimates = problem.solve(z, problem.start(z)).estimates
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """Poses of a robot where readings and rows fit best.
+
+    Attributes
+    ----------
+    solution : of n poses. is_determined : (n,) poses that the data determine.
+    absorbed : (n,) number of residuals that each pose takes up; poses that rows link are counted
+        at the first of them. left : (n,) number of residuals of its linked poses that are left.
+    reading_residuals : (n, actuators) true minus recorded readings in units of their sigma, zero
+        where exact or not taken.
+    """
+
+    solution: Solution
+    is_determined: BoolArray
+    absorbed: IntArray
+    left: IntArray
+    reading_residuals: FloatArray
+
+
+def fit_poses(
+    robot: Mechanism, data: Measurements, nuisance: NuisanceParameters | None = None
+) -> PoseFit:
+    """Return the poses where uncertain readings and all rows fit best at this geometry.
+
+    Parameters
+    ----------
+    data : with at least one uncertain reading. nuisance : with fixed values; those without are
+        fitted as well. None leaves the rows out: readings alone locate the poses.
+
+    Raises
+    ------
+    DataError
+        A redundant reading is stated to be exact.
+    """
+    data, nothing = fill_in_reading_sigma(robot, data), np.zeros(0)
+    if nuisance is None:
+        data = replace(data, observations=())
+        nuisance = NuisanceParameters(ParameterTable(()), ())
+    free = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
+    problem, z = problem_of(free, data, nuisance), np.zeros((1, 0))
+    fitted = problem.solve(z, problem.start(z))
+    estimates = fitted.estimates
     assert estimates is not None
-    solution = make_solution(robot, estimates.states.state, estimates.states.q[0])
-    return solution, ~estimates.is_undetermined[0]
+    assert problem.member is not None
+    states, member = estimates.states, problem.member
+    absorbed = np.zeros(data.n_poses, dtype=np.int64)
+    absorbed[np.unique(member, return_index=True)[1]] = estimates.rank[0]
+    return PoseFit(
+        make_solution(robot, states.state, states.q[0]),
+        ~estimates.is_undetermined[0],
+        absorbed,
+        (problem.component_count[0] - estimates.rank[0])[member],
+        problem.residuals(z, fitted)[-1].whitened[0],
+    )

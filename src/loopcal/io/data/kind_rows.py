@@ -22,7 +22,12 @@ from loopcal.io.data.columns import (
     name_measured,
     refuse_unknown_columns,
 )
-from loopcal.io.data.kind_settings import list_kind_settings, read_kind, read_noise
+from loopcal.io.data.kind_settings import (
+    list_kind_settings,
+    read_kind,
+    read_noise,
+    read_noise_source,
+)
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import EXAMPLES
@@ -40,6 +45,8 @@ SETTINGS: Mapping[str, str] = {
     "kinds": "label -> kind, settings and noise, in files with several kinds",
     "noise": "standard deviation of each noise column, with its unit; by name or pattern, such as "
     '`"*.x": 5 um`',
+    "noise_source": "`assumed` where nobody stated the noise, as in imported files; by default "
+    "`stated`. Assumed noise decides no quality gate",
     "unknowns": "name or pattern -> prior knowledge of a setup parameter (frame, target, surface, "
     "offset), or `fixed`",
     "session": "session of all rows whose column states none",
@@ -54,12 +61,16 @@ POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
 
 @dataclass(frozen=True)
 class KindRows:
-    """A kind in a file: its noise [SI] by column, its rows, and the place of its settings."""
+    """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
+
+    `is_noise_assumed` where the settings say that nobody stated the noise.
+    """
 
     kind: Kind
     noise: dict[str, float]
     rows: IntArray
     location: Location
+    is_noise_assumed: bool = False
 
 
 def has_measured_values(table: Table) -> bool:
@@ -130,6 +141,7 @@ def read_observations(
             group=_read_names(table, "group", rows),
             context=beside,
             source=str(table.path),
+            is_noise_assumed=entry.is_noise_assumed,
         )
     return observations, tuple(table.place(int(row)) for row in rows)
 
@@ -142,8 +154,12 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
         kind = read_kind(file, content, ()).with_tool(robot.tool)
         refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
         rows = np.arange(len(table.rows))
-        return (KindRows(kind, read_noise(file, content, kind, ()), rows, ()),)
-    allowed = [key for key in SETTINGS if key not in ("kind", "noise")]
+        noise, is_assumed = (
+            read_noise(file, content, kind, ()),
+            read_noise_source(file, content, ()),
+        )
+        return (KindRows(kind, noise, rows, (), is_assumed),)
+    allowed = [key for key in SETTINGS if key not in ("kind", "noise", "noise_source")]
     refuse_unknown_keys(file, list(content), allowed)
     if not isinstance(several, dict) or not all(isinstance(n, dict) for n in several.values()):
         sentence = "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
@@ -157,10 +173,10 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     for label, node in several.items():
         place = ("kinds", label)
         kind = read_kind(file, node, place).with_tool(robot.tool)
-        allowed = ["kind", "noise", *list_kind_settings(type(kind))]
+        allowed = ["kind", "noise", "noise_source", *list_kind_settings(type(kind))]
         refuse_unknown_keys(file, list(node), allowed, place)
         noise, rows = read_noise(file, node, kind, place), np.flatnonzero(cells == label)
-        kinds.append(KindRows(kind, noise, rows, place))
+        kinds.append(KindRows(kind, noise, rows, place, read_noise_source(file, node, place)))
     return tuple(kinds)
 
 

@@ -7,6 +7,7 @@
     places: [[100 mm, 0 mm, 20 mm]]           lengths with units; directions as plain numbers
     noise: {x: 1 um, "*": 5 urad}             standard deviations of the noise columns, by name or
                                               pattern; the last one that matches counts
+    noise_source: assumed                     nobody stated this noise
 
 The record of a kind's settings is made from its dataclass, so that a new kind needs nothing here:
 arrays called T_.. are poses, those in DIRECTIONS are directions, other arrays and numbers are
@@ -42,6 +43,9 @@ NOISE_UNITS = {
     Dimension.ANGLE: ("urad", 1e-6),
     Dimension.RATIO: ("1", 1.0),
 }
+ASSUMED = "assumed"
+"""Word for noise that a program assumed."""
+
 LENGTHS = Annotated[list[Any] | None, Dimension.LENGTH]
 LENGTH = Annotated[float | None, Dimension.LENGTH]
 NUMBERS = Annotated[list[Any] | None, Dimension.RATIO]
@@ -114,7 +118,23 @@ def read_noise(
     return noise
 
 
-def format_kind(kind: Kind, noise: Mapping[str, float], tool: FloatArray) -> dict[str, str]:
+def read_noise_source(file: YamlFile, node: Mapping[str, Any], location: Location) -> bool:
+    """Return whether settings say that the noise is assumed.
+
+    Raises
+    ------
+    FileError : another word than `stated` or `assumed`.
+    """
+    source = node.get("noise_source", "stated")
+    if source not in (ASSUMED, "stated"):
+        sentence = f"noise_source is {source!r}; write {ASSUMED} where nobody stated the noise"
+        raise file.error(f"{sentence}, or stated", (*location, "noise_source"))
+    return bool(source == ASSUMED)
+
+
+def format_kind(
+    kind: Kind, noise: Mapping[str, float], tool: FloatArray, is_noise_assumed: bool = False
+) -> dict[str, str]:
     """Return key -> text of the settings of a kind.
 
     Keyword-only settings are left out where they are the default, or the robot's `tool`.
@@ -136,7 +156,7 @@ def format_kind(kind: Kind, noise: Mapping[str, float], tool: FloatArray) -> dic
         # nine digits: more would be rounding
         sigmas = (f"{n}: {s / units[n][1]:.9g} {units[n][0]}" for n, s in noise.items())
         texts["noise"] = f"{{{', '.join(sigmas)}}}"
-    return texts
+    return {**texts, "noise_source": ASSUMED} if is_noise_assumed else texts
 
 
 def format_quantity(value: float, dimension: Dimension) -> str:

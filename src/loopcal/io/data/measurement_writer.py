@@ -84,8 +84,11 @@ def format_measurements(
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
     tables = [_tabulate_rows(rows, robot) for rows in data.observations]
     reading_noise, of_poses = _tabulate_poses(data, robot)
-    noise = [common for common, _ in tables]
-    lines = _format_settings(robot, list(zip(labels, kinds, noise, strict=True)), remark)
+    texts = [
+        format_kind(rows.kind, noise, robot.tool, rows.is_noise_assumed)
+        for rows, (noise, _) in zip(data.observations, tables, strict=True)
+    ]
+    lines = _format_settings(robot, list(zip(labels, texts, strict=True)), remark)
     knowledge = format_stated_values(data.stated_values, data.nuisance_parameters.table.entries)
     for key, text in (("unknowns", knowledge), ("reading_noise", reading_noise)):
         lines += [f"# {key}: {text}"] if text else []
@@ -142,7 +145,8 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
         for label, kind in zip(labels, kinds, strict=True)
         if kind.poses_per_row > 1
     ]
-    settings = _format_settings(robot, list(zip(labels, kinds, noise, strict=True)), "")
+    texts = [format_kind(kind, of, robot.tool) for kind, of in zip(kinds, noise, strict=True)]
+    settings = _format_settings(robot, list(zip(labels, texts, strict=True)), "")
     return "\n".join([*settings, header, ADDED, *compared]) + "\n"
 
 
@@ -265,12 +269,11 @@ def _tabulate_rows(
 
 
 def _format_settings(
-    robot: Mechanism, kinds: Sequence[tuple[str, Kind, Mapping[str, float]]], remark: str
+    robot: Mechanism, settings: Sequence[tuple[str, Mapping[str, str]]], remark: str
 ) -> list[str]:
-    """Return the front matter."""
+    """Return the front matter, from the label and the settings of each kind."""
     lines = [f"## {' '.join(remark.split())}"] if remark else []
     lines += [f"# format: {FORMAT}", f"# robot: {robot.name}"]
-    settings = [(label, format_kind(kind, noise, robot.tool)) for label, kind, noise in kinds]
     if len(settings) == 1:
         return lines + [f"# {key}: {text}" for key, text in settings[0][1].items()]
     lines.append("# kinds:")

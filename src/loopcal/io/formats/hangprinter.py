@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,8 +125,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
         poses=len(samples.motors),
         motors=len(samples.names),
         known=len(samples.known),
-        sigma_line=Quantity(options.sigma_line / MM, "mm"),
-        sigma_position=Quantity(options.sigma_position / MM, "mm"),
+        sigma_line=Quantity(options.choose_noise("line") / MM, "mm"),
+        sigma_position=Quantity(options.choose_noise("position") / MM, "mm"),
     )
     text = format_robot(samples, anchors, path, options)
     return Imported(text, _build_measurements(samples, options), (finding, *samples.findings))
@@ -193,7 +193,7 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
 
 def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: ImportOptions) -> str:
     """Return the robot file, one limb a line; spools of equal radius share one parameter."""
-    sigma = options.sigma_line / MM
+    sigma = options.choose_noise("line") / MM
     lengths = np.linalg.norm(anchors, axis=1)
     drives = [
         f"  {name.lower()}: {{reads: angle, radius: {_format(gain)}, "
@@ -252,7 +252,9 @@ def _build_measurements(samples: Samples, options: ImportOptions) -> Measurement
     n, k = len(samples.motors), len(samples.known)
     known = samples.known * MM if k else np.full((n, FREEDOMS), np.nan)
     kind = Position().with_tool(np.eye(4))
-    rows = Observations.from_sigma(kind, np.arange(len(known)), known, options.sigma_position)
+    sigma = options.choose_noise("position")
+    rows = Observations.from_sigma(kind, np.arange(len(known)), known, sigma)
+    rows = replace(rows, is_noise_assumed=options.is_noise_assumed("line", "position"))
     labels = tuple(f"{'known' if i < k else 'sample'}{i + 1}" for i in range(n))
     return Measurements(options.name, samples.motors, (rows,), labels=labels)
 

@@ -182,8 +182,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
         "files.probe-noise-assumed",
         heights=len(probes.heights),
         distances=len(probes.distances),
-        sigma_height=Quantity(options.sigma_height / MM, "mm"),
-        sigma_distance=Quantity(options.sigma_distance / MM, "mm"),
+        sigma_height=Quantity(options.choose_noise("height") / MM, "mm"),
+        sigma_distance=Quantity(options.choose_noise("distance") / MM, "mm"),
     )
     return Imported(text, _build_measurements(probes, steps, options), (finding,))
 
@@ -272,12 +272,16 @@ def _build_measurements(
         kind = Component(components=("z",)).with_tool(np.eye(4))
         rows = [labels.index(label) for label, _ in probes.heights]
         measured = np.array([[value * MM] for _, value in probes.heights])
-        observations.append(Observations.from_sigma(kind, rows, measured, options.sigma_height))
+        sigma, is_assumed = options.choose_noise("height"), options.is_noise_assumed("height")
+        heights = Observations.from_sigma(kind, rows, measured, sigma)
+        observations.append(replace(heights, is_noise_assumed=is_assumed))
     if probes.distances:
         kind = Separation().with_tool(np.eye(4))
         pairs = [(labels.index(a), labels.index(b)) for a, b, _ in probes.distances]
         measured = np.array([[value * MM] for *_, value in probes.distances])
-        observations.append(Observations.from_sigma(kind, pairs, measured, options.sigma_distance))
+        sigma, is_assumed = options.choose_noise("distance"), options.is_noise_assumed("distance")
+        distances = Observations.from_sigma(kind, pairs, measured, sigma)
+        observations.append(replace(distances, is_noise_assumed=is_assumed))
     return Measurements(options.name, readings, tuple(observations), labels=labels)
 
 

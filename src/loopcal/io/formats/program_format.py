@@ -18,14 +18,15 @@ from loopcal.mechanism import Mechanism
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
 
-HEIGHT_SIGMA = 20e-6
-"""Standard deviation of a probed height where the probe is unknown [m]."""
-
-DISTANCE_SIGMA = 0.1e-3
-"""Standard deviation of a distance on a printed part, by calipers [m]."""
-
-LINE_SIGMA = POSITION_SIGMA = 1e-3
-"""Standard deviations of line lengths and of known positions of a cable robot [m]."""
+ASSUMED_NOISE: Mapping[str, float] = {
+    "height": 20e-6,
+    "distance": 0.1e-3,
+    "line": 1e-3,
+    "position": 1e-3,
+}
+"""Standard deviations [m] that are assumed where nobody states them: of a probed height, of a
+distance on a printed part, of line lengths and of known positions of a cable robot.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class ImportOptions:
     name : of the robot.
     sigma_height, sigma_distance : noise of probed heights and distances [m], which no format
         states. sigma_line, sigma_position : noise of lines and known positions of a cable robot
-        [m].
+        [m]. Where one is None it is assumed, see `choose_noise`.
     length_unit : symbol of the unit of lengths, for formats that state none.
     home_height : z of the home pose [m].
     closures : file of loop closures, for formats that keep them apart.
@@ -45,14 +46,23 @@ class ImportOptions:
     """
 
     name: str
-    sigma_height: float = HEIGHT_SIGMA
-    sigma_distance: float = DISTANCE_SIGMA
+    sigma_height: float | None = None
+    sigma_distance: float | None = None
     length_unit: str | None = None
     home_height: float | None = None
     closures: Path | None = None
     platform: str | None = None
-    sigma_line: float = LINE_SIGMA
-    sigma_position: float = POSITION_SIGMA
+    sigma_line: float | None = None
+    sigma_position: float | None = None
+
+    def choose_noise(self, what: str) -> float:
+        """Return the noise [m] of "height", "distance", "line" or "position": stated or assumed."""
+        stated: float | None = getattr(self, f"sigma_{what}")
+        return ASSUMED_NOISE[what] if stated is None else stated
+
+    def is_noise_assumed(self, *what: str) -> bool:
+        """Return whether any of these is assumed."""
+        return any(getattr(self, f"sigma_{of}") is None for of in what)
 
 
 @dataclass(frozen=True)

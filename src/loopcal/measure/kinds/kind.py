@@ -55,8 +55,9 @@ class Kind(ABC):
     wraps_angles : bool
         Whether differences of angles are wrapped into (-pi, pi].
     description : str
-        What is measured, for suggestions to measure it with known setup; "the" and the name where
-        empty.
+        What is measured, for suggestions to measure it with known setup; else "the" and the name.
+    length_error, angle_error : str
+        What its residuals are errors of, by dimension, such as "position"; see `list_error_groups`.
     allowed_unknown : tuple of str
         Setup items that `unknown` may list.
     unknown : tuple of str
@@ -68,6 +69,8 @@ class Kind(ABC):
     changes_with_pose: ClassVar[bool] = True
     wraps_angles: ClassVar[bool] = True
     description: ClassVar[str] = ""
+    length_error: ClassVar[str] = "length"
+    angle_error: ClassVar[str] = "angle"
     allowed_unknown: ClassVar[tuple[str, ...]] = ()
     unknown: tuple[str, ...] = ()
 
@@ -247,11 +250,7 @@ class Kind(ABC):
             If the kind senses joints and none are given.
         """
         if joints is None:
-            if self.sensed_joints:
-                raise DataError(
-                    f"the kind {self.name!r} needs the values of {', '.join(self.sensed_joints)}; "
-                    "pass them as `joints`"
-                )
+            self.stack_joints({}, np.zeros(0, dtype=np.intp))  # refuses where it senses any
             joints = np.empty((1, 1, 0))
         filled = np.where(np.isnan(measured), self.placeholder, measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance

@@ -39,6 +39,7 @@ class DirectionKind(Kind):
     unknown: tuple[str, ...] = ()
 
     inward: ClassVar[bool] = False
+    angle_error: ClassVar[str] = "orientation"
 
     @property
     @abstractmethod

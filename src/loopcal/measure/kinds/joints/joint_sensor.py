@@ -57,6 +57,8 @@ class JointSensor(Kind):
     unknown: tuple[str, ...] = ()
 
     name: ClassVar[str] = "joint"
+    length_error: ClassVar[str] = "joint length"
+    angle_error: ClassVar[str] = "joint angle"
     allowed_unknown: ClassVar[tuple[str, ...]] = ("offset",)
     changes_with_pose: ClassVar[bool] = False
     scope: ClassVar[str] = "session"

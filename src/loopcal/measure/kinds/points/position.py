@@ -43,6 +43,7 @@ class Position(TargetKind):
     """
 
     name: ClassVar[str] = "position"
+    length_error: ClassVar[str] = "position"
     per_target: ClassVar[tuple[Column, ...]] = POSITION_COLUMNS
 
     @classmethod

@@ -44,6 +44,8 @@ class ToolKind(Kind):
     frame: str = "frame"
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "tool")
+    length_error: ClassVar[str] = "position"
+    angle_error: ClassVar[str] = "orientation"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -48,6 +48,7 @@ class SurfaceKind(TargetKind):
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("surface", "targets")
     changes_with_pose: ClassVar[bool] = False
+    length_error: ClassVar[str] = "gap"
 
     def __post_init__(self) -> None:
         super().__post_init__()

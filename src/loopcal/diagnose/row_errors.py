@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of measured rows, by quantity and target, with their statistics and the noise floor.
+
+An error is the difference of one target (or of the tool) between prediction and measurement. With
+the components (d_1 .. d_c) of that difference that were measured:
+
+    size      sqrt(d_1^2 + .. + d_c^2)         [m] or [rad]
+    balance   largest minus smallest component, with two components or more
+
+A row with three targets has three position errors; statistics run over rows x targets. Which
+residuals belong together is what `list_error_groups` says.
+
+Kinds of measurement are compared in units of their sigma: the root mean square of W r over all
+measured components, r the residuals and W the inverse Cholesky factor of their covariance. It is 1
+where the geometry explains everything but the noise. Without this division the least accurate
+instrument would decide alone.
+
+The noise floor of a statistic is its value for an exact geometry, see `NoiseFloor`. Source of size
+and balance: "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism",
+section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from loopcal.measure import Observations
+from loopcal.measure.kinds.error_groups import list_error_groups
+from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
+
+MOST_COMPONENTS = 3
+"""Components of the largest error."""
+
+BISECTIONS = 60
+"""Bisections of the median of the largest error: each halves its interval."""
+
+READINGS = "actuator readings"
+"""Kind of the readings of redundant actuators, which must agree on one pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Maximum, root mean square, mean and standard deviation of `count` errors (rows x targets).
+
+    All are NaN where there is no error.
+    """
+
+    max: float
+    rms: float
+    mean: float
+    sd: float
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class QuantityErrors:
+    """Errors of one quantity: one entry for each measured row and target.
+
+    Attributes
+    ----------
+    dimension : of the errors. components : (e, 3) differences [SI], NaN where not measured.
+    rows : (e,) number of the row of each entry. targets : (e,) names; empty for the only one.
+    measured : names of the components that are measured, such as ("z",).
+    """
+
+    dimension: Dimension
+    components: FloatArray
+    rows: IntArray
+    targets: tuple[str, ...]
+    measured: tuple[str, ...]
+
+    @property
+    def size(self) -> FloatArray:
+        """(e,) root of the sum of squares of the measured components [m] or [rad]."""
+        return np.sqrt(np.nansum(self.components**2, axis=1))
+
+    @property
+    def balance(self) -> FloatArray:
+        """(e,) largest minus smallest measured component; NaN with fewer than two."""
+        present = np.isfinite(self.components)
+        high = np.where(present, self.components, -np.inf).max(axis=1, initial=-np.inf)
+        low = np.where(present, self.components, np.inf).min(axis=1, initial=np.inf)
+        enough = present.sum(axis=1) > 1
+        return np.where(enough, np.where(enough, high, 0.0) - np.where(enough, low, 0.0), np.nan)
+
+    @property
+    def statistics(self) -> Statistics:
+        """Statistics of the size."""
+        return compute_statistics(self.size)
+
+    def take(self, rows: IntArray) -> QuantityErrors:
+        """Return the errors of some rows only."""
+        kept = np.isin(self.rows, rows)
+        targets = tuple(t for t, is_kept in zip(self.targets, kept, strict=True) if is_kept)
+        return QuantityErrors(
+            self.dimension, self.components[kept], self.rows[kept], targets, self.measured
+        )
+
+
+NO_ERRORS = QuantityErrors(
+    Dimension.LENGTH, np.zeros((0, MOST_COMPONENTS)), np.zeros(0, np.intp), (), ()
+)
+"""Errors of a quantity that no row measures."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Errors of r rows by quantity: "position", "orientation", "length" and others.
+
+    Attributes
+    ----------
+    quantities : the errors of each quantity that some row measures.
+    """
+
+    quantities: Mapping[str, QuantityErrors] = field(default_factory=dict)
+
+    def __getitem__(self, quantity: str) -> QuantityErrors:
+        return self.quantities.get(quantity, NO_ERRORS)
+
+    @property
+    def position(self) -> FloatArray:
+        """(e,) sizes of the position errors [m], one for each row and target."""
+        return self["position"].size
+
+    @property
+    def orientation(self) -> FloatArray:
+        """(e,) sizes of the orientation errors [rad]."""
+        return self["orientation"].size
+
+    def statistics(self, quantity: str) -> Statistics:
+        """Return the statistics of the sizes of a quantity."""
+        return self[quantity].statistics
+
+    def take(self, rows: IntArray) -> PoseErrors:
+        """Return the errors of some rows only."""
+        taken = {name: errors.take(rows) for name, errors in self.quantities.items()}
+        return PoseErrors({name: errors for name, errors in taken.items() if len(errors.rows)})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return statistics, sizes, balances, rows and targets of every quantity, SI."""
+        return {
+            name: {
+                **vars(errors.statistics),
+                "errors": errors.size,
+                "balance": errors.balance,
+                "rows": errors.rows,
+                "targets": errors.targets,
+                "components": errors.measured,
+            }
+            for name, errors in self.quantities.items()
+        }
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Errors that an exact geometry would show, because the measurement itself has noise.
+
+    With the covariances S_i of the e errors: rms^2 = mean of trace S_i. The largest is the median
+    of the largest of e errors of that noise; the square of an error is taken as a multiple of
+    chi-square with the same mean and variance, which is exact for components of equal sigma. The
+    noise of uncertain joint readings is not part of it, so with such readings it is a lower bound.
+
+    Attributes
+    ----------
+    rms, max : by quantity [m] or [rad].
+    """
+
+    rms: Mapping[str, float]
+    max: Mapping[str, float]
+
+    @property
+    def position(self) -> float:
+        """Root mean square of the position error [m]; NaN where no row measures it."""
+        return self.rms.get("position", float("nan"))
+
+    @property
+    def orientation(self) -> float:
+        """Root mean square of the orientation error [rad]; NaN where no row measures it."""
+        return self.rms.get("orientation", float("nan"))
+
+
+@dataclass(frozen=True)
+class KindErrors:
+    """Whitened errors of one kind of measurement, or of all kinds.
+
+    Attributes
+    ----------
+    kind : its name; "all" for all kinds. count : measured components over all its rows.
+    before, after : root mean square of the whitened residuals [sigma].
+    noise_floor : the value for an exact geometry [sigma].
+    """
+
+    kind: str
+    count: int
+    before: float
+    after: float
+    noise_floor: float = 1.0
+
+    @property
+    def improvement(self) -> float:
+        """Factor by which the error became smaller."""
+        return self.before / self.after if self.after > 0.0 else np.inf
+
+
+def compute_statistics(values: FloatArray) -> Statistics:
+    """Return the statistics of errors (e,); NaN are not counted."""
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return Statistics(np.nan, np.nan, np.nan, np.nan, 0)
+    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
+    rms = float(np.sqrt(np.mean(values**2)))
+    return Statistics(float(values.max()), rms, float(values.mean()), sd, len(values))
+
+
+def compute_row_errors(
+    observations: Sequence[Observations], residuals: Sequence[FloatArray], first_row: int = 0
+) -> PoseErrors:
+    """Return the errors of the rows of all kinds, one kind after the other.
+
+    Parameters
+    ----------
+    observations : of every kind. residuals : (r, m) [SI] of each. first_row : number of the first.
+    """
+    parts: dict[str, list[QuantityErrors]] = {}
+    for o, residual in zip(observations, residuals, strict=True):
+        shown = np.where(o.present, residual, np.nan)
+        for group in list_error_groups(o.kind):
+            components = np.full((len(o), MOST_COMPONENTS), np.nan)
+            components[:, : len(group.columns)] = shown[:, list(group.columns)]
+            measured = np.isfinite(components).any(axis=1)
+            names = tuple(
+                name
+                for name, i in zip(group.components, group.columns, strict=True)
+                if o.present[:, i].any()
+            )
+            errors = QuantityErrors(
+                group.dimension,
+                components[measured],
+                first_row + np.flatnonzero(measured),
+                (group.target,) * int(measured.sum()),
+                names,
+            )
+            parts.setdefault(group.quantity, []).append(errors)
+        first_row += len(o)
+    joined = {name: _join(some) for name, some in parts.items()}
+    return PoseErrors({name: errors for name, errors in joined.items() if len(errors.rows)})
+
+
+def join_errors(errors: Sequence[PoseErrors]) -> PoseErrors:
+    """Return the errors of several sets of rows as one set; their row numbers must differ."""
+    names = dict.fromkeys(name for of_set in errors for name in of_set.quantities)
+    return PoseErrors(
+        {name: _join([e[name] for e in errors if name in e.quantities]) for name in names}
+    )
+
+
+def compute_kind_errors(
+    observations: Sequence[Observations], before: list[FloatArray], after: list[FloatArray]
+) -> tuple[KindErrors, ...]:
+    """Return the whitened errors of each kind and, last, of all kinds.
+
+    Parameters
+    ----------
+    observations : of every kind. before, after : residuals (r, m) [SI] of each.
+    """
+    totals: dict[str, FloatArray] = {}
+    for o, *residuals in zip(observations, before, after, strict=True):
+        squares = [
+            ((o.whitener @ np.where(o.present, r, 0.0)[..., None]) ** 2).sum() for r in residuals
+        ]
+        total = totals.setdefault(o.kind.name, np.zeros(3))
+        total += [o.present.sum(), *squares]
+    return summarize_kinds(totals)
+
+
+def summarize_kinds(totals: Mapping[str, FloatArray]) -> tuple[KindErrors, ...]:
+    """Return the errors of each kind and, last, of all kinds.
+
+    `totals` are (count, sum of squares before, sum of squares after) of each kind.
+    """
+    every = {**totals, "all": np.sum([np.zeros(3), *totals.values()], axis=0)}
+    return tuple(
+        KindErrors(
+            name, int(n), *(float(np.sqrt(square / n)) if n else np.nan for square in squares)
+        )
+        for name, (n, *squares) in every.items()
+    )
+
+
+def compute_noise_floor(observations: Sequence[Observations]) -> NoiseFloor:
+    """Return the noise floor of rows with their stated covariances."""
+    variances = [np.diagonal(o.covariance, axis1=1, axis2=2) for o in observations]
+    # errors whose components are the sigmas have the sums of the variances as squares
+    sigma = [np.sqrt(np.where(o.present, v, 0.0)) for o, v in zip(observations, variances)]  # noqa: B905
+    errors = compute_row_errors(observations, sigma)
+    return NoiseFloor(
+        {name: e.statistics.rms for name, e in errors.quantities.items()},
+        {name: _median_of_largest(e.components**2) for name, e in errors.quantities.items()},
+    )
+
+
+def _median_of_largest(variances: FloatArray) -> float:
+    """Return the median of the largest of e errors with variances (e, c), NaN where absent."""
+    mean, square = np.nansum(variances, axis=1), np.nansum(variances**2, axis=1)
+    mean, square = mean[mean > 0.0], square[mean > 0.0]
+    if not len(mean):
+        return float("nan")
+    degrees, unit = mean**2 / square, square / mean
+    low, high = 0.0, 1e3 * float(mean.max())
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        tail = compute_chi_square_tail(degrees, middle / unit)
+        is_below = np.log1p(-np.minimum(tail, 1.0 - 1e-300)).sum() < np.log(0.5)
+        low, high = (middle, high) if is_below else (low, middle)
+    return float(np.sqrt(high))
+
+
+def _join(parts: Sequence[QuantityErrors]) -> QuantityErrors:
+    """Return the errors of one quantity of several kinds or sets as one."""
+    names = dict.fromkeys(name for part in parts for name in part.measured)
+    return QuantityErrors(
+        parts[0].dimension,
+        np.concatenate([part.components for part in parts]),
+        np.concatenate([part.rows for part in parts]),
+        tuple(target for part in parts for target in part.targets),
+        tuple(names),
+    )
