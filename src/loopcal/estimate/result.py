@@ -25,6 +25,9 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray
 
+LAST_DIGITS = 3
+"""Digits of the values at which an iteration ended that did not converge."""
+
 
 @dataclass(frozen=True, eq=False)
 class KindResiduals:
@@ -205,43 +208,59 @@ class Identification:
         """Whitened sum of squares, see `ResidualTest`."""
         return self.residual_test.chi_square
 
+    def describe_statistics(self) -> str:
+        """Return rank and chi-square. Where the iteration did not converge they belong to no fit;
+        then return by how much it lowered the sum of squares, or nothing.
+        """
+        test, cost = self.residual_test, self.history.cost
+        if self.converged:
+            rank, value = f"Rank {self.rank} of {len(self.names)}.", f"{test.chi_square:.5g}"
+            if test.weighted:
+                return f"{rank} The squares of the weighted residuals add up to {value}."
+            return f"{rank} Chi-square {value} with {test.degrees:.4g} degrees of freedom."
+        if not cost[-1] < cost[0]:
+            return ""
+        fell = f"The sum of squared residuals, each divided by its sigma, fell from {cost[0]:.3g}"
+        return f"{fell} to {cost[-1]:.3g}."
+
     def __repr__(self) -> str:
         """Return a summary on one screen; `print` shows the parameters."""
-        test = self.residual_test
         codes = ", ".join(dict.fromkeys(finding.code for finding in self.findings))
         return "\n".join(
             [
                 f"<Identification of {self.robot.name} by {type(self.method).__name__}",
-                (
-                    f"  {len(self.names)} parameters, rank {self.rank}, "
-                    f"{len(self.nuisance)} nuisance parameters"
-                ),
+                f"  {len(self.names)} parameters, {len(self.nuisance)} nuisance parameters",
                 f"  {self.status.name.lower()} after {self.history.iterations} steps",
-                f"  chi-square {test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom",
+                f"  {self.describe_statistics()}",
                 f"  findings: {codes or 'none'}>",
             ]
         )
 
     def __str__(self) -> str:
         """Return the parameters as a table, the status and the findings."""
+        lines = [*self._list_values(), ""]
+        lines.append(f"{self.history.finding} {self.describe_statistics()}".rstrip())
+        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self._further_findings)])
+
+    def _list_values(self) -> list[str]:
+        """Return the lines of the table of parameters; last values are no estimates."""
         width = max(len(name) for name in (*self.names, *self.nuisance.names))
+        rows = (*self._parameter_rows(), *self._nuisance_rows())
+        if not self.converged:
+            lines = [f"{'parameter':<{width}} {'nominal':>14} {'last value':>14} unit"]
+            for entry in rows:
+                values = (f"{entry[key]:>14.{LAST_DIGITS}g}" for key in ("nominal", "estimate"))
+                lines.append(f"{entry['name']:<{width}} {' '.join(values)} {entry['unit']}")
+            return lines
         lines = [f"{'parameter':<{width}} {'nominal':>14} {'estimate':>14} {'+/- (95 %)':>12} unit"]
-        for entry in (*self._parameter_rows(), *self._nuisance_rows()):
+        for entry in rows:
             half_width = _format_half_width(entry["plus_minus"])
             decimals, shown = half_width if entry.get("free", True) else (6, "fixed")
             nominal, estimate = (f"{entry[key]:>14.{decimals}f}" for key in ("nominal", "estimate"))
             lines.append(
                 f"{entry['name']:<{width}} {nominal} {estimate} {shown:>12} {entry['unit']}"
             )
-        test = self.residual_test
-        lines += [
-            "",
-            (
-                f"{self.history.finding} Rank {self.rank} of {len(self.names)}. Chi-square "
-                f"{test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom."
-            ),
-        ]
-        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self._further_findings)])
+        return lines
 
     @property
     def _further_findings(self) -> list[Finding]:
@@ -271,15 +290,19 @@ class Identification:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON; parameters in the units of the robot's file, the rest SI."""
+        """Return the content for JSON; parameters in the units of the robot's file, the rest SI.
+
+        Rank, condition and the numbers of the residual test are None where the iteration did not
+        converge.
+        """
         test = self.residual_test
         return {
             "robot": self.robot.name,
             "method": repr(self.method),
             "parameters": self._parameter_rows(),
             "local": self._nuisance_rows(),
-            "rank": self.rank,
-            "condition": self.spectrum.condition,
+            "rank": self.rank if self.converged else None,
+            "condition": self.spectrum.condition if self.converged else None,
             "singular_values": self.spectrum.singular_values,
             "rank_tolerance": self.spectrum.tolerance,
             "unidentifiable": self.unidentifiable,
@@ -288,7 +311,7 @@ class Identification:
             "degrees": test.degrees,
             "p_value": test.p_value,
             "noise": test.noise,
-            "sigma_scale": test.sigma_scale,
+            "sigma_scale": test.sigma_scale if self.converged else None,
             "prior_conflict": self.prior_conflict,
             "dropped": self.excluded_poses,
             "readings": self.poses,

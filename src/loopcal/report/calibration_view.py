@@ -8,6 +8,7 @@ from typing import Any
 
 from loopcal.diagnose import ModelChoice, ReadingError
 from loopcal.estimate import Identification
+from loopcal.estimate.result import LAST_DIGITS
 from loopcal.findings import Finding
 from loopcal.mechanism import Mechanism
 from loopcal.report.numbers import (
@@ -54,7 +55,10 @@ def view_calibration(
     blocks += ["", f"Next: {report.next_step}"]
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")
-    blocks.append(build_parameter_table("Parameters", rows["parameters"]))
+    if fit.converged:
+        blocks.append(build_parameter_table("Parameters", rows["parameters"]))
+    elif verbose:
+        blocks.append(build_last_value_table(rows["parameters"]))
     if verbose:
         blocks += _view_details(report, rows)
     return blocks
@@ -73,7 +77,7 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
     """Return everything that the summary leaves out."""
     fit = report.identification
     blocks: list[Block] = []
-    if rows["local"]:
+    if rows["local"] and fit.converged:
         blocks.append(build_parameter_table("Setup parameters", rows["local"]))
     blocks += ["", _describe_iteration(fit)]
     for suggestion in report.suggestions or ():
@@ -102,6 +106,18 @@ def build_parameter_table(caption: str, rows: Iterable[Mapping[str, Any]]) -> Ta
             Column("+/- (95 %)"),
             lambda row: format_uncertainty(row["plus_minus"]) if row.get("free", True) else "fixed",
         ),
+        (word_column("unit"), lambda row: row["unit"]),
+    )
+
+
+def build_last_value_table(rows: Iterable[Mapping[str, Any]]) -> Table:
+    """Return the values at which an iteration ended that did not converge, without precision."""
+    return build_table(
+        "Where the iteration ended (no estimates)",
+        rows,
+        (word_column("name"), lambda row: row["name"]),
+        (Column("nominal"), lambda row: format_number(row["nominal"])),
+        (Column("last value"), lambda row: format_number(row["estimate"], LAST_DIGITS)),
         (word_column("unit"), lambda row: row["unit"]),
     )
 
@@ -140,17 +156,14 @@ def build_reading_table(robot: Mechanism, errors: Sequence[ReadingError]) -> Tab
 
 def view_fit(fit: Identification) -> list[Block]:
     """Return the parameters of a fit and how it ended."""
-    rows = fit.to_dict()
-    return [
-        build_parameter_table(f"{fit.robot.name}: {len(fit.names)} parameters", rows["parameters"]),
-        _describe_iteration(fit),
-    ]
+    rows = fit.to_dict()["parameters"]
+    caption = f"{fit.robot.name}: {len(fit.names)} parameters"
+    table = build_parameter_table(caption, rows)
+    return [table if fit.converged else build_last_value_table(rows), _describe_iteration(fit)]
 
 
 def _describe_iteration(fit: Identification) -> str:
     """Return how a fit ended, and its residuals in one number."""
-    return (
-        f"Iteration: {fit.status.name.lower().replace('_', ' ')} after {fit.history.iterations} "
-        f"steps; rank {fit.rank} of {len(fit.names)}.\nChi-square {fit.chi_square:.5g} with "
-        f"{fit.residual_test.degrees:.4g} degrees of freedom."
-    )
+    status = fit.status.name.lower().replace("_", " ")
+    ending = f"Iteration: {status} after {fit.history.iterations} steps."
+    return f"{ending}\n{fit.describe_statistics()}".rstrip()

@@ -162,7 +162,7 @@ def _report(
         *_report_conventions(conventions),
         *_report_fit(fit),
         *impossible,
-        *_report_validation(errors, held_out is not None),
+        *(_report_validation(errors, held_out is not None) if fit.converged else ()),
         *_report_freedoms(fit),
         start.finding,
         *(() if examination is None else examination.findings),
@@ -180,7 +180,7 @@ def _report(
         findings=sort_by_importance(findings),
         examination=examination,
         suggestions=suggestions,
-        reading_errors=compute_reading_errors(fit, fitted),
+        reading_errors=compute_reading_errors(fit, fitted) if fit.converged else None,
         model_choice=result.choice,
         change=result.change,
         provenance=describe_provenance(options),
@@ -190,7 +190,11 @@ def _report(
 def _validate(
     fit: Identification, data: Measurements, options: CalibrationOptions
 ) -> tuple[Validation | None, list[Finding]]:
-    """Return errors on poses, or why there are none: a wrong geometry may reach no pose."""
+    """Return errors on poses, or why there are none: a wrong geometry may reach no pose. Values of
+    a fit that did not converge are no estimate, and have none.
+    """
+    if not fit.converged:
+        return None, []
     try:
         return validate(fit, data, options.limit_position, options.limit_angle), []
     except DataError as error:

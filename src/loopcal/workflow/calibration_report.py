@@ -70,8 +70,9 @@ class CalibrationReport:
     identification : the fit. start : the geometry before calibration against the fit.
     conventions : units, signs and columns of the data against the robot.
     validation : errors on held-out poses; None without held-out poses, or where they could not be
-        predicted.
-    fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic.
+        predicted or the fit did not converge.
+    fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic. None
+        where the fit did not converge.
     findings : everything noticed, the most important first.
     examination : outliers, lack of fit, correlations and expected gain; None where the fit did not
         converge.

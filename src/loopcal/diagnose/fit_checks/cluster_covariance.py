@@ -39,7 +39,7 @@ from loopcal.mechanism import Status, differentiate_pose, forward_trials
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import decompose
 from loopcal.numerics.tree_elimination import fold_at
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 LIMIT = 1.5
 """Ratio of standard uncertainties above which the stated ones are too small."""
@@ -50,7 +50,7 @@ below which the ratio is reported: 1 % of data sets for the two together.
 """
 
 JUDGED = 0.5
-"""Share of the variance of poses that residuals must be able to judge. The rest depends on
+"""Share of the variance of poses by noise that residuals must be able to judge. The rest lies in
 directions that one cluster alone determines.
 """
 
@@ -64,8 +64,9 @@ class Ratio(NamedTuple):
     Attributes
     ----------
     ratio : of the root mean square over the measured poses; NaN without uncertainty.
-    degrees : degrees of freedom of its square for independent errors. share : of the variance that
-        residuals can judge. p_value : probability of a larger ratio for independent errors.
+    degrees : degrees of freedom of its square for independent errors.
+    share : of the variance by noise that residuals can judge.
+    p_value : probability of a larger ratio for independent errors.
     """
 
     ratio: float
@@ -137,15 +138,16 @@ def check_clusters(fit: Identification, data: Measurements) -> ClusterCheck:
 class RobustSpread:
     """The cluster-robust covariance C_robust = L (I + spread) L' of a fit with C = L L'.
 
-    Each of G clusters has h rows, turned into the eigenvectors of its leverage H_gg. With a
-    correction of one the sum of scores' scores' is `spread` + sum_g parts_g parts_g'.
+    With the scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for
+    independent errors. Each cluster has h rows, turned into the eigenvectors of its leverage H_gg.
 
     Attributes
     ----------
     root : (p, k) L in tolerances, for the k directions that the fit estimates.
-    scores : (G, k) h_g = B-scaled u_g, of unit variance in all for independent errors.
-    parts : (G, k, h) the rows in units of L; zero where no residual can judge them.
-    correction : (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h).
+    scores : (G, k) h_g, the u_g in units of L.
+    parts : (G, k, h) the rows in units of L; without a prior the sum of their squares is k.
+    correction : (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h); 0 where g is 1, so that
+        no residual can judge the row.
     columns : (G, h, w) rows by everything that is estimated, in standard deviations: their products
         are the leverages.
     """
@@ -156,6 +158,11 @@ class RobustSpread:
     correction: FloatArray
     leverage: FloatArray
     columns: FloatArray
+
+    @property
+    def is_tested(self) -> BoolArray:
+        """(G, h) rows that a residual can judge."""
+        return self.correction > 0.0
 
     def compare(self, effect: FloatArray) -> Ratio:
         """Return the ratio for quantities whose change is effect (m, p) times the deviation in
@@ -169,20 +176,21 @@ class RobustSpread:
         _, s, vt = np.linalg.svd(root, full_matrices=False)
         E = vt[s > COMMON * s[0]].T * s[s > COMMON * s[0]]
         parts = np.matmul(E.T, self.parts)
+        by_rows, parts = float((parts**2).sum()), parts * self.is_tested[:, None, :]
         mean, observed = float((parts**2).sum()), float(((self.scores @ E) ** 2).sum())
         if not mean > 0.0:
             return NO_RATIO
         ratio = float(np.sqrt(max(total + observed - mean, 0.0) / total))
         degrees = self._degrees(parts, mean)
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
-        return Ratio(ratio, degrees, mean / total, p_value)
+        return Ratio(ratio, degrees, mean / by_rows, p_value)
 
     def parameter_ratios(self) -> FloatArray:
         """Return the ratio (p,) of each parameter; NaN without a standard deviation."""
         stated = (self.root**2).sum(axis=1)
         observed = ((self.scores @ self.root.T) ** 2).sum(axis=0)
         expected = np.zeros(len(stated))
-        for parts in self.parts:
+        for parts in self.parts * self.is_tested[:, None, :]:
             expected += ((self.root @ parts) ** 2).sum(axis=1)
         square = np.divide(
             observed - expected, stated, out=np.full(len(stated), np.nan), where=stated > 0.0
@@ -250,7 +258,7 @@ def compute_robust_spread(
     remaining = 1.0 - leverage
     is_tested = remaining > TESTABLE
     correction = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
-    parts = np.matmul(P.swapaxes(-1, -2), vectors) * is_tested[:, None, :]
+    parts = np.matmul(P.swapaxes(-1, -2), vectors)
     residual = correction * np.matmul(r[:, None, :], vectors)[:, 0]
     scores = np.matmul(parts, residual[..., None])[..., 0]
     columns = np.matmul(vectors.swapaxes(-1, -2), half)

@@ -36,7 +36,8 @@ class ResidualTest:
 
     Attributes
     ----------
-    chi_square : whitened sum of squares, with the penalty of a prior.
+    chi_square : whitened sum of squares, with the penalty of a prior; like the other numbers NaN
+        where the iteration did not converge, because it then belongs to no fit.
     degrees : degrees of freedom of chi_square if model, noise and prior are right.
     p_value : probability of a larger chi_square; NaN where nothing can be tested.
     dof : equations minus the number of parameters that the method effectively uses.
@@ -113,6 +114,9 @@ def run_residual_test(
     converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor
         intervals.
     """
+    if not converged:
+        nan = np.nan
+        return ResidualTest(nan, nan, nan, nan, noise, 1.0, False, False, weighted)
     finite = np.where(np.isfinite(penalty), penalty, 0.0)
     left = float(decomposition.remaining(penalty)[0])
     y = decomposition.solution(penalty)
@@ -121,17 +125,15 @@ def run_residual_test(
     m = float(decomposition.rows[0])
     degrees = m - float((used & (penalty == 0.0)).sum())
     dof = m - float(decomposition.filter_factors(penalty).sum())
-    p_value, scale, intervals = np.nan, 1.0, converged
-    if converged and noise == "estimated":
+    p_value, scale, intervals = np.nan, 1.0, True
+    if noise == "estimated":
         intervals = dof >= FEWEST_DEGREES
         scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
-    elif converged and not weighted:
+    elif not weighted:
         p_value = float(compute_chi_square_tail(degrees, chi_square)) if degrees > 0 else np.nan
         if p_value < SIGNIFICANCE:
             scale = max(1.0, float(np.sqrt(chi_square / degrees)))
-    return ResidualTest(
-        chi_square, degrees, p_value, dof, noise, scale, intervals, converged, weighted
-    )
+    return ResidualTest(chi_square, degrees, p_value, dof, noise, scale, intervals, True, weighted)
 
 
 def coverage_factor(test: ResidualTest, level: float = LEVEL) -> float:

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fit that did not converge: nothing that is printed or written pretends to be its result."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopcal.estimate import MAP, FitOptions, Huber, Identification, LeastSquares, identify
+from loopcal.measure import Measurements
+from loopcal.report.calibration_view import view_calibration, view_fit
+from loopcal.report.text_page import render_text
+from loopcal.workflow import CalibrationOptions, CalibrationReport, Verdict, calibrate
+from tests.estimate.problems import hexapod, hexapod_data
+
+
+def wrong_data() -> Measurements:
+    """Return measurements whose readings belong to other poses."""
+    data = hexapod_data(20)
+    return replace(data, readings=data.readings[np.random.default_rng(0).permutation(20)])
+
+
+@cache
+def failed() -> CalibrationReport:
+    """Return a calibration whose fit did not converge."""
+    options = CalibrationOptions(hold_out=0.25, check_conventions=False)
+    return calibrate(hexapod(), wrong_data(), options)
+
+
+def list_texts(report: CalibrationReport) -> dict[str, str]:
+    """Return everything that people read about a calibration."""
+    fit = report.identification
+    return {
+        "report": str(report),
+        "fit": str(fit),
+        "repr": repr(fit),
+        "summary": render_text(view_calibration(report), 100),
+        "page": render_text(view_calibration(report, verbose=True), 100),
+        "view": render_text(view_fit(fit), 100),
+    }
+
+
+@pytest.mark.parametrize("name", ["report", "fit", "repr", "summary", "page", "view"])
+def test_no_statistics_and_no_precise_values_are_printed(name):
+    assert not failed().identification.converged
+    text = list_texts(failed())[name]
+    assert not re.search(r"chi-square|degrees of freedom|[Rr]ank \d|nan|\+/-", text)
+    assert "after calibration" not in text
+    assert "smaller" not in text
+    values = [line for line in text.splitlines() if line.startswith("leg")]
+    for line in values:  # name, nominal value, last value, unit
+        digits = re.sub(r"e[+-]\d+|[^0-9]", "", line.split()[2]).strip("0")
+        assert len(digits) <= 3, line
+
+
+def test_json_has_no_statistics_of_a_failed_fit():
+    document = failed().to_dict()
+    fit = document["fit"]
+    for key in ("chi_square", "degrees", "p_value", "dof", "rank", "condition", "sigma_scale"):
+        assert fit[key] is None, key
+    assert all(row["plus_minus"] is None for row in fit["parameters"])
+    assert document["validation"] is None
+    assert failed().verdict is Verdict.NOT_CALIBRATED
+    codes = {finding.code for finding in failed().findings}
+    assert not {code for code in codes if code.startswith(("gates.errors", "validation."))}
+
+
+def test_sum_of_squares_is_printed_only_where_the_iteration_lowered_it():
+    fit = failed().identification
+    first, last = fit.history.cost[0], fit.history.cost[-1]
+    assert fit.describe_statistics().endswith(f"fell from {first:.3g} to {last:.3g}.")
+    stuck = replace(fit, history=replace(fit.history, cost=fit.history.cost[:1]))
+    assert stuck.describe_statistics() == ""
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP()], ids=["least squares", "MAP"])
+def test_chi_square_is_that_of_the_residuals(method):
+    fit = identify(hexapod(), hexapod_data(20), method)
+    assert fit.converged
+    expected = sum((r.whitened**2).sum() for r in fit.residuals)
+    if isinstance(method, MAP):
+        expected += (((fit.estimate - fit.nominal) / fit.tolerance) ** 2).sum()
+    assert fit.chi_square == pytest.approx(expected, rel=1e-6)
+
+
+def test_chi_square_of_a_loss_is_that_of_the_weighted_residuals():
+    data = hexapod_data(20)
+    rows = data.observations[0]
+    measured = np.array(rows.measured)
+    measured[3, 3:] += 1e-4
+    data = replace(data, observations=(replace(rows, measured=measured),))
+    fit: Identification = identify(
+        hexapod(), data, options=FitOptions(method=LeastSquares(), loss=Huber())
+    )
+    squares = (fit.residuals[0].whitened ** 2).sum(axis=1)
+    assert fit.chi_square == pytest.approx((fit.pose_weights * squares).sum(), rel=1e-4)
+    assert fit.chi_square < 0.9 * squares.sum()
+    assert "weighted residuals" in fit.describe_statistics()
