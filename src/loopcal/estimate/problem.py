@@ -28,6 +28,7 @@ from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.nuisance.elimination import NodeMembers, NuisanceElimination, fold_node_rows
 from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
 from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
+from loopcal.estimate.poses.consistent import ConsistentPoses
 from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
@@ -35,7 +36,7 @@ from loopcal.estimate.poses.linearization import evaluate_rows, whiten
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.measure import Measurements, list_sensed_joints
-from loopcal.numerics.decomposition import empty_factor
+from loopcal.numerics.decomposition import empty_factor, remove_null_space
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray
@@ -59,6 +60,8 @@ class Problem:
     member : (n,) component of each pose where readings are uncertain.
     coordinates : in which poses of uncertain readings move.
     located : (T | 1, n, 4, 4) [m], optional; see `ExactPoses`.
+    consistent : poses without residuals, at which rank is decided; None where all residuals are
+        invariant under the motions that the rows do not determine.
     residual_count : (T,) residuals that are present, those of uncertain readings included.
     """
 
@@ -73,6 +76,7 @@ class Problem:
     member: IntArray | None = None
     coordinates: PoseCoordinates | None = None
     located: FloatArray | None = None
+    consistent: ConsistentPoses | None = None
 
     @cached_property
     def poses(self) -> ExactPoses | UncertainPoses:
@@ -182,7 +186,10 @@ class Problem:
                 solution = exact.solve(z, trials, begin, self.control, shared=shared)
             else:
                 solution = self.poses.solve(z, trials, begin, self.control)
-            linearizations.append(self._eliminate(solution, z, trials, begin))
+            linearization = self._eliminate(solution, z, trials, begin)
+            if self.consistent is not None and self.located is None:
+                linearization = self._drop_second_order(linearization, solution, trials, begin)
+            linearizations.append(linearization)
         return Linearization.join(linearizations)
 
     def solve(
@@ -300,6 +307,23 @@ class Problem:
             next_start = replace(next_start, nuisance=solution.nuisance, slope=slope)
         cost = np.where(is_lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
         return Linearization(z, factor, cost, equations, next_start, estimate, solution.estimates)
+
+    def _drop_second_order(
+        self, linearization: Linearization, solution: PoseSolution, trials: IntArray, start: Start
+    ) -> Linearization:
+        """Remove directions that the rows do not determine at poses without residuals."""
+        assert self.consistent is not None
+        z = linearization.deviation
+        states = self.consistent.move(solution, z, trials, start)
+        if isinstance(self.poses, ExactPoses):
+            poses = self.poses.at_readings(states.q)
+            moved = poses.solve(z, trials, start, self.control, solution.nuisance)
+        else:
+            poses, moved = self.poses, replace(solution, states=states, linearized=None)
+        problem = replace(self)
+        vars(problem).update(poses=poses, component_count=self.component_count)
+        reference = problem._eliminate(moved, z, trials, start).factor
+        return replace(linearization, factor=remove_null_space(linearization.factor, reference))
 
     def _first_states(self) -> PoseStates | None:
         """Return the states with which poses begin."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.components import find_components
+from loopcal.estimate.poses.consistent import LOOSE, ConsistentPoses, select_mixing_rows
 from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
+from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.estimate.problem import Problem
 from loopcal.measure import (
     Measurements,
@@ -23,8 +26,9 @@ from loopcal.measure import (
     resolve_reading_sigma,
 )
 from loopcal.measure.whitening import compute_whitener
+from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import Halving
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
@@ -90,30 +94,71 @@ def make_problem(
     """
     numbers, robot = np.arange(trials), free.robot
     believed = resolve_reading_sigma(robot, sigma, recorded.shape[1])
+    consistent = _plan_consistent_poses(free, recorded, believed, rows, numbers, data)
     if believed is None:
         nuisance = plan_elimination(local, rows)
-        return Problem(free, recorded[:1], rows, numbers, nuisance, data)
-    all_rows = (*rows, _reading_rows(free, recorded, believed))
+        return Problem(
+            free, recorded[:1], rows, numbers, nuisance, data, consistent=consistent
+        )
+    uncertain = _make_uncertain(free, recorded, believed, rows, numbers, data)
+    nuisance = plan_elimination(local, rows, uncertain.member)
+    return replace(uncertain, nuisance=nuisance, consistent=consistent)
+
+
+def _make_uncertain(
+    free: FreeParameters,
+    recorded: FloatArray,
+    sigma: FloatArray,
+    rows: tuple[ObservationRows, ...],
+    numbers: IntArray,
+    data: Callable[[int], Measurements],
+) -> Problem:
+    """Return the problem with uncertain readings, before nuisance parameters are eliminated."""
+    all_rows, robot = (*rows, _reading_rows(free, recorded, sigma)), free.robot
     names = list_sensed_joints(r.kind for r in all_rows)
     if robot.program.sigma is None:
-        unit = [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
-        scale = np.where(np.isinf(believed), UNKNOWN_READING * np.array(unit), believed)
+        scale = np.where(np.isinf(sigma), UNKNOWN_READING * _reading_units(robot), sigma)
         coordinates: PoseCoordinates = ReadingCoordinates(free, scale, names)
     else:
         coordinates = TwistCoordinates(free, names)
-    member = find_components(recorded.shape[1], all_rows, coordinates.freedoms)
-    nuisance = plan_elimination(local, rows, member)
     return Problem(
         free,
         recorded,
         all_rows,
         numbers,
-        nuisance,
+        None,
         data,
         control=POSE_CONTROL,
-        sigma=believed,
-        member=member,
+        sigma=sigma,
+        member=find_components(recorded.shape[1], all_rows, coordinates.freedoms),
         coordinates=coordinates,
+    )
+
+
+def _plan_consistent_poses(
+    free: FreeParameters,
+    recorded: FloatArray,
+    sigma: FloatArray | None,
+    rows: tuple[ObservationRows, ...],
+    numbers: IntArray,
+    data: Callable[[int], Measurements],
+) -> ConsistentPoses | None:
+    """Return poses that follow the rows of kinds that mix their components; None without any."""
+    mixing = select_mixing_rows(rows)
+    if not mixing:
+        return None
+    loose = np.broadcast_to(LOOSE * _reading_units(free.robot), recorded.shape[1:])
+    if sigma is not None:
+        loose = np.where(np.isinf(sigma), np.inf, loose)
+    problem = _make_uncertain(free, recorded, loose, mixing, numbers, data)
+    assert isinstance(problem.poses, UncertainPoses)
+    return ConsistentPoses(problem.poses, recorded)
+
+
+def _reading_units(robot: Mechanism) -> FloatArray:
+    """Return the units (actuators,) of readings [SI]: the size of the robot, or a radian."""
+    return np.array(
+        [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
     )
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,11 @@ class ExactPoses:
     def is_single_block(self) -> bool:
         """Whether all rows belong to one block, so that poses are kept from start to start."""
         return len(self.blocks) == 1 and self.located is None
+
+    def at_readings(self, q: FloatArray) -> ExactPoses:
+        """Return these rows at other readings (a, n, actuators) [SI]."""
+        blocks = tuple(replace(block, readings=q[:, block.poses]) for block in self.blocks)
+        return replace(self, blocks=blocks)
 
     def first_states(self, trials: int) -> PoseStates | None:
         """Return the home pose for all trials and poses; None where poses are not kept."""

@@ -52,6 +52,10 @@ class Kind(ABC):
     changes_with_pose : bool
         Whether columns that stay constant while the robot moves indicate a mistake. It is False for
         touched surfaces and for locked joints, whose columns stay at 0.
+    mixes_components : bool
+        Whether a motion of the base, the setup with it, mixes the components of a residual, which
+        no setup parameter follows. Its first-order rows then contain this motion in proportion to
+        the residuals; see docs/theory/identification.md.
     wraps_angles : bool
         Whether differences of angles are wrapped into (-pi, pi].
     description : str
@@ -67,6 +71,7 @@ class Kind(ABC):
     name: ClassVar[str]
     poses_per_row: ClassVar[int] = 1
     changes_with_pose: ClassVar[bool] = True
+    mixes_components: ClassVar[bool] = False
     wraps_angles: ClassVar[bool] = True
     description: ClassVar[str] = ""
     length_error: ClassVar[str] = "length"

@@ -43,6 +43,7 @@ class Line(SurfaceKind):
     surface: str = "line"
 
     name: ClassVar[str] = "line"
+    mixes_components: ClassVar[bool] = True
     per_target: ClassVar[tuple[Column, ...]] = (
         Column("gap_a", Dimension.LENGTH),
         Column("gap_b", Dimension.LENGTH),
