@@ -43,12 +43,19 @@ REDEFINED: dict[str, str] = {
 collected again.
 """
 
+CORRECTED: dict[str, str] = {
+    "papers/cmm-constraint-2011/surfaces": (
+        "rank 33, no longer 34: residuals of lines are no information on rotations of the base"
+    ),
+}
+"""Cases whose fixture was written anew because a result was wrong, with the reason."""
+
 GOLDEN = compare.read()
 
 
 def test_fixture_has_exactly_the_registered_cases():
     assert list(GOLDEN) == list(CASES)
-    assert set(CASES) >= set(EXCEPTIONS) | set(REDEFINED)
+    assert set(CASES) >= set(EXCEPTIONS) | set(REDEFINED) | set(CORRECTED)
 
 
 @pytest.mark.parametrize(

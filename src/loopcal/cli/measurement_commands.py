@@ -249,21 +249,24 @@ def _fill_in(
 ) -> tuple[SimulatedMeasurements, str]:
     """Return the filled-in data file of a plan."""
     from loopcal.io import load_measurements
-    from loopcal.io.data.measurement_file import load_instrument, refuse_empty_readings
+    from loopcal.io.data.measurement_file import (
+        has_empty_readings,
+        load_contact_sheet,
+        load_instrument,
+    )
     from loopcal.io.data.measurement_writer import format_measurements
-    from loopcal.workflow.simulated_measurements import fill_in_measurements
+    from loopcal.io.runs.plan_folder import find_plan_sheet
+    from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(
         ("poses", "draw", *DESCRIPTION[2:], "sigma_reading"),
         f"because --fill {sheet} states poses and instrument",
     )
-    refuse_empty_readings(sheet, robot)
-    result = fill_in_measurements(
-        robot,
-        load_measurements(sheet, robot),
-        load_instrument(sheet, robot),
-        draw_errors=draw_errors,
-        seed=seed,
-    )
+    instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}
+    if has_empty_readings(sheet, robot):
+        planned = load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
+        result = fill_in_contacts(robot, planned, instrument, **how)
+    else:
+        result = fill_in_measurements(robot, load_measurements(sheet, robot), instrument, **how)
     title = f"simulated by loopcal: {sheet.name}, seed {seed}"
     return result, format_measurements(result.data, result.truth, title)

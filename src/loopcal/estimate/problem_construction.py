@@ -97,9 +97,7 @@ def make_problem(
     consistent = _plan_consistent_poses(free, recorded, believed, rows, numbers, data)
     if believed is None:
         nuisance = plan_elimination(local, rows)
-        return Problem(
-            free, recorded[:1], rows, numbers, nuisance, data, consistent=consistent
-        )
+        return Problem(free, recorded[:1], rows, numbers, nuisance, data, consistent=consistent)
     uncertain = _make_uncertain(free, recorded, believed, rows, numbers, data)
     nuisance = plan_elimination(local, rows, uncertain.member)
     return replace(uncertain, nuisance=nuisance, consistent=consistent)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurements: kinds, instruments, observations, nuisance parameters, and their simulation."""
 
+from loopcal.measure.contact_simulation import simulate_contacts as simulate_contacts
 from loopcal.measure.data_checks import check_actuators as check_actuators
 from loopcal.measure.data_checks import check_duplicates as check_duplicates
 from loopcal.measure.data_checks import check_strokes as check_strokes

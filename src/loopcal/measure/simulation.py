@@ -183,7 +183,7 @@ def simulate_trials(
         _measure_sensor(k, sensor, T, reached, joints, noise, nuisance)
         for k, sensor in enumerate(assigned.sensors)
     )
-    recorded, sigma = _record_readings(robot, true, reading_sigma, len(values), seed)
+    recorded, sigma = record_readings(robot, true, reading_sigma, len(values), seed)
     return Trials(
         assigned, robot.name, readings, measured, values, T, reached, nuisance, recorded, sigma
     )
@@ -306,7 +306,7 @@ def _close_all_limbs(
     return np.where(np.isfinite(closed), closed, readings)
 
 
-def _record_readings(
+def record_readings(
     robot: Mechanism, true: FloatArray, sigma: ArrayLike | None, trials: int, seed: int
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return recorded readings (t, n, a) of true ones (t | 1, n, a), and their sigma (n, a); None

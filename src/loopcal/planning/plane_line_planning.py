@@ -71,6 +71,8 @@ class SurfacePlan:
     positions : (u, k, 3) of the origin of the tool [m].
     axis : (u,) 0, 1 or 2, along which each line runs.
     rank : number of parameter combinations that the groups determine.
+    possible : number that planes and lines can determine. With fewer equations, the plan takes the
+        tolerances as prior information.
     sd_first, sd_last : root mean square standard deviation of these, in tolerances, as drawn and as
         planned.
     """
@@ -81,6 +83,7 @@ class SurfacePlan:
     positions: FloatArray
     axis: IntArray
     rank: int
+    possible: int
     sd_first: float
     sd_last: float
 
@@ -121,6 +124,7 @@ class SurfacePlan:
     def findings(self) -> tuple[Finding, ...]:
         """Everything that the plan reports."""
         u, k = self.poses.groups.shape
+        few = () if self.rank == self.possible else (self._report_few_groups(),)
         return (
             report_finding(
                 "plan.surfaces",
@@ -136,7 +140,20 @@ class SurfacePlan:
                 sd_first=self.sd_first,
                 sd_last=self.sd_last,
             ),
+            *few,
             report_finding("plan.readings-are-measured"),
+        )
+
+    def _report_few_groups(self) -> Finding:
+        """Return that the groups give fewer equations than could be determined."""
+        u, k = self.poses.groups.shape
+        return report_finding(
+            "plan.few-groups",
+            groups=u,
+            points=k,
+            equations=self.rank,
+            rank=self.possible,
+            needed=-(-self.possible // (k - SPENT)),
         )
 
     def __repr__(self) -> str:
@@ -165,6 +182,7 @@ class SurfacePlan:
             "groups": u,
             "points": k,
             "rank": self.rank,
+            "possible_rank": self.possible,
             "sd_first": self.sd_first,
             "sd_last": self.sd_last,
             "sigma": self.options.sigma,
@@ -187,8 +205,7 @@ def plan_surfaces(
     Raises
     ------
     EstimationError
-        Fewer equations than the groups can determine unknowns, too few points, or no group that
-        satisfies the constraints.
+        Too few points, or no group that satisfies the constraints.
     """
     check_argument(robot, "robot", Mechanism)
     options = options or SurfaceOptions()
@@ -199,20 +216,10 @@ def plan_surfaces(
     designs, rows = _draw_allowed(
         groups, checker, options.groups, np.random.default_rng(options.seed)
     )
-    prior = PriorInformation.none(len(groups.free))
-    rank = len(find_observable_space(rows, prior))
-    equations = options.groups * (options.points - SPENT)
-    if equations < rank:
-        raise EstimationError(
-            report_finding(
-                "plan.too-few-groups",
-                groups=options.groups,
-                points=options.points,
-                equations=equations,
-                rank=rank,
-                needed=-(-rank // (options.points - SPENT)),
-            )
-        )
+    none = PriorInformation.none(len(groups.free))
+    possible = len(find_observable_space(rows, none))
+    rank = min(possible, options.groups * (options.points - SPENT))
+    prior = none if rank == possible else PriorInformation.from_tolerances(len(groups.free))
     best = coordinate_exchange(
         lambda _, design: groups.linearize(design, checker),
         designs[: options.groups],
@@ -230,6 +237,7 @@ def plan_surfaces(
         positions,
         np.rint(best.design[:, AXIS]).astype(np.int64),
         rank,
+        possible,
         _rms_sd(rows[: options.groups], rank),
         _rms_sd(best.rows, rank),
     )

@@ -14,6 +14,7 @@ from loopcal.measure import (
     replace_measured_values,
     sample_truth,
     simulate,
+    simulate_contacts,
 )
 from loopcal.mechanism import Mechanism, resolve_poses
 
@@ -68,6 +69,23 @@ def fill_in_measurements(
     """Simulate the measured values of a planned data sheet; the other arguments as above."""
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     return SimulatedMeasurements(replace_measured_values(truth, sheet, instrument, seed), truth)
+
+
+def fill_in_contacts(
+    robot: Mechanism,
+    sheet: Measurements,
+    instrument: Instrument,
+    *,
+    draw_errors: bool = False,
+    seed: int = 1,
+) -> SimulatedMeasurements:
+    """Simulate the readings of a planned sheet of planes and lines, whose readings are those of the
+    commanded poses; the other arguments as above.
+    """
+    truth = draw_true_machine(robot, seed) if draw_errors else robot
+    data = simulate_contacts(truth, sheet, instrument, seed)
+    check_strokes(data, truth)
+    return SimulatedMeasurements(data, truth)
 
 
 def draw_true_machine(robot: Mechanism, seed: int) -> Mechanism:

@@ -14,6 +14,7 @@ files has the same readings in both.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,10 +73,42 @@ def load_measurements(
     DataError : a check fails, noise is not a covariance, or a commanded pose cannot be reached.
     ArgumentTypeError : `path` is not a path, or `robot` is not a robot.
     """
-    from loopcal.measure import Measurements, check_duplicates, check_strokes
-
     require_robot(robot)
     tables = _read_tables(path)
+    return _join_tables(tables, robot, allow_outside_stroke, allow_duplicates)
+
+
+def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) -> Measurements:
+    """Read a planned sheet whose readings are still to be measured, with those of the plan.
+
+    Parameters
+    ----------
+    sheet : data file of a plan of planes and lines. plan : the operator's sheet beside it, with the
+        nominal reading of each pose.
+
+    Raises
+    ------
+    FileError, DataError : as `load_measurements`, or the plan lacks a pose of the sheet.
+    """
+    table, planned = read_table(sheet), read_table(plan)
+    readings = tuple(actuator.name for actuator in robot.actuators)
+    require_columns(planned, ("pose", *readings), f"a reading of {robot.name}")
+    kept = ("pose", *readings)
+    columns = [planned.text(name) for name in kept]
+    planned = replace(
+        planned,
+        units={name: planned.units[name] for name in kept},
+        rows=tuple(zip(*columns, strict=True)),
+    )
+    return _join_tables((table, planned), robot, allow_outside_stroke=True, allow_duplicates=True)
+
+
+def _join_tables(
+    tables: Sequence[Table], robot: Mechanism, allow_outside_stroke: bool, allow_duplicates: bool
+) -> Measurements:
+    """Return the measurements of some tables; arguments as of `load_measurements`."""
+    from loopcal.measure import Measurements, check_duplicates, check_strokes
+
     kinds = [read_kinds(table, robot, len(tables) > 1) for table in tables]
     if not any(kinds):
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
@@ -264,14 +297,12 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
     return _build_instrument(table, kinds)
 
 
-def refuse_empty_readings(path: str | Path, robot: Mechanism) -> None:
-    """Raise FileError for a sheet without any reading, where poses are to come from readings."""
+def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
+    """Return whether a sheet has columns of readings, all empty: they are to be measured."""
     table = read_table(path)
     columns = [actuator.name for actuator in robot.actuators if actuator.name in table.units]
-    if columns and table.rows and not any(cell for name in columns for cell in table.text(name)):
-        sentence = "this sheet has no readings, because they are what is to be measured"
-        act = "fill in the readings, or simulate a plan of poses"
-        raise FileError(f"{sentence}; {act}", table.path)
+    cells = (cell for name in columns for cell in table.text(name))
+    return bool(columns and table.rows) and not any(cells)
 
 
 def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:

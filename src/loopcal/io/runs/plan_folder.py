@@ -116,6 +116,21 @@ def refuse_plan_folder(path: Path, force: bool) -> None:
             raise FileError(f"{sentence}; move it, or choose another folder", file)
 
 
+def find_plan_sheet(data: Path) -> Path:
+    """Return the operator's sheet beside a data file without readings, which has the commands.
+
+    Raises
+    ------
+    FileError
+        There is none.
+    """
+    beside = data.parent / SHEET
+    if not beside.is_file():
+        sentence = f"this sheet has no readings, and there is no {SHEET} beside it"
+        raise FileError(f"{sentence}; fill in the readings, or name the file in its plan", data)
+    return beside
+
+
 def write_plan_folder(
     path: Path,
     texts: Mapping[str, str],

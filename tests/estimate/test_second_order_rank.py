@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rank counts first-order facts: residuals do not make motions of the base identifiable."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal import geometry
+from loopcal.diagnose import identifiability
+from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.problem_construction import problem_of
+from loopcal.measure import KINDS
+from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+from tests.estimate.plane_line_data import plan_groups, simulate_plan
+
+FIRST_ORDER, PARAMETERS = 33, 42
+
+
+@pytest.mark.parametrize(
+    ("sigma", "method"), [(1e-6, LeastSquares()), (1e-5, None), (1e-4, LeastSquares())]
+)
+def test_planes_and_lines_determine_33_of_42_at_every_noise(sigma, method):
+    robot = lc.load_robot("hexapod-nategh-agheli")
+    truth, data = simulate_plan(plan_groups(), sigma, seed=1)
+    fit = identify(robot, data, method)
+    assert fit.converged
+    assert fit.rank == FIRST_ORDER
+    assert len(fit.unidentifiable) == PARAMETERS - FIRST_ORDER
+    assert _orientation_error(fit.robot, truth) < 0.5 * _orientation_error(robot, truth)
+    assert fit.history.iterations <= 8
+
+
+def test_without_the_rule_the_residuals_determine_rotations_of_the_base():
+    """The complaint: 36 singular values above the tolerance, whose rotations are anything."""
+    robot = lc.load_robot("hexapod-nategh-agheli")
+    _, data = simulate_plan(plan_groups(), 1e-5, seed=1)
+    free = select_free_parameters(robot)
+    problem = replace(problem_of(free, data), consistent=None)
+    z = free.deviation(identify(robot, data, LeastSquares()).robot.values[None])
+    s = np.linalg.svd(problem.linearize(z, problem.start(z)).factor[0, :-1, :-1], compute_uv=False)
+    assert (s > 1e-11 * s[0]).sum() == 36
+    assert 1e-7 * s[0] < s[35] < s[33] < 1e-5 * s[0]
+
+
+def test_the_sum_of_squares_does_not_depend_on_the_removed_rotations():
+    """Finite rotations of the base, which the rows contain, leave the residuals as large."""
+    robot = lc.load_robot("hexapod-nategh-agheli")
+    _, data = simulate_plan(plan_groups(), 1e-5, seed=2)
+    fit = identify(robot, data, LeastSquares())
+    free = select_free_parameters(robot)
+    problem = problem_of(free, data)
+    for axis in np.eye(3):
+        z = free.deviation(_rotate_base(fit.robot, 0.02 * axis)[None])
+        cost = problem.linearize(z, problem.start(z)).cost[0]
+        assert cost == pytest.approx(fit.chi_square, rel=1e-6)
+
+
+def test_curvature_supports_every_direction_that_counts_and_no_other():
+    """Second differences of the sum of squares, with the best setup at each point."""
+    robot = lc.load_robot("hexapod-nategh-agheli")
+    _, data = simulate_plan(plan_groups(), 1e-5, seed=3)
+    fit = identify(robot, data, LeastSquares())
+    free = select_free_parameters(robot)
+    problem = problem_of(free, data)
+    z0 = free.deviation(fit.robot.values[None])
+    start = problem.start(z0)
+    linearization = problem.linearize(z0, start)
+    _, s, vt = np.linalg.svd(linearization.factor[0, :-1, :-1])
+
+    measured = replace(problem, consistent=None)
+
+    def cost(z):
+        return float(measured.linearize(z[None], start).cost[0])
+
+    step = 0.1  # tolerances
+    for i, direction in enumerate(vt):
+        up, down = (cost(z0[0] + sign * step * direction) for sign in (1, -1))
+        curvature = (up + down - 2.0 * float(linearization.cost[0])) / (2.0 * step**2)
+        if i < FIRST_ORDER:
+            assert curvature == pytest.approx(s[i] ** 2, rel=0.05)
+        else:
+            assert abs(curvature) < 0.05 * s[FIRST_ORDER - 1] ** 2
+
+
+def test_identifiability_of_a_filled_sheet_is_that_of_its_plan():
+    plan = plan_groups()
+    for sigma, seed in ((1e-6, 1), (1e-4, 3)):
+        _, data = simulate_plan(plan, sigma, seed)
+        result = identifiability(plan.robot, data)
+        assert result.rank == plan.rank == FIRST_ORDER
+        assert result.gap > 1e9
+
+
+def test_uncertain_readings_and_a_loss_do_not_change_the_rank():
+    robot = lc.load_robot("hexapod-nategh-agheli")
+    _, data = simulate_plan(plan_groups(), 1e-5, seed=4)
+    uncertain = replace(data, reading_sigma=np.full(data.readings.shape, 2e-6))
+    assert identify(robot, uncertain).rank == FIRST_ORDER
+    assert identifiability(robot, uncertain).rank == FIRST_ORDER
+    assert identify(robot, data, loss=Huber()).rank == FIRST_ORDER
+    excluded = FitOptions(excluded_poses=(data.labels[3],))
+    assert identify(robot, data, options=excluded).rank == FIRST_ORDER
+
+
+@pytest.mark.parametrize(("gap", "rank"), [(1e-5, 33), (3e-4, 36)])
+def test_only_gaps_beyond_their_noise_determine_rotations(gap, rank):
+    """A recorded gap of 0.3 mm has a direction, which a noise of 10 um does not hide."""
+    robot = lc.load_robot("hexapod-nategh-agheli")
+    _, data = simulate_plan(plan_groups(), 1e-5, seed=5)
+    rng = np.random.default_rng(0)
+    rows = tuple(
+        replace(o, measured=gap * rng.standard_normal(o.measured.shape)) for o in data.observations
+    )
+    assert identify(robot, replace(data, observations=rows)).rank == rank
+
+
+TOUCHED = {name for name, kind in KINDS.items() if not kind.changes_with_pose}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(example, id=f"{name}-{'-'.join(example.unknown) or 'known'}")
+        for name, kind in KINDS.items()
+        if name not in TOUCHED and name != "joint"
+        for example in kind.examples()
+        if example.unknown and not example.sensed_joints
+    ],
+)
+def test_residuals_do_not_change_the_rank_of_other_kinds(kind):
+    """Only kinds that say so mix the components of their residuals: a machine far from nominal has
+    the rank of one without residuals."""
+    assert not kind.mixes_components
+    robot = lc.load_robot("hexapod-42")
+    sigma = [1e-5] * len(kind.noise_columns)
+    instrument = lc.Instrument((lc.Sensor(kind, lc.Gaussian(sigma)),))
+    wrong = robot.with_values(lc.sample_truth(robot, 1, 1)[0])
+    exact, far = (identifiability(robot, _simulate(r, instrument)).rank for r in (robot, wrong))
+    assert exact == far
+
+
+def _simulate(truth: Mechanism, instrument: lc.Instrument) -> lc.Measurements:
+    coordinates = sample_workspace(truth.nominal, 30, 1).coordinates
+    return lc.simulate(truth, coordinates, instrument, 1)
+
+
+def _orientation_error(robot: Mechanism, truth: Mechanism) -> float:
+    """Return the root mean square error of orientation [rad] over the workspace."""
+    coordinates = sample_workspace(robot.nominal, 60, 5).coordinates
+    q = inverse(robot.nominal, coordinates).q
+    R, true = forward(robot, q).T[:, :3, :3], forward(truth, q).T[:, :3, :3]
+    return float(np.sqrt((geometry.log_so3(np.swapaxes(R, 1, 2) @ true) ** 2).sum(1).mean()))
+
+
+def _rotate_base(robot: Mechanism, rotation: np.ndarray) -> np.ndarray:
+    """Return the values of a hexapod whose base points are rotated about the origin."""
+    values, R = robot.values.copy(), geometry.exp_so3(rotation)
+    for leg in range(1, 7):
+        places = [robot.parameters.index(f"leg{leg}.base.{axis}") for axis in "xyz"]
+        values[places] = R @ values[places]
+    return values
