@@ -46,7 +46,7 @@ collected again.
 CORRECTED: dict[str, str] = {
     "papers/cmm-constraint-2011/surfaces": (
         "rank 33, no longer 34: residuals of lines are no information on rotations of the base"
-    ),
+    )
 }
 """Cases whose fixture was written anew because a result was wrong, with the reason."""
 

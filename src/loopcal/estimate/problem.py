@@ -28,7 +28,7 @@ from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.nuisance.elimination import NodeMembers, NuisanceElimination, fold_node_rows
 from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
 from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
-from loopcal.estimate.poses.consistent import ConsistentPoses
+from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
 from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
@@ -36,7 +36,7 @@ from loopcal.estimate.poses.linearization import evaluate_rows, whiten
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.measure import Measurements, list_sensed_joints
-from loopcal.numerics.decomposition import empty_factor, remove_null_space
+from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray

@@ -292,33 +292,6 @@ def empty_factor(trials: int, parameters: int) -> FloatArray:
     return np.zeros((trials, parameters + 1, parameters + 1))
 
 
-def remove_null_space(
-    factor: FloatArray, reference: FloatArray, tolerance: float = RANK_TOLERANCE
-) -> FloatArray:
-    """Return a factor without the directions that the rows of a reference do not determine.
-
-    With the null space N of the reference, A becomes A (I - N N'). Where the reference has full
-    rank, or numbers that are not finite, the factor stays as it is.
-
-    Parameters
-    ----------
-    factor, reference : (t, p + 1, p + 1) upper triangular, of rows [A | b] with the same columns.
-    """
-    p = factor.shape[-1] - 1
-    finite = np.isfinite(reference).all(axis=(1, 2)) & np.isfinite(factor).all(axis=(1, 2))
-    _, s, vt = np.linalg.svd(np.where(finite[:, None, None], reference[:, :p, :p], 0.0))
-    determined = are_nonzero(s, tolerance)
-    changed = np.flatnonzero(finite & ~determined.all(axis=1))
-    if not changed.size:
-        return factor
-    basis = np.where(determined[changed, :, None], vt[changed], 0.0)
-    rows = np.array(factor[changed])
-    rows[:, :, :p] = np.matmul(np.matmul(rows[:, :, :p], basis.swapaxes(-1, -2)), basis)
-    result = np.array(factor)
-    result[changed] = np.linalg.qr(rows, mode="r")
-    return result
-
-
 def decompose(
     factor: FloatArray,
     rows: IntArray,

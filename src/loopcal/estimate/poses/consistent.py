@@ -20,6 +20,7 @@ from loopcal.estimate.linearization import Start
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_states
 from loopcal.estimate.poses.uncertain import UncertainPoses
+from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
 
@@ -85,3 +86,30 @@ class ConsistentPoses:
         )
         assert moved.states is not None
         return moved.states
+
+
+def remove_null_space(
+    factor: FloatArray, reference: FloatArray, tolerance: float = RANK_TOLERANCE
+) -> FloatArray:
+    """Return a factor without the directions that the rows of a reference do not determine.
+
+    With the null space N of the reference, A becomes A (I - N N'). Where the reference has full
+    rank, or numbers that are not finite, the factor stays as it is.
+
+    Parameters
+    ----------
+    factor, reference : (t, p + 1, p + 1) upper triangular, of rows [A | b] with the same columns.
+    """
+    p = factor.shape[-1] - 1
+    finite = np.isfinite(reference).all(axis=(1, 2)) & np.isfinite(factor).all(axis=(1, 2))
+    _, s, vt = np.linalg.svd(np.where(finite[:, None, None], reference[:, :p, :p], 0.0))
+    determined = are_nonzero(s, tolerance)
+    changed = np.flatnonzero(finite & ~determined.all(axis=1))
+    if not changed.size:
+        return factor
+    basis = np.where(determined[changed, :, None], vt[changed], 0.0)
+    rows = np.array(factor[changed])
+    rows[:, :, :p] = np.matmul(np.matmul(rows[:, :, :p], basis.swapaxes(-1, -2)), basis)
+    result = np.array(factor)
+    result[changed] = np.linalg.qr(rows, mode="r")
+    return result

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of measurement kinds: columns, residuals and their derivatives.
 
-A new kind is one file with one frozen dataclass, and one entry in `KINDS`. Files, templates,
-documentation and contract tests follow from the members of this class. A kind does not know the
-robot: it receives platform poses. It states
+A new kind is one file with one frozen dataclass, and one entry in `KINDS`. Files, templates and
+contract tests follow from this class. A kind receives platform poses, not the robot. It states
 
 * `columns`, as written in files;
-* `possible_setup`: frames, targets, surfaces and offsets that `unknown` may name, with their
-  parameters;
-* `_predict`: columns without noise, and their derivatives. A kind whose noise is more than an
-  addition to its columns overrides `_evaluate` and `_measure` instead;
+* `possible_setup`: frames, targets, surfaces and offsets that may be unknown;
+* `_predict`: columns without noise, and derivatives; or, where noise is not just added to the
+  columns, `_evaluate` and `_measure`;
 * `guess_values`, if its parameters follow from data in closed form.
 
-`loopcal.measure.kinds.points.distance` is a short example, with three setup items.
-
+A short example: `loopcal.measure.kinds.points.distance`.
 Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u nuisance
 parameters of the kind, j joints that it senses. A kind with `poses_per_row` l > 1 compares several
 poses in one row and has an axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6). Values of
@@ -53,9 +50,8 @@ class Kind(ABC):
         Whether columns that stay constant while the robot moves indicate a mistake. It is False for
         touched surfaces and for locked joints, whose columns stay at 0.
     mixes_components : bool
-        Whether a motion of the base, the setup with it, mixes the components of a residual, which
-        no setup parameter follows. Its first-order rows then contain this motion in proportion to
-        the residuals; see docs/theory/identification.md.
+        Whether a motion of base and setup mixes the components of a residual, so that rows contain
+        it in proportion to the residual; see docs/theory/identification.md.
     wraps_angles : bool
         Whether differences of angles are wrapped into (-pi, pi].
     description : str

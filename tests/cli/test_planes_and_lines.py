@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planes and lines from the plan to the calibrated robot, as docs/planning.md describes."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal import geometry
+from loopcal.cli import main
+from loopcal.io import load_robot
+from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+
+ROBOT = "hexapod-nategh-agheli"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(line: str) -> int:
+    return main(line.split())
+
+
+def orientation_error(robot: Mechanism, truth: Mechanism) -> float:
+    """Return the root mean square error [deg] over the workspace."""
+    nominal = robot.nominal
+    q = inverse(nominal, sample_workspace(nominal, 50, 3).coordinates).q
+    R, true = forward(robot, q).T[:, :3, :3], forward(truth, q).T[:, :3, :3]
+    angles = geometry.log_so3(np.swapaxes(R, 1, 2) @ true)
+    return float(np.degrees(np.sqrt((angles**2).sum(axis=1).mean())))
+
+
+def test_commands_of_the_page_report_rank_33_from_plan_to_calibration(folder, root, capsys):
+    page = (root / "docs" / "planning.md").read_text("utf-8")
+    plan, fill, calibrate, identify = re.findall(rf"^loopcal (.*{ROBOT}.*)$", page, re.MULTILINE)
+    assert run(plan) == 0
+    assert "determine 33 parameter combinations" in capsys.readouterr().out
+    assert run(f"{fill} --truth truth.yaml") == 0
+    assert run(calibrate) == 0
+    capsys.readouterr()
+    assert run(f"{identify} --json") == 0
+    assert json.loads(capsys.readouterr().out)["rank"] == 33
+    result = json.loads((folder / "run" / "result.json").read_text())
+    assert result["fit"]["rank"] == 33
+    truth = load_robot("truth.yaml")
+    before, after = (
+        orientation_error(load_robot(name), truth) for name in (ROBOT, "run/robot.yaml")
+    )
+    assert after < 0.5 * before
+
+
+@pytest.mark.slow
+def test_least_squares_does_not_move_along_rotations_of_the_base(folder):
+    assert run(f"plan {ROBOT} -o plan --measure plane-line --groups 12 --points 6") == 0
+    fill = f"simulate {ROBOT} --fill plan/measurements.csv --draw-errors --truth truth.yaml"
+    assert run(f"{fill} -o filled.csv --seed 2") == 0
+    assert run(f"calibrate {ROBOT} filled.csv -o run --method ls") == 0
+    truth = load_robot("truth.yaml")
+    before, after = (
+        orientation_error(load_robot(name), truth) for name in (ROBOT, "run/robot.yaml")
+    )
+    assert after < 0.5 * before  # it was 0.6 times before at one seed, 2 times at another
+
+
+@pytest.mark.slow
+def test_plan_with_fewer_equations_than_directions_says_so(folder, capsys):
+    ask = f"plan {ROBOT} -o plan --measure plane-line --groups 6 --points 6"
+    assert run(f"{ask} --json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["rank"], document["possible_rank"]) == (24, 33)
+    assert "plan.few-groups" in [finding["code"] for finding in document["findings"]]
+    assert document["sd_last"] < document["sd_first"]
+    fill = f"simulate {ROBOT} --fill plan/measurements.csv --draw-errors"
+    assert run(f"{fill} -o filled.csv") == 0
+    assert run(f"calibrate {ROBOT} filled.csv -o run") == 0
+    result = json.loads((folder / "run" / "result.json").read_text())
+    assert result["fit"]["rank"] == 24
+
+
+@pytest.mark.slow
+def test_a_sheet_without_readings_needs_its_plan(folder, capsys):
+    assert run(f"plan {ROBOT} -o plan --measure plane-line --groups 9 --points 6") == 0
+    (folder / "plan" / "measurements.csv").rename(folder / "sheet.csv")
+    assert run(f"simulate {ROBOT} --fill sheet.csv -o filled.csv") == 1
+    message = capsys.readouterr().err
+    assert "this sheet has no readings, and there is no plan.csv beside it" in message
