@@ -10,11 +10,11 @@ contract tests follow from this class. A kind receives platform poses, not the r
   columns, `_evaluate` and `_measure`;
 * `guess_values`, if its parameters follow from data in closed form.
 
-Example: `loopcal.measure.kinds.points.distance`. Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u nuisance
-parameters of the kind, j joints that it senses. A kind with `poses_per_row` l > 1 compares several
-poses in one row and has an axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6). Values of
-nuisance parameters are plain numbers that add up; `loopcal.measure.kinds.setup_parameters` says how
-a frame or a direction is written in them.
+Example: `loopcal.measure.kinds.points.distance`. Shapes: t trials, r rows, c columns as in files,
+m residuals (often c), u nuisance parameters of the kind, j joints that it senses. A kind with
+`poses_per_row` l > 1 has an axis l for the poses that a row compares: T (t, r, l, 4, 4), jacobian
+(t, r, l, m, 6). Values of nuisance parameters are plain numbers that add up;
+`loopcal.measure.kinds.setup_parameters` says how a frame or a direction is written in them.
 """
 
 from abc import ABC, abstractmethod
