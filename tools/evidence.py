@@ -96,9 +96,14 @@ def render_table(table: dict[str, Any]) -> str:
     columns = table["columns"]
     formats = table.get("formats", [""] * len(columns))
     rows = (zip(row, formats, strict=True) for row in table["rows"])
-    return format_table(
-        columns, [["-" if x is None else format(x, spec) for x, spec in row] for row in rows]
-    )
+    return format_table(columns, [[_render_cell(*cell) for cell in row] for row in rows])
+
+
+def _render_cell(value: Any, spec: str) -> str:
+    """Return a cell as text; a word in a column of numbers, such as "diverged", stays a word."""
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else format(value, spec)
 
 
 def fill_tables(text: str, folder: Path) -> str:

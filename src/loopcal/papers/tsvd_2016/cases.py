@@ -25,6 +25,7 @@ from loopcal.papers.tsvd_2016.machines import (
     load_machine,
     measure_machines,
 )
+from loopcal.papers.tsvd_2016.situations import LS, RANKED, RE, TSVD, find_bottom
 from loopcal.papers.tsvd_2016.steps import (
     Iterations,
     iterate,
@@ -36,7 +37,6 @@ from loopcal.papers.tsvd_2016.steps import (
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-LS, RANKED, RE, TSVD = "LS", "LS with rank detection", "RE", "TSVD"
 WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
 CHOSEN = ", chosen"
 EQUAL_INTERVALS, EQUAL_RATIOS = 11, 13
@@ -50,12 +50,14 @@ class Answer:
 
     Attributes
     ----------
-    setting : lambda or k. values : (p,) [SI], NaN if diverged. errors : (4,), see MEASURES.
+    setting : lambda or k. values : (p,) [SI], NaN if diverged. errors : (5,), see MEASURES.
+    commanded : (2,), see COMMANDED.
     """
 
     setting: str
     values: FloatArray
     errors: FloatArray
+    commanded: FloatArray
     iterations: int
     is_converged: bool
 
@@ -67,30 +69,39 @@ class Answer:
     @property
     def needed(self) -> str:
         """Iterations until convergence, in words."""
-        return str(self.iterations) if self.is_converged else f"more than {self.iterations}"
+        if self.is_diverged:
+            return "diverged"
+        return f"{self.iterations:,}" if self.is_converged else f"more than {self.iterations:,}"
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """One algorithm over its setting. settings : (s,) lambda or k. runs : of all settings. errors :
-    (s, 4).
+    """One algorithm over its setting.
+
+    Attributes
+    ----------
+    settings : (s,) lambda or k. study : what was measured. runs : of all settings.
+    errors : (s, 5), see MEASURES. first : place of the first setting that may be the best: 1 where
+        the setting before it is LS.
     """
 
     settings: FloatArray
+    study: Study
     runs: Iterations
     errors: FloatArray
+    first: int = 0
 
     @property
     def best(self) -> int:
-        """Place of the minimum of the curve."""
-        return int(np.nanargmin(self.errors[:, 0] * self.errors[:, 1]))
+        """Place of the bottom of the curve."""
+        return self.first + find_bottom(self.errors[self.first :])
 
     def answer(self, i: int, setting: str) -> Answer:
         """Return the result of one setting."""
         runs = self.runs
-        return Answer(
-            setting, runs.values[i], self.errors[i], int(runs.count[i]), bool(runs.is_converged[i])
-        )
+        commanded = self.study.compute_commanded_errors(runs.values[[i]], runs.machine[[i]])[0]
+        count, is_converged = int(runs.count[i]), bool(runs.is_converged[i])
+        return Answer(setting, runs.values[i], self.errors[i], commanded, count, is_converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +159,7 @@ def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
     ks = np.arange(p, p // 3, -1)
     by_lambda, by_k = (
         _sweep(measured, lambdas, penalize_ridge(lambdas, p)),
-        _sweep(measured, ks, penalize_truncated(ks, p)),
+        _sweep(measured, ks, penalize_truncated(ks, p), first=1),
     )
     plain, ranked = (
         _sweep(measured, np.zeros(1), penalize_none(p)),
@@ -220,28 +231,31 @@ def run_library(measured: Study) -> dict[str, Answer]:
         elif name == PRIOR:
             setting = "lambda = 1, by definition"
         errors = measured.compute_output_errors(fit.values)[0]
-        answers[name] = Answer(
-            setting, fit.values[0], errors, int(fit.iterations[0]), bool(fit.converged[0])
-        )
+        commanded = measured.compute_commanded_errors(fit.values)[0]
+        count, is_converged = int(fit.iterations[0]), bool(fit.converged[0])
+        answers[name] = Answer(setting, fit.values[0], errors, commanded, count, is_converged)
     return answers
 
 
-def follow_ridge(measured: Study, counts: tuple[int, ...]) -> list[tuple[int, float, FloatArray]]:
-    """Return the best lambda and its errors (4,) after each number of RE iterations."""
-    smallest = float(
-        linearize(measured, measured.robot.values[None], np.zeros(1, dtype=np.int64))[
-            0
-        ].singular_values[0, -1]
-    )
-    lambdas = np.geomspace(smallest, 1.0, EQUAL_RATIOS)
-    history = iterate(
-        measured, penalize_ridge(lambdas, len(measured.robot.parameters)), limit=max(counts)
-    ).history
+def follow_ridge(
+    measured: Study, counts: tuple[int, ...]
+) -> list[tuple[int | str, float, FloatArray]]:
+    """Return the best lambda and its errors (5,) after each number of RE iterations, and at the end
+    of the iteration.
+    """
+    first = np.zeros(1, dtype=np.int64)
+    decomposition, _ = linearize(measured, measured.robot.values[None], first)
+    lambdas = np.geomspace(float(decomposition.singular_values[0, -1]), 1.0, EQUAL_RATIOS)
+    penalty = penalize_ridge(lambdas, len(measured.robot.parameters))
+    history = iterate(measured, penalty, limit=max(counts), ahead=0.0).history
+    ends: list[tuple[int | str, FloatArray]] = [
+        (count, history[min(count, len(history) - 1)]) for count in counts
+    ]
+    ends.append(("at convergence", iterate(measured, penalty).values))
     rows = []
-    for count in counts:
-        values = history[min(count, len(history) - 1)]
+    for count, values in ends:
         errors = measured.compute_output_errors(values, np.zeros(len(values), dtype=np.int64))
-        best = int(np.argmin(errors[:, 0] * errors[:, 1]))
+        best = find_bottom(errors)
         rows.append((count, float(lambdas[best]), errors[best]))
     return rows
 
@@ -251,10 +265,9 @@ def to_paper_units(measured: Study, values: FloatArray) -> FloatArray:
     return (values - measured.robot.parameters.nominal) / list_scales(measured.robot)
 
 
-def _sweep(measured: Study, settings: FloatArray | IntArray, penalty: FloatArray) -> Sweep:
+def _sweep(
+    measured: Study, settings: FloatArray | IntArray, penalty: FloatArray, first: int = 0
+) -> Sweep:
     runs = iterate(measured, penalty)
-    return Sweep(
-        np.asarray(settings, dtype=np.float64),
-        runs,
-        measured.compute_output_errors(runs.values, runs.machine),
-    )
+    errors = measured.compute_output_errors(runs.values, runs.machine)
+    return Sweep(np.asarray(settings, dtype=np.float64), measured, runs, errors, first)

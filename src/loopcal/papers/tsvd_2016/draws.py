@@ -1,66 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many machines: the methods compared over draws of the paper's errors and noise.
+"""Many machines: the paper's methods and the library's over draws of the paper's errors and noise.
 
-Raw methods are judged at their best: for each machine and each measure with the best lambda or k,
-which requires knowing the true machine. The library's methods choose theirs from the data.
+The paper's methods take the setting that is best for the true machine. The library's methods choose
+theirs from the data; MAP is given the true spread of the errors as its tolerances.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.estimate import GCV, MAP, FitOptions, LeastSquares, Ridge, identify_trials
 from loopcal.estimate.methods.penalties import Method
 from loopcal.measure import make_random_stream
-from loopcal.papers.printed import Cell, Table
 from loopcal.papers.tsvd_2016.machines import (
-    MEASURES,
     Study,
     draw_true_values,
     load_machine,
     measure_machines,
 )
-from loopcal.papers.tsvd_2016.steps import iterate, penalize_ridge, penalize_truncated
-from loopcal.papers.wording import read_wording
-from loopcal.typing import FloatArray, IntArray
+from loopcal.papers.tsvd_2016.situations import (
+    LS,
+    RANKED,
+    RE,
+    TSVD,
+    Situation,
+    mark_diverged,
+    run_situation,
+)
+from loopcal.typing import BoolArray, FloatArray
 
-RAW_LS, RAW_RE, RAW_TSVD = "raw LS", "best raw RE", "best raw TSVD"
-WHITENED, CROSS, PRIOR, HINDSIGHT = (
-    "whitened LS",
-    "whitened ridge, GCV",
-    "MAP",
-    "whitened ridge, best lambda in hindsight",
-)
-RAW_FIVE, WHITENED_FIVE, PRIOR_FIVE = (
-    "raw LS with rank detection, 5-DOF",
-    "whitened LS, 5-DOF",
-    "MAP, 5-DOF",
-)
-BEFORE = "before calibration"
+BEFORE, TRUE = "before calibration", "true parameters known"
+RAW_LS, RAW_RE, RAW_TSVD = "raw LS", "raw RE at its best", "raw TSVD at its best"
+RAW_FIVE = "raw LS with rank detection, 5-DOF"
+RE_FIVE, TSVD_FIVE = "raw RE at its best, 5-DOF", "raw TSVD at its best, 5-DOF"
+WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
+HINDSIGHT = "whitened ridge, best lambda in hindsight"
+NARROW, WIDE = "MAP, tolerances a third of the spread", "MAP, tolerances three times the spread"
+WHITENED_FIVE, PRIOR_FIVE = "whitened LS, 5-DOF", "MAP, 5-DOF"
 METHODS = (
-    BEFORE,
-    RAW_LS,
-    RAW_RE,
-    RAW_TSVD,
-    WHITENED,
-    CROSS,
-    PRIOR,
-    HINDSIGHT,
-    RAW_FIVE,
-    WHITENED_FIVE,
-    PRIOR_FIVE,
-)
+    BEFORE, RAW_LS, RAW_RE, RAW_TSVD, RAW_FIVE, RE_FIVE, TSVD_FIVE, WHITENED, CROSS, PRIOR, NARROW,
+    WIDE, HINDSIGHT, WHITENED_FIVE, PRIOR_FIVE, TRUE,
+)  # fmt: skip
+FACTOR = 3.0
+"""Between the tolerances of NARROW and WIDE and the true spread."""
+GROUPS = 5
+"""Groups of machines for claims about medians: each is a smaller draw of the study."""
 
-LAMBDAS = np.logspace(-6.0, 1.0, 15)
-"""Of RE, from below the smallest singular value of either manipulator to above 1; two a decade."""
 HINDSIGHT_LAMBDAS = np.logspace(-2.5, 2.5, 11)
 """Of ridge on whitened, scaled rows, where 1 is MAP."""
-TOGETHER = 8
-"""Machines at a time, for memory."""
 RESAMPLES = 2000
 RESAMPLING = 4  # purpose of a random stream
 
@@ -71,55 +61,61 @@ class Draws:
 
     Attributes
     ----------
-    name : of the structure. errors : method -> (t, 4), see MEASURES.
-    lambdas, ks : (l,), (k,) settings of RE and TSVD. ridge, truncated : (t, l, 4), (t, k, 4) errors
-        at them.
+    name : of the structure. six, five : the paper's methods with 6- and 5-DOF measurement.
+    errors : method -> (t, 5), see MEASURES, infinite where diverged.
+    commanded : method -> (t, 2), see COMMANDED, infinite where diverged; without HINDSIGHT, which
+        takes another lambda for each measure.
     """
 
     name: str
+    six: Situation
+    five: Situation
     errors: dict[str, FloatArray]
-    lambdas: FloatArray
-    ks: IntArray
-    ridge: FloatArray
-    truncated: FloatArray
+    commanded: dict[str, FloatArray]
 
     def __len__(self) -> int:
-        return len(self.ridge)
+        return len(self.six)
+
+    @property
+    def situations(self) -> tuple[Situation, Situation]:
+        """With 6- and 5-DOF measurement."""
+        return self.six, self.five
+
+    def list_groups(self) -> tuple[Draws, ...]:
+        """Return groups of machines of about equal size, `GROUPS` or as many as there are machines.
+
+        They hold the errors of the methods; the situations stay those of all machines.
+        """
+        places = np.array_split(np.arange(len(self)), min(GROUPS, len(self)))
+        return tuple(
+            replace(self, errors={m: errors[place] for m, errors in self.errors.items()})
+            for place in places
+        )
 
     def compute_median(self, method: str) -> FloatArray:
-        """Return medians (4,) over the machines."""
+        """Return medians (5,) over the machines."""
         return np.median(self.errors[method], axis=0)
 
     def compute_interval(self, method: str) -> FloatArray:
-        """Return the bootstrap interval (2, 4) of the medians, 95 %."""
+        """Return the bootstrap interval (2, 5) of the medians, 95 %."""
         return _interval(np.median(_resampled(self.errors[method]), axis=1))
 
     def compute_ratio(self, method: str, other: str) -> FloatArray:
-        """Return the ratio (4,) of medians, method over other."""
+        """Return the ratio (5,) of medians, method over other."""
         return self.compute_median(method) / self.compute_median(other)
 
     def compute_ratio_interval(self, method: str, other: str) -> FloatArray:
-        """Return the bootstrap interval (2, 4) of the ratio of medians, the machines drawn in
-        pairs, 95 %.
+        """Return the bootstrap interval (2, 2) of the ratio of medians in position and angle, the
+        machines drawn in pairs, 95 %.
         """
+        first, second = (self.errors[m][:, :2] for m in (method, other))
         return _interval(
-            np.median(_resampled(self.errors[method]), axis=1)
-            / np.median(_resampled(self.errors[other]), axis=1)
+            np.median(_resampled(first), axis=1) / np.median(_resampled(second), axis=1)
         )
 
-    def compute_curve(self, algorithm: str) -> FloatArray:
-        """Return medians (s, 4) over the machines at every setting of "RE" (LS, then rising lambda)
-        or "TSVD" (falling k).
-        """
-        if algorithm == "TSVD":
-            return np.median(self.truncated, axis=0)
-        return np.concatenate([self.compute_median(RAW_LS)[None], np.median(self.ridge, axis=0)])
-
-    def count_diverged(self, method: str) -> int:
-        """Return the number of machines for which the method diverged; their errors count as
-        infinite.
-        """
-        return int(np.isinf(self.errors[method][:, 0]).sum())
+    def find_diverged(self, method: str) -> BoolArray:
+        """Return for which machines (t,) the method diverged; their errors count as infinite."""
+        return np.isinf(self.errors[method][:, 0])
 
 
 def draw_machines(
@@ -128,51 +124,42 @@ def draw_machines(
     """Draw machines, measure and identify them by all methods."""
     truth = draw_true_values(load_machine(name), trials, seed)
     whole = measure_machines(name, truth, seed=seed)
-    p = len(whole.robot.parameters)
-    ks = np.arange(p, p // 3, -1)
-    penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(LAMBDAS, p)])
-    parts = []
-    for first in range(0, trials, TOGETHER):
-        progress(f"{name}, drawing {first + 1} of {trials}")
-        machines = np.arange(first, min(first + TOGETHER, trials))
-        run = iterate(
-            whole, np.tile(penalty, (len(machines), 1)), np.repeat(machines, len(penalty))
-        )
-        errors = whole.compute_output_errors(run.values, run.machine)
-        parts.append(errors.reshape(len(machines), len(penalty), -1))
-    curves = _mark_diverged(np.concatenate(parts))
-    by_k, by_lambda = curves[:, : len(ks)], curves[:, len(ks) :]
-    errors = {
-        BEFORE: whole.compute_output_errors(
-            np.repeat(whole.robot.parameters.nominal[None], trials, axis=0)
-        ),
-        RAW_LS: by_k[:, 0],
-        RAW_RE: by_lambda.min(axis=1),
-        RAW_TSVD: by_k.min(axis=1),
-        **run_whitened(whole, {WHITENED: LeastSquares(), CROSS: Ridge(GCV()), PRIOR: MAP()}),
-        HINDSIGHT: _run_in_hindsight(whole),
-        RAW_FIVE: _run_with_rank(whole.five),
-        **run_whitened(whole.five, {WHITENED_FIVE: LeastSquares(), PRIOR_FIVE: MAP()}),
-    }
-    return Draws(name, {method: errors[method] for method in METHODS}, LAMBDAS, ks, by_lambda, by_k)
+    six, five = (run_situation(study, progress) for study in (whole, whole.five))
+    progress(f"{name}, methods of loopcal")
+    nominal = np.repeat(whole.robot.parameters.nominal[None], trials, axis=0)
+    values = {BEFORE: nominal, TRUE: truth}
+    methods = {WHITENED: LeastSquares(), CROSS: Ridge(GCV()), PRIOR: MAP()}
+    scaled = {NARROW: Ridge(FACTOR**2), WIDE: Ridge(FACTOR**-2)}
+    values |= _identify(whole, methods | scaled)
+    values |= _identify(whole.five, {WHITENED_FIVE: LeastSquares(), PRIOR_FIVE: MAP()})
+    errors = {m: whole.compute_output_errors(v) for m, v in values.items()}
+    commanded = {m: whole.compute_commanded_errors(v) for m, v in values.items()}
+    errors[HINDSIGHT] = _run_in_hindsight(whole)
+    for method, algorithm, situation in (
+        (RAW_LS, LS, six),
+        (RAW_RE, RE, six),
+        (RAW_TSVD, TSVD, six),
+        (RAW_FIVE, RANKED, five),
+        (RE_FIVE, RE, five),
+        (TSVD_FIVE, TSVD, five),
+    ):
+        errors[method] = situation.chosen[algorithm].errors
+        commanded[method] = situation.chosen[algorithm].commanded
+    return Draws(
+        name,
+        six,
+        five,
+        {m: mark_diverged(errors[m]) for m in METHODS},
+        {m: mark_diverged(commanded[m]) for m in METHODS if m != HINDSIGHT},
+    )
 
 
-def run_whitened(measured: Study, methods: Mapping[str, Method]) -> dict[str, FloatArray]:
-    """Return errors (t, 4) of the library's methods: rows whitened, columns scaled by tolerance."""
+def _identify(measured: Study, methods: Mapping[str, Method]) -> dict[str, FloatArray]:
+    """Return values (t, p) by the library's methods: rows whitened, columns scaled by tolerance."""
     return {
-        name: measured.compute_output_errors(
-            identify_trials(measured.robot, measured.trials, method).values
-        )
+        name: identify_trials(measured.robot, measured.trials, method).values
         for name, method in methods.items()
     }
-
-
-def _run_with_rank(measured: Study) -> FloatArray:
-    """Return errors of raw LS without the null direction: one singular value fewer."""
-    p = len(measured.robot.parameters)
-    machines = np.arange(len(measured.trials))
-    run = iterate(measured, penalize_truncated(np.array([p - 1]), p), machines)
-    return _mark_diverged(measured.compute_output_errors(run.values))
 
 
 def _run_in_hindsight(measured: Study) -> FloatArray:
@@ -187,88 +174,6 @@ def _run_in_hindsight(measured: Study) -> FloatArray:
     return np.min(tried, axis=0)
 
 
-def make_medians(draws: Draws) -> Table:
-    """Return medians with their intervals."""
-    rows: list[tuple[Cell, ...]] = []
-    for method in METHODS:
-        middle, (low, high) = draws.compute_median(method), draws.compute_interval(method)
-        cells = [c for i in (0, 1, 2) for c in (float(middle[i]), f"{low[i]:.2g} to {high[i]:.2g}")]
-        rows.append((method, *cells, float(middle[3]), draws.count_diverged(method)))
-    words, name = read_wording(__file__), f"draws_{write_file_name(draws.name)}"
-    return words.table("draws", rows, name, name=draws.name, trials=len(draws))
-
-
-def make_ratios(draws: Draws) -> Table:
-    """Return ratios of medians: MAP, the default kind of fit, over each of the others."""
-    rows: list[tuple[Cell, ...]] = []
-    for other in (method for method in METHODS[1:8] if method != PRIOR):
-        ratio = draws.compute_ratio(PRIOR, other)
-        low, high = draws.compute_ratio_interval(PRIOR, other)
-        cells = (c for i in (0, 1) for c in (float(ratio[i]), float(low[i]), float(high[i])))
-        rows.append((f"MAP over {other}", *cells))
-    words, name = read_wording(__file__), f"ratios_{write_file_name(draws.name)}"
-    return words.table("ratios", rows, name, name=draws.name, trials=len(draws))
-
-
-def make_median_curves(draws: Draws) -> Table:
-    """Return median errors at every lambda and k."""
-    settings = [("RE", float(x)) for x in (0.0, *draws.lambdas)]
-    settings += [("TSVD", float(k)) for k in draws.ks]
-    curves = np.concatenate([draws.compute_curve("RE"), draws.compute_curve("TSVD")])
-    rows = [
-        (*setting, *(float(e) if np.isfinite(e) else None for e in errors[:3]))
-        for setting, errors in zip(settings, curves, strict=True)
-    ]
-    words, name = read_wording(__file__), f"curves_{write_file_name(draws.name)}"
-    return words.table("median_curves", rows, name, name=draws.name, trials=len(draws))
-
-
-def to_document(draws: Draws, seed: int) -> dict[str, Any]:
-    """Return the draws for evidence: tables by name, and which curves have an interior minimum."""
-    tables = {
-        "medians": make_medians(draws),
-        "ratios": make_ratios(draws),
-        "curves": make_median_curves(draws),
-    }
-    inside = {
-        algorithm: {
-            m: has_interior_minimum(draws.compute_curve(algorithm)[:, i])
-            for i, m in enumerate(MEASURES[:3])
-        }
-        for algorithm in ("RE", "TSVD")
-    }
-    return {
-        "robot": draws.name,
-        "seed": seed,
-        "draws": len(draws),
-        "minimum_inside": inside,
-        "tables": {
-            name: {
-                "columns": list(t.columns),
-                "formats": list(t.formats),
-                "rows": [list(row) for row in t.rows],
-            }
-            for name, t in tables.items()
-        },
-    }
-
-
-def has_interior_minimum(curve: FloatArray, gain: float = 1.05) -> bool:
-    """Return whether both ends of a curve (s,) are at least `gain` times its inner minimum."""
-    best = int(np.argmin(curve))
-    return bool(0 < best < len(curve) - 1 and min(curve[0], curve[-1]) > gain * curve[best])
-
-
-def write_file_name(name: str) -> str:
-    """Return the name of a manipulator in file names."""
-    return name.lower().replace("-", "_")
-
-
-def _mark_diverged(errors: FloatArray) -> FloatArray:
-    """Count diverged machines as infinitely wrong, so that medians stay honest."""
-    return np.where(np.isnan(errors), np.inf, errors)
-
-
 def _resampled(values: FloatArray) -> FloatArray:
     """(RESAMPLES, t, ..) machines drawn with replacement, always the same ones."""
     t = len(values)
@@ -276,4 +181,4 @@ def _resampled(values: FloatArray) -> FloatArray:
 
 
 def _interval(medians: FloatArray) -> FloatArray:
-    return np.quantile(medians, [0.025, 0.975], axis=0)
+    return np.quantile(medians, [0.025, 0.975], axis=0, method="nearest")  # some may be infinite

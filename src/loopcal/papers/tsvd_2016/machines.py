@@ -25,7 +25,14 @@ from loopcal.measure import (
     make_random_stream,
     simulate_trials,
 )
-from loopcal.mechanism import Mechanism, Solution, forward_trials, inverse
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    compute_readings,
+    forward_trials,
+    inverse,
+    inverse_trials,
+)
 from loopcal.papers.tsvd_2016.published import MM, read_published
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -49,7 +56,9 @@ MEASURES = (
     "phi and theta [deg]",
     "direction of the normal [deg]",
     "parameters [tolerances]",
+    "parameters farther from the truth than nominal [share]",
 )
+COMMANDED = ("position after commanding [mm]", "phi and theta after commanding [deg]")
 ERRORS = 3  # purpose of a random stream
 
 
@@ -101,6 +110,13 @@ class Study:
         """The same measurements without psi."""
         return replace(self, trials=_without_psi(self.trials))
 
+    @property
+    def exact(self) -> Study:
+        """The same measurements without noise."""
+        T = self.trials.T
+        measured = self.kind.measure(T, np.zeros((*T.shape[:2], self.freedoms)))
+        return replace(self, trials=replace(self.trials, measured=(measured,)))
+
     @cached_property
     def commanded(self) -> State:
         """States of the machine as designed at the readings, (1, 36): starts of corrected ones."""
@@ -133,27 +149,61 @@ class Study:
 
         Returns
         -------
-        errors : (a, 4) root mean squares, see MEASURES. psi counts in none of them: the paper
-            considers it unnecessary.
+        errors : (a, 5) root mean squares, and a share, see MEASURES. psi counts in none of them:
+            the paper considers it unnecessary.
         """
         is_finite = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
-        T, true = (
-            self._outputs(np.where(is_finite, values, self.robot.values)),
-            self.true_outputs[machine],
+        T = self._outputs(np.where(is_finite, values, self.robot.values))
+        truth, nominal = self.trials.truth[machine], self.robot.parameters.nominal
+        parameters = ((values - truth) / self.robot.parameters.tolerance) ** 2
+        worse = np.abs(values - truth) > np.abs(nominal - truth)
+        errors = np.column_stack(
+            [
+                _compare_poses(T, self.true_outputs[machine]),
+                np.sqrt(parameters.mean(axis=1)),
+                worse.mean(axis=1),
+            ]
         )
-        position = np.sum((T[..., :3, 3] - true[..., :3, 3]) ** 2, axis=-1) / MM**2
-        first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, true))
-        angles = sum(
-            np.rad2deg(geometry.wrap_angle(a - b)) ** 2
-            for a, b in zip(first[:2], second[:2], strict=True)
-        )
-        normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - true[..., :3, 2]) ** 2, axis=-1)
-        parameters = ((values - self.trials.truth[machine]) / self.robot.parameters.tolerance) ** 2
-        squares = [
-            np.asarray(square).mean(axis=1) for square in (position, angles, normal, parameters)
-        ]
-        return np.where(is_finite, np.sqrt(np.stack(squares, axis=1)), np.nan)
+        return np.where(is_finite, errors, np.nan)
+
+    def compute_commanded_errors(
+        self, values: FloatArray, machine: IntArray | None = None
+    ) -> FloatArray:
+        """Return errors of the true machines, commanded to the output range with identified values.
+
+        The readings come from the inverse kinematics of the identified machine; the true machine
+        takes its pose at them; the error is relative to the pose of the machine as designed.
+        Coordinates without an actuator keep their errors, even with the true values.
+
+        Parameters
+        ----------
+        values, machine : as for `compute_output_errors`.
+
+        Returns
+        -------
+        errors : (a, 2) root mean squares, see COMMANDED.
+        """
+        is_finite = np.isfinite(values).all(axis=1, keepdims=True)
+        machine = np.arange(len(values)) if machine is None else machine
+        known = np.where(is_finite, values, self.robot.values)
+        target = list_output_range(self.robot)[None]
+        state = inverse_trials(self.robot, known, target, self.grid.state)
+        q = compute_readings(self.robot, known, state)
+        T = forward_trials(self.robot, self.trials.truth[machine], q, self.grid.state).T
+        return np.where(is_finite, _compare_poses(T, self.grid.T[None])[:, :2], np.nan)
+
+
+def _compare_poses(T: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return rms differences (a, 3) of poses (a, n, 4, 4): the first three MEASURES."""
+    position = np.sum((T[..., :3, 3] - reference[..., :3, 3]) ** 2, axis=-1) / MM**2
+    first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, reference))
+    angles = sum(
+        np.rad2deg(geometry.wrap_angle(a - b)) ** 2
+        for a, b in zip(first[:2], second[:2], strict=True)
+    )
+    normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - reference[..., :3, 2]) ** 2, axis=-1)
+    return np.sqrt(np.stack([np.mean(x, axis=1) for x in (position, angles, normal)], axis=1))
 
 
 def measure_machines(

@@ -36,8 +36,19 @@ ENOUGH = 1e-6
 text.
 """
 
-LIMIT = 20
-"""Iterations at most; ridge steps shorten slowly."""
+LIMIT = 1_000_000
+"""Iterations at most; ridge steps shorten slowly, and 100,000 of them are common."""
+
+LINEARIZATIONS = 40
+"""Matrices H at most: enough for `LIMIT` ridge steps, see `AHEAD`, and for 40 steps of LS."""
+
+AHEAD = 0.5
+"""Steps taken with one H, as a share of the iterations done before.
+
+Ridge converges in many steps that hardly change the machine, and so hardly change H. With the same
+H the sum of m steps has a closed form, the filter 1 - (lambda / (s^2 + lambda))^m. LS and TSVD,
+whose steps with the same H are zero after the first, take one step with each H.
+"""
 
 LOST = 1e4
 """A step of more than this [mm, rad] has diverged: ten meters."""
@@ -45,23 +56,30 @@ LOST = 1e4
 
 @dataclass(frozen=True, eq=False)
 class Iterations:
-    """Result of the steps for t settings; index k of a history is the state after k iterations.
+    """Result of the steps for t settings; index k of a history is the state at the k-th H.
 
     Attributes
     ----------
-    values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI].
-    steps : (k, t) largest component of each step [mm, rad], NaN after the end. count : (t,)
-        iterations done.
-    is_converged, is_diverged : (t,); neither: `LIMIT` was reached. machine : (t,) as given.
+    values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI],
+        NaN from the step on that diverged.
+    steps : (k, t) largest component of the first step with each H [mm, rad], NaN after the end and
+        where it diverged. done : (k + 1, t) iterations before each state of the history.
+    is_converged, is_diverged : (t,); neither: stopped by `LIMIT` or `LINEARIZATIONS`.
+    machine : (t,) as given.
     """
 
     values: FloatArray
     history: FloatArray
     steps: FloatArray
-    count: IntArray
+    done: IntArray
     is_converged: BoolArray
     is_diverged: BoolArray
     machine: IntArray
+
+    @property
+    def count(self) -> IntArray:
+        """(t,) iterations done."""
+        return self.done[-1]
 
 
 def penalize_none(parameters: int) -> FloatArray:
@@ -80,7 +98,11 @@ def penalize_truncated(k: IntArray, parameters: int) -> FloatArray:
 
 
 def iterate(
-    study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT
+    study: Study,
+    penalty: FloatArray,
+    machine: IntArray | None = None,
+    limit: int = LIMIT,
+    ahead: float = AHEAD,
 ) -> Iterations:
     """Run steps 5 to 9.
 
@@ -88,31 +110,66 @@ def iterate(
     ----------
     study : the machines. penalty : (t | 1, p) of each setting, see above.
     machine : (t,) which machine was measured; default: the first. limit : iterations at most.
+    ahead : see `AHEAD`; 0 computes H in every iteration.
     """
     machine = np.zeros(len(penalty), dtype=np.int64) if machine is None else machine
     t = len(machine)
     penalty = np.broadcast_to(penalty, (t, penalty.shape[1]))
     values = np.repeat(study.robot.parameters.nominal[None], t, axis=0)
-    running, diverged = np.ones(t, dtype=bool), np.zeros(t, dtype=bool)
-    history, steps, count = [values.copy()], [], np.zeros(t, dtype=np.int64)
-    for _ in range(limit):
-        active = np.flatnonzero(running)
+    diverged, converged = np.zeros(t, dtype=bool), np.zeros(t, dtype=bool)
+    count = np.zeros(t, dtype=np.int64)
+    history, steps, done = [values.copy()], [], [count.copy()]
+    for _ in range(LINEARIZATIONS if ahead else limit):
+        active = np.flatnonzero(~diverged & ~converged & (count < limit))
         if not active.size:
             break
         decomposition, reached = linearize(study, values[active], machine[active])
-        step = decomposition.deviation(decomposition.solution(penalty[active]))
-        size = np.abs(step).max(axis=1)
-        good = reached & (size < LOST)
-        values[active] += np.where(good[:, None], step, 0.0) * list_scales(study.robot)
-        count[active] += 1
-        running[active], diverged[active] = good & (size > ENOUGH), ~good
+        wanted = np.minimum(np.maximum(1, ahead * count[active]), limit - count[active])
+        taken = _count_steps(decomposition, penalty[active], wanted.astype(np.int64))
+        size = _measure_step(decomposition, penalty[active], np.zeros(len(active), np.int64))
+        change = decomposition.deviation(_sum_steps(decomposition, penalty[active], taken))
+        good = reached & (size < LOST) & (np.abs(change).max(axis=1) < LOST)
+        values[active] += np.where(good[:, None], change, np.nan) * list_scales(study.robot)
+        count[active] += np.where(good, taken, 1)
+        converged[active], diverged[active] = good & (size <= ENOUGH), ~good
         history.append(values.copy())
+        done.append(count.copy())
         steps.append(np.full(t, np.nan))
-        steps[-1][active] = size
-    final = np.where(diverged[:, None], np.nan, values)
-    return Iterations(
-        final, np.stack(history), np.stack(steps), count, ~running & ~diverged, diverged, machine
-    )
+        steps[-1][active] = np.where(good, size, np.nan)
+    size = np.stack(steps) if steps else np.zeros((0, t))
+    return Iterations(values, np.stack(history), size, np.stack(done), converged, diverged, machine)
+
+
+def _sum_steps(decomposition: Decomposition, penalty: FloatArray, count: IntArray) -> FloatArray:
+    """Return the coordinates (a, p) of the sum of `count` (a,) steps with the same H.
+
+    Step m + 1 has the filter f r^m with f = s^2 / (s^2 + penalty) and r = 1 - f, so that the sum
+    has the filter 1 - r^m.
+    """
+    left = 1.0 - decomposition.filter_factors(penalty)
+    kept = 1.0 - left ** count[:, None]
+    s = decomposition.singular_values
+    return np.divide(kept * decomposition.projections, s, out=np.zeros_like(s), where=s > 0.0)
+
+
+def _measure_step(
+    decomposition: Decomposition, penalty: FloatArray, before: IntArray
+) -> FloatArray:
+    """Return the largest component (a,) of the step after `before` (a,) steps with this H."""
+    left = (1.0 - decomposition.filter_factors(penalty)) ** before[:, None]
+    step = decomposition.deviation(left * decomposition.solution(penalty))
+    return np.abs(step).max(axis=1)
+
+
+def _count_steps(decomposition: Decomposition, penalty: FloatArray, wanted: IntArray) -> IntArray:
+    """Return how many of the `wanted` (a,) steps are larger than `ENOUGH`, and one at least."""
+    low, high = np.ones_like(wanted), np.maximum(wanted, 1)
+    while (low < high).any():
+        middle = (low + high) // 2
+        is_small = _measure_step(decomposition, penalty, middle) <= ENOUGH
+        low, high = np.where(is_small, low, middle + 1), np.where(is_small, middle, high)
+        low = np.minimum(low, high)
+    return low
 
 
 def linearize(

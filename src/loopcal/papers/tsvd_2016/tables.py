@@ -10,29 +10,21 @@ import numpy as np
 
 from loopcal.mechanism import Mechanism
 from loopcal.papers.printed import Cell, Comparison, Table
-from loopcal.papers.tsvd_2016.cases import (
-    LS,
-    PRIOR,
-    RANKED,
-    RE,
-    TSVD,
-    WHITENED,
-    Case,
-    Sweep,
-    to_paper_units,
-)
-from loopcal.papers.tsvd_2016.draws import (
-    BEFORE,
-    Draws,
+from loopcal.papers.tsvd_2016.cases import PRIOR, WHITENED, Case, Sweep, to_paper_units
+from loopcal.papers.tsvd_2016.draw_tables import (
+    DIVERGED,
     make_median_curves,
     make_medians,
     make_ratios,
+    show_number,
     write_file_name,
 )
+from loopcal.papers.tsvd_2016.draws import BEFORE, TRUE, Draws
 from loopcal.papers.tsvd_2016.machines import EVALUATED_TILTS, HEIGHTS, LIMITS, load_machine
 from loopcal.papers.tsvd_2016.published import NOISE_COLUMNS, Published, read_published
+from loopcal.papers.tsvd_2016.situations import LS, RANKED, RE, TSVD
 from loopcal.papers.wording import read_wording
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 RIDGE_STEPS = (5, 10, 20, 50, 100)
@@ -62,7 +54,7 @@ class Results:
     printed: Published
     cases: tuple[Case, ...]
     draws: tuple[Draws, ...]
-    steps: list[tuple[int, float, FloatArray]]
+    steps: list[tuple[int | str, float, FloatArray]]
     counts: Comparison
 
     def find_case(self, name: str, freedoms: int) -> Case:
@@ -88,7 +80,7 @@ def make_tables(results: Results) -> tuple[Table, ...]:
         _list_ridge_steps(results),
         *(_list_identified(name, results) for name in names),
         *(_list_curves(case) for case in results.cases),
-        *(make_median_curves(draws) for draws in results.draws),
+        *(make_median_curves(s) for draws in results.draws for s in draws.situations),
         *(_list_history(case) for case in results.cases),
     )
 
@@ -98,18 +90,24 @@ def name_file(case: Case) -> str:
     return f"{write_file_name(case.study.name)}_{case.study.freedoms}"
 
 
-def collect_history(case: Case, algorithm: str) -> FloatArray:
-    """Return identified errors (k + 1, p) [mm, rad] by iteration of LS, or of RE or TSVD at their
-    best setting.
+def collect_history(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
+    """Return iterations (k + 1,) and identified errors (k + 1, p) [mm, rad] of LS, or of RE or TSVD
+    at their best setting; NaN after a step that diverged.
     """
     sweep, i = _find_run(case, algorithm)
-    return to_paper_units(case.study, sweep.runs.history[: sweep.runs.count[i] + 1, i])
+    done, history = sweep.runs.done[:, i], sweep.runs.history[:, i]
+    end = int(np.searchsorted(done, done[-1])) + 1
+    return done[:end], to_paper_units(case.study, history[:end])
 
 
-def collect_steps(case: Case, algorithm: str) -> FloatArray:
-    """Return the largest component (k,) of each step [mm, rad]."""
+def collect_steps(case: Case, algorithm: str) -> tuple[IntArray, FloatArray]:
+    """Return iterations (k,) and the largest component of each step (k,) [mm, rad], NaN where it
+    diverged.
+    """
     sweep, i = _find_run(case, algorithm)
-    return sweep.runs.steps[: sweep.runs.count[i], i]
+    done, steps = sweep.runs.done[:, i], sweep.runs.steps[:, i]
+    end = int(np.searchsorted(done, done[-1]))
+    return done[:end] + 1, steps[:end]
 
 
 def list_units(robot: Mechanism) -> tuple[str, ...]:
@@ -163,15 +161,17 @@ def _list_outputs(name: str, results: Results) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for freedoms in (6, 5):
         case = results.find_case(name, freedoms)
-        nominal = case.study.robot.parameters.nominal[None]
-        before = case.study.compute_output_errors(nominal)[0]
-        if freedoms == 6:
-            rows.append(("", BEFORE, None, *map(float, before), None, None))
+        study = case.study
+        nominal, truth = study.robot.parameters.nominal[None], study.trials.truth
+        for method, values in ((BEFORE, nominal), (TRUE, truth)) if freedoms == 6 else ():
+            numbers = (*study.compute_output_errors(values)[0, :4],
+                       *study.compute_commanded_errors(values)[0])  # fmt: skip
+            rows.append(("", method, None, *map(float, numbers), None, None))
         for method, answer in case.answers.items():
-            errors = [None] * 4 if answer.is_diverged else [float(e) for e in answer.errors]
-            end = "diverged" if answer.is_diverged else "yes" if answer.is_converged else "no"
+            numbers = (*answer.errors[:4], *answer.commanded)
+            end = DIVERGED if answer.is_diverged else "yes" if answer.is_converged else "no"
             label = (f"{freedoms}-DOF", method, answer.setting)
-            rows.append((*label, *errors, answer.iterations, end))
+            rows.append((*label, *map(show_number, numbers), answer.iterations, end))
     number = 8 if name == "3-PRS" else 7
     words = read_wording(__file__)
     return words.table("outputs", rows, f"table_{number}", name=name, number=number)
@@ -184,7 +184,7 @@ def _list_identified(name: str, results: Results) -> Table:
     columns += [results.find_case(name, f).answers[m].values for m, f in IDENTIFIED]
     values = to_paper_units(case.study, np.array(columns))
     labels = zip(robot.parameters.names, list_units(robot), strict=True)
-    rows = [(*label, *map(float, values[:, i])) for i, label in enumerate(labels)]
+    rows = [(*label, *map(show_number, values[:, i])) for i, label in enumerate(labels)]
     number = 6 if name == "3-PRS" else 5
     words = read_wording(__file__)
     return words.table("identified", rows, f"table_{number}", name=name, number=number)
@@ -199,7 +199,7 @@ def _list_convergence(cases: Sequence[Case]) -> Table:
 
 
 def _list_ridge_steps(results: Results) -> Table:
-    rows = [(count, lam, *map(float, errors[:2])) for count, lam, errors in results.steps]
+    rows = [(count, lam, *map(show_number, errors[:2])) for count, lam, errors in results.steps]
     return read_wording(__file__).table("ridge_steps", rows)
 
 
@@ -207,8 +207,7 @@ def _list_curves(case: Case) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for algorithm, sweep in ((RE, case.ridge), (TSVD, case.truncated)):
         for i, setting in enumerate(sweep.settings):
-            lost = bool(sweep.runs.is_diverged[i])
-            errors = [None] * 3 if lost else [float(e) for e in sweep.errors[i, :3]]
+            errors = map(show_number, sweep.errors[i, :3])
             spacing = None
             if algorithm == RE:
                 spacing = "equal intervals" if case.is_equal[i] else "equal ratios"
@@ -223,9 +222,9 @@ def _list_history(case: Case) -> Table:
     robot = case.study.robot
     labels = zip(robot.parameters.names, list_units(robot), strict=True)
     rows = [
-        (algorithm, i, *map(float, values))
+        (algorithm, int(i), *map(show_number, values))
         for algorithm in (LS, RE, TSVD)
-        for i, values in enumerate(collect_history(case, algorithm))
+        for i, values in zip(*collect_history(case, algorithm), strict=True)
     ]
     words, name = read_wording(__file__), f"history_{name_file(case)}"
     table = words.table("history", rows, name, case=case.name)

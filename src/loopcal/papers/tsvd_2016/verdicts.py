@@ -1,250 +1,344 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judge every claim of the paper, and our own checks, by the numbers of this run."""
+"""Judge the claims of the paper, and our own checks, on the drawn machines.
+
+The paper simulates one machine of each structure. Here each drawn pair of machines is one draw of
+that simulation, and a claim is judged in every draw; it holds in a draw where it holds in all
+situations it speaks of. Claims about medians are judged in groups of machines.
+
+Rules are in text.yaml.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from loopcal.papers.reproduction import Verdict
-from loopcal.papers.tsvd_2016.cases import CHOSEN, LS, PRIOR, RANKED, RE, TSVD
-from loopcal.papers.tsvd_2016.cases import CROSS as CASE_CROSS
+from loopcal.papers.tsvd_2016.draw_tables import DIVERGED
 from loopcal.papers.tsvd_2016.draws import (
+    BEFORE,
     CROSS,
+    FACTOR,
     HINDSIGHT,
+    NARROW,
+    PRIOR,
     PRIOR_FIVE,
     RAW_FIVE,
     RAW_LS,
     RAW_RE,
     RAW_TSVD,
-    WHITENED_FIVE,
+    WHITENED,
+    WIDE,
     Draws,
-    has_interior_minimum,
 )
-from loopcal.papers.tsvd_2016.draws import WHITENED as MANY_WHITENED
+from loopcal.papers.tsvd_2016.figures import NUMBERS
+from loopcal.papers.tsvd_2016.judgement import (
+    format_all,
+    format_pair,
+    format_ratio,
+    judge_groups,
+    judge_machines,
+)
 from loopcal.papers.tsvd_2016.machines import LIMITS
-from loopcal.papers.tsvd_2016.published import MM, read_published
-from loopcal.papers.tsvd_2016.steps import list_scales
+from loopcal.papers.tsvd_2016.published import Published
+from loopcal.papers.tsvd_2016.situations import (
+    GAIN,
+    LS,
+    RANKED,
+    RE,
+    SHORT,
+    TSVD,
+    Situation,
+    compute_rises,
+    find_bottom,
+)
+from loopcal.papers.tsvd_2016.steps import LINEARIZATIONS
 from loopcal.papers.tsvd_2016.tables import Results
 from loopcal.papers.wording import Wording, read_wording
-from loopcal.typing import FloatArray
 
 ERRORS = ("position", "angle")
-NEAR = 0.1
-"""k is close to the number of parameters: within this share of it."""
+UNITS = ("mm", "deg")
 
 
 def judge_claims(results: Results) -> tuple[Verdict, ...]:
     """Return a verdict for each claim."""
     words = read_wording(__file__)
-    return (
-        _judge_noise(words),
-        *(_judge_curve(words, d, i) for d in results.draws for i in range(len(ERRORS))),
-        _judge_gain(words, results),
-        _judge_best(words, results),
-        *_judge_five(words, results),
-        *_judge_many(words, results),
-        _judge_speed(words, results),
-        *_judge_lambda(words, results),
-        _judge_k(words, results),
-        *_judge_own_checks(words, results),
-    )
+    situations = [situation for draws in results.draws for situation in draws.situations]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (
+            *(_judge_curve(words, situation) for situation in situations),
+            _judge_availability(words, results.draws),
+            _judge_gain(words, results.draws),
+            _judge_best(words, situations),
+            _judge_failure(words, results.draws),
+            _judge_existence(words, results.draws),
+            _judge_parameters(words, results.draws),
+            _judge_deviation(words, results.draws),
+            _judge_speed(words, situations),
+            _judge_lambda(words, results),
+            _judge_rule(words, results.draws),
+            _judge_k(words, situations),
+            _judge_noise(words, results.printed),
+            _judge_rank_detection(words, results.draws),
+            _judge_units(words, results.draws),
+            *_judge_prior(words, results.draws),
+        )
 
 
-def _judge_noise(words: Wording) -> Verdict:
-    published = read_published()
+def _judge_curve(words: Wording, situation: Situation) -> Verdict:
+    """Judge the curves over lambda and k of one figure: position and angle, each machine."""
+    places = {
+        error: {
+            "least_ridge": situation.compute_rises(RE, i),
+            "least_tsvd": situation.compute_rises(TSVD, i),
+        }
+        for i, error in enumerate(ERRORS)
+    }
+    curves = [
+        {
+            "letter": "lambda" if algorithm == RE else "k",
+            "error": error,
+            "count": int((situation.compute_rises(algorithm, i) > GAIN).sum()),
+            "of": len(situation),
+            **_describe_curve(situation, algorithm, i),
+        }
+        for algorithm in (RE, TSVD)
+        for i, error in enumerate(ERRORS)
+    ]
+    short = [int((compute_rises(situation.short[:, :, i]) > GAIN).sum()) for i in (0, 1)]
+    return judge_machines(
+        words, "u_shape", places, name=situation.label, curves=curves, iterations=SHORT,
+        number=NUMBERS[situation.name, situation.freedoms], short=short,
+    )  # fmt: skip
+
+
+def _describe_curve(situation: Situation, algorithm: str, i: int) -> dict[str, str]:
+    curve = np.median(situation.get_curves(algorithm)[:, :, i], axis=0)
+    settings, usable = situation.get_settings(algorithm), np.flatnonzero(np.isfinite(curve))
+    if not usable.size:
+        return dict.fromkeys(("first", "least", "last"), DIVERGED)
+    best = int(usable[np.argmin(curve[usable])])
+    return {
+        name: f"{curve[j]:.2g} {UNITS[i]} at {settings[j]:.2g}"
+        for name, j in (("first", usable[0]), ("least", best), ("last", usable[-1]))
+    }
+
+
+def _judge_availability(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    places = {}
+    for one in draws:
+        chosen = one.six.chosen[LS]
+        places[one.six.label] = {
+            "most_diverged": np.isinf(chosen.errors[:, 0]).astype(float),
+            "most_iterations": chosen.iterations.astype(float),
+        }
+    lost = [
+        {
+            "name": label,
+            "diverged": int(numbers["most_diverged"].sum()),
+            "slow": int((numbers["most_iterations"] >= LINEARIZATIONS).sum()),
+        }
+        for label, numbers in places.items()
+    ]
+    return judge_machines(words, "ls_stable", places, lost=lost, limit=LINEARIZATIONS)
+
+
+def _judge_gain(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    """Judge RE and TSVD against LS with settings that were best on other machines."""
+    places, gains = {}, []
+    for one in draws:
+        ridge, tsvd = (one.six.compare_unseen(algorithm) for algorithm in (RE, TSVD))
+        places[one.six.label] = {"most_ridge": ridge.max(axis=1), "most_tsvd": tsvd.max(axis=1)}
+        middle = {"ridge": format_pair(np.median(ridge, axis=0)),
+                  "tsvd": format_pair(np.median(tsvd, axis=0))}  # fmt: skip
+        gains.append({"name": one.six.label, **middle})
+    return judge_machines(words, "ls_not_best", places, gains=gains)
+
+
+def _judge_best(words: Wording, situations: list[Situation]) -> Verdict:
+    """Judge TSVD against LS and RE, each of the three at the bottom of its curve."""
+    places, rows = {}, []
+    for situation in situations:
+        chosen = situation.chosen
+        tsvd = chosen[TSVD].errors[:, :2]
+        places[situation.label] = {
+            "most_ridge": (tsvd / chosen[RE].errors[:, :2]).max(axis=1),
+            "most_ls": (tsvd / chosen[LS].errors[:, :2]).max(axis=1),
+        }
+        after = chosen[TSVD].commanded / chosen[RE].commanded
+        medians = {m: np.median(chosen[a].errors, axis=0)
+                   for m, a in (("tsvd", TSVD), ("ridge", RE), ("ls", LS))}  # fmt: skip
+        commanded = int((after.max(axis=1) <= 1.0).sum())
+        rows.append({"name": situation.label, "commanded": commanded, **format_all(**medians)})
+    return judge_machines(words, "tsvd_best", places, rows=rows, trials=len(situations[0]))
+
+
+def _judge_failure(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    """Judge 5-DOF measurement: LS diverges, RE and TSVD improve the machine."""
+    places = {}
+    for one in draws:
+        chosen, before = one.five.chosen, one.errors[BEFORE][:, :2]
+        left = {a: (chosen[a].errors[:, :2] / before).max(axis=1) for a in (RE, TSVD)}
+        diverged = np.isinf(chosen[LS].errors[:, 0]).astype(float)
+        places[one.five.label] = {
+            "least_diverged": diverged, "most_ridge": left[RE], "most_tsvd": left[TSVD],
+        }  # fmt: skip
+    rows = [
+        {"name": label, "diverged": int(n["least_diverged"].sum()), "of": len(n["most_ridge"]),
+         "ridge": float(np.median(n["most_ridge"])), "tsvd": float(np.median(n["most_tsvd"]))}
+        for label, n in places.items()
+    ]  # fmt: skip
+    return judge_machines(words, "ls_fails", places, rows=rows)
+
+
+def _judge_existence(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    """Judge whether exact 5-DOF measurements leave an error of the poses."""
+    places, rows = {}, []
+    for one in draws:
+        left = one.five.exact[:, :2] / one.errors[BEFORE][:, :2]
+        places[one.five.label] = {"least_left": left.max(axis=1)}
+        largest = one.five.exact.max(axis=0)
+        rows.append({"name": one.five.label, "left": f"{largest[0]:.0e} mm / {largest[1]:.0e} deg",
+                     "parameters": float(np.median(one.five.exact[:, 3]))})  # fmt: skip
+    return judge_machines(words, "no_solution", places, rows=rows)
+
+
+def _judge_parameters(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    """Judge the parameter errors of the paper's RE and TSVD with 5- against 6-DOF measurement."""
+    places, rows = {}, []
+    for one in draws:
+        ratios = {
+            a: one.five.chosen[a].errors[:, 3] / one.six.chosen[a].errors[:, 3] for a in (RE, TSVD)
+        }
+        places[one.name] = {"least_ridge": ratios[RE], "least_tsvd": ratios[TSVD]}
+        medians = {
+            f"{key}_{f}": float(np.median(situation.chosen[a].errors[:, 3]))
+            for key, a in (("ridge", RE), ("tsvd", TSVD))
+            for f, situation in (("six", one.six), ("five", one.five))
+        }
+        prior = {"six": one.compute_median(PRIOR)[3], "five": one.compute_median(PRIOR_FIVE)[3]}
+        rows.append({"name": one.name, **medians, **prior})
+    return judge_machines(words, "six_better", places, rows=rows)
+
+
+def _judge_deviation(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    """Judge both halves: parameters farther from the truth than nominal, and better poses."""
+    places, rows = {}, []
+    for one in draws:
+        for situation in one.situations:
+            used = [situation.chosen[a] for a in (RANKED, RE, TSVD)]
+            worse = np.array([c.errors[:, 4] for c in used])
+            left = np.array([(c.errors[:, :2] / one.errors[BEFORE][:, :2]).max(axis=1)
+                             for c in used])  # fmt: skip
+            numbers = {"least_worse": worse.min(axis=0), "most_left": left.max(axis=0)}
+            places[situation.label] = numbers
+            shares = dict(zip(("ls", "ridge", "tsvd"), np.median(worse, axis=1), strict=True))
+            rows.append({"name": situation.label, **shares, "left": np.median(left)})
+    return judge_machines(words, "deviate", places, rows=rows)
+
+
+def _judge_speed(words: Wording, situations: list[Situation]) -> Verdict:
+    places, rows = {}, []
+    for situation in situations:
+        counts = {a: situation.chosen[a].iterations for a in (RANKED, RE, TSVD)}
+        places[situation.label] = {
+            "most_ls": counts[TSVD] / counts[RANKED], "most_ridge": counts[TSVD] / counts[RE]
+        }  # fmt: skip
+        middle = {key: f"{np.median(counts[a]):,.0f}"
+                  for key, a in (("ls", RANKED), ("ridge", RE), ("tsvd", TSVD))}  # fmt: skip
+        rows.append({"name": situation.label, **middle})
+    return judge_machines(words, "faster", places, rows=rows)
+
+
+def _judge_lambda(words: Wording, results: Results) -> Verdict:
+    """Judge the range of the best lambda, looked for beyond that range, and its differences."""
+    best = {s.label: s.chosen[RE].settings for d in results.draws for s in d.situations}
+    first, *others = (draws.six.chosen[RE].settings for draws in results.draws)
+    apart = np.max([np.maximum(first / other, other / first) for other in others], axis=0)
+    values = np.array(list(best.values()))
+    numbers = {"least_lambda": values.min(axis=0), "most_lambda": values.max(axis=0),
+               "least_factor": apart}  # fmt: skip
+    rows = [
+        {"name": name, "low": settings.min(), "middle": np.median(settings),
+         "high": settings.max()}
+        for name, settings in best.items()
+    ]  # fmt: skip
+    steps = [
+        {"end": f"after {count}" if isinstance(count, int) else count, "value": value}
+        for count, value, _ in results.steps
+    ]
+    searched = results.draws[0].six.lambdas
+    return judge_machines(
+        words, "lambda_range", {"all": numbers}, rows=rows, by_steps=steps, low=searched.min(),
+        high=searched.max(),
+    )  # fmt: skip
+
+
+def _judge_rule(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    ratios = [{"name": d.name, "ratio": format_pair(d.compute_ratio(CROSS, RAW_RE))}
+              for d in draws]  # fmt: skip
+    return judge_groups(words, "no_rule", draws, {"most": [(CROSS, RAW_RE)]}, ratios=ratios)
+
+
+def _judge_k(words: Wording, situations: list[Situation]) -> Verdict:
+    """Judge the best k, all parameters included, by its distance from their number."""
+    places, rows = {}, []
+    for situation in situations:
+        p = int(situation.ks[0])
+        best = np.array([situation.ks[find_bottom(curve)] for curve in situation.truncated])
+        distance = (p - best) / p
+        places[situation.label] = {"most_distance": distance, "least_distance": distance}
+        rows.append({"name": situation.label, "low": int(best.min()), "high": int(best.max()),
+                     "middle": float(np.median(best)), "of": p})  # fmt: skip
+    return judge_machines(words, "k_near_j", places, rows=rows)
+
+
+def _judge_noise(words: Wording, published: Published) -> Verdict:
+    noise = published.noise.values
     shares = published.noise_si / LIMITS
-    largest, rms = np.abs(published.noise.values).max(axis=0), float(np.sqrt(np.mean(shares**2)))
+    largest, rms = np.abs(noise).max(axis=0), float(np.sqrt(np.mean(shares**2)))
     # three standard deviations of the rms of that many uniform numbers
     spread = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))
     return words.judge(
-        "noise", agrees=np.abs(shares).max() <= 1.0 and abs(rms - 1.0 / np.sqrt(3.0)) < spread,
-        count=shares.size, length=largest[:3].max(), angle=largest[3:].max(),
+        "noise", largest=float(np.abs(shares).max()), off=abs(rms - 1.0 / np.sqrt(3.0)),
+        allowed=spread, count=shares.size, length=largest[:3].max(), angle=largest[3:].max(),
         degrees=np.rad2deg(largest[3:].max()), rms=rms,
     )  # fmt: skip
 
 
-def _judge_curve(words: Wording, draws: Draws, i: int) -> Verdict:
-    """Judge the median curves over lambda and k for one error: 0 position, 1 angle."""
-    settings = {RE: (0.0, *draws.lambdas), TSVD: draws.ks.tolist()}
-    shapes = []
-    for algorithm, letter in ((RE, "lambda"), (TSVD, "k")):
-        curve, values = draws.compute_curve(algorithm)[:, i], settings[algorithm]
-        best = int(np.argmin(curve))
-        shapes.append(
-            {
-                "letter": letter,
-                "course": "falls" if has_interior_minimum(curve) else "no minimum",
-                "first": f"{_format(curve[0])} {('mm', 'deg')[i]} at {letter} = {values[0]:g}",
-                "last": f"{_format(curve[-1])} at {values[-1]:g}",
-                "least": f"{_format(curve[best])} at {values[best]:.2g}",
-            }
-        )
-    agrees = all(shape["course"] == "falls" for shape in shapes)
-    return words.judge("u_shape", agrees=agrees, name=draws.name, error=ERRORS[i], shapes=shapes)
-
-
-def _judge_gain(words: Wording, results: Results) -> Verdict:
-    ratios = {
-        draws.name: [draws.compute_ratio(m, RAW_LS)[:2] for m in (RAW_RE, RAW_TSVD)]
-        for draws in results.draws
-    }
-    gains = [
-        {
-            "name": draws.name,
-            "ridge": _format_pair(ratios[draws.name][0]),
-            "tsvd": _format_pair(ratios[draws.name][1]),
-            "lost": draws.count_diverged(RAW_LS),
-        }
-        for draws in results.draws
-    ]
-    agrees = np.all(np.array(list(ratios.values())) < 1.0)
-    trials = len(results.draws[0])
-    return words.judge("slightly_better", agrees=agrees, trials=trials, gains=gains)
-
-
-def _judge_best(words: Wording, results: Results) -> Verdict:
-    rows, agrees = [], True
-    for case in results.cases:
-        tsvd, ridge, prior = (case.answers[m].errors for m in (TSVD, RE, PRIOR))
-        others = [ridge, prior]
-        if not case.answers[LS].is_diverged:
-            others.append(case.answers[LS].errors)
-        agrees &= all(bool((tsvd[:2] <= other[:2]).all()) for other in others)
-        rows.append({"name": case.name, **_format_all(tsvd=tsvd, ridge=ridge, prior=prior)})
-    return words.judge("tsvd_best", agrees=agrees, rows=rows)
-
-
-def _judge_five(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    """Judge measurement in five coordinates."""
-    fives = [case for case in results.cases if case.study.freedoms == 5]
-    nulls, pairs, as_good = [], [], True
-    for case in fives:
-        six, five = (
-            results.find_case(case.study.name, 6).answers[LS].errors,
-            case.answers[RANKED].errors,
-        )
-        as_good &= bool((five[:2] <= 1.1 * six[:2]).all())
-        pairs.append({"name": case.study.name, **_format_all(five=five, six=six)})
-        combinations = " and ".join(map(str, case.known.unidentifiable))
-        nulls.append({"case": case, "last": case.singular_values[-2:], "is": combinations})
-    many = []
-    for draws in results.draws:
-        five, six, prior = (
-            draws.compute_median(m) for m in (WHITENED_FIVE, MANY_WHITENED, PRIOR_FIVE)
-        )
-        many.append({"name": draws.name, **_format_all(five=five, six=six, prior=prior)})
-    fails = all(case.answers[LS].is_diverged for case in fives)
-    steps = " and ".join(f"{case.normal_equations:.0e}" for case in fives)
-    return (
-        words.judge("ls_fails", agrees=fails, steps=steps, nulls=nulls),
-        words.judge("five_unusable", agrees=not as_good, pairs=pairs, many=many),
-        words.judge("no_solution", agrees=not as_good),
-    )
-
-
-def _judge_many(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    """Judge the parameters: over many machines, and those of one machine."""
-    methods = {"six": PRIOR, "five": PRIOR_FIVE, "raw_six": RAW_LS, "raw_five": RAW_FIVE}
+def _judge_rank_detection(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     rows = [
-        {"name": d.name, **{key: d.compute_median(m)[3] for key, m in methods.items()}}
-        for d in results.draws
-    ]
-    machines = []
-    for name in ("RU-PUS-PRS", "3-PRS"):
-        case = results.find_case(name, 6)
-        lengths = list_scales(case.study.robot) == MM
-        answers = {"ls": case.answers[LS], "prior": case.answers[PRIOR]}
-        errors = {k: np.abs(a.values - case.study.trials.truth[0]) for k, a in answers.items()}
-        wrong = {f"{k}_wrong": e[lengths].max() / MM for k, e in errors.items()}
-        machines.append({"name": name, **answers, **wrong})
-    agrees = all(row["five"] > row["six"] for row in rows)
-    deviate = all(machine["ls_wrong"] > 0.1 for machine in machines)
-    return (
-        words.judge("six_better", agrees=agrees, rows=rows),
-        words.judge("deviate", agrees=deviate, rows=machines),
-    )
-
-
-def _judge_speed(words: Wording, results: Results) -> Verdict:
-    rows = []
-    for case in results.cases:
-        ls = case.answers[LS if case.study.freedoms == 6 else RANKED]
-        others = {"ridge": case.answers[RE], "prior": case.answers[PRIOR]}
-        rows.append({"name": case.name, "ls": ls, "tsvd": case.answers[TSVD], **others})
-    agrees = all(
-        row["tsvd"].is_converged
-        and row["tsvd"].iterations <= min(row["ls"].iterations, row["ridge"].iterations)
-        for row in rows
-    )
-    return words.judge("faster", agrees=agrees, rows=rows)
-
-
-def _judge_lambda(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    best = [
-        {"name": case.name, "value": case.ridge.settings[case.ridge.best]} for case in results.cases
-    ]
-    chosen = [
-        f"{case.name} {case.answers[CASE_CROSS].setting.removesuffix(CHOSEN)}"
-        for case in results.cases
-    ]
-    ratios = {draws.name: draws.compute_ratio(CROSS, RAW_RE)[:2] for draws in results.draws}
-    in_range = all(1e-5 * 0.5 <= row["value"] <= 1.0 for row in best)
-    steps = [{"count": count, "value": value} for count, value, _ in results.steps]
-    texts = [{"name": name, "ratio": _format_pair(ratio)} for name, ratio in ratios.items()]
-    is_worse = bool(np.min(list(ratios.values())) >= 1.0)
-    return (
-        words.judge("lambda_range", agrees=in_range, best=best, by_steps=steps),
-        words.judge("no_rule", agrees=is_worse, chosen=", ".join(chosen), ratios=texts),
-    )
-
-
-def _judge_k(words: Wording, results: Results) -> Verdict:
-    rows = [
-        {"name": c.name, "k": int(c.truncated.settings[c.truncated.best]),
-         "of": len(c.singular_values)}
-        for c in results.cases
+        {"name": d.name, **format_all(five=d.compute_median(RAW_FIVE),
+                                       six=d.compute_median(RAW_LS))}
+        for d in draws
     ]  # fmt: skip
-    agrees = all(row["of"] - NEAR * row["of"] <= row["k"] < row["of"] for row in rows)
-    return words.judge("k_near_j", agrees=agrees, rows=rows)
+    return judge_groups(words, "five_usable", draws, {"most": [(RAW_FIVE, RAW_LS)]}, rows=rows)
 
 
-def _judge_own_checks(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    """Judge what the paper does not consider: units, priors, rules."""
-    both = [results.find_draws(name) for name in ("3-PRS", "RU-PUS-PRS")]
-    raw = {"ls": RAW_LS, "ridge": RAW_RE, "tsvd": RAW_TSVD}
-    near = [[d.compute_ratio(PRIOR, m)[:2] for m in (CROSS, HINDSIGHT)] for d in both]
-    texts = [" and ".join(map(_format_pair, ratios)) for ratios in near]
-    parts = [draws.compute_ratio(MANY_WHITENED, RAW_LS)[1] for draws in both]
+def _judge_units(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
+    ratios = [{"name": d.name, "ratio": format_ratio(d.compute_ratio(WHITENED, RAW_LS)[1])}
+              for d in draws]  # fmt: skip
+    numbers = {"most_angle": [(WHITENED, RAW_LS)]}
+    return judge_groups(words, "mixed_units", draws, numbers, ratios=ratios)
+
+
+def _judge_prior(words: Wording, draws: tuple[Draws, ...]) -> tuple[Verdict, ...]:
+    """Judge MAP: against the raw methods, near the best choice, and with wrong tolerances."""
+    raw = (RAW_LS, RAW_RE, RAW_TSVD)
     rows = [
-        {
-            "name": draws.name,
-            **_format_all(**{k: draws.compute_median(m) for k, m in raw.items()}),
-            **_format_all(prior=draws.compute_median(PRIOR)),
-        }
-        for draws in both
-    ]
-    case = results.find_case("3-PRS", 6)
-    condition = float(case.singular_values[0] / case.singular_values[case.rank - 1])
-    better = all((d.compute_ratio(PRIOR, m)[:2] < 1.0).all() for d in both for m in raw.values())
-    is_near = all((near[0][i] < limit).all() for i, limit in enumerate((1.05, 1.15)))
+        {"name": d.name,
+         **format_all(prior=d.compute_median(PRIOR), narrow=d.compute_median(NARROW),
+                       wide=d.compute_median(WIDE), ls=d.compute_median(RAW_LS),
+                       ridge=d.compute_median(RAW_RE), tsvd=d.compute_median(RAW_TSVD)),
+         "gcv": format_pair(d.compute_ratio(PRIOR, CROSS)),
+         "hindsight": format_pair(d.compute_ratio(PRIOR, HINDSIGHT))}
+        for d in draws
+    ]  # fmt: skip
+    better = {"most": [(PRIOR, m) for m in raw]}
+    wrong = {"most": [(p, m) for p in (NARROW, WIDE) for m in raw]}
+    near = {"gcv": [(PRIOR, CROSS)], "hindsight": [(PRIOR, HINDSIGHT)]}
+    tripod = tuple(d for d in draws if d.name == "3-PRS")
     return (
-        words.judge(
-            "mixed_units", tripod=parts[0], tracker=parts[1], raw=condition,
-            whitened=case.known.condition,
-        ),
-        words.judge("map_better", agrees=better, rows=rows, trials=len(both[0])),
-        words.judge("map_near_best", agrees=is_near, tripod=texts[0], tracker=texts[1]),
-    )  # fmt: skip
-
-
-def _format_all(**errors: FloatArray) -> dict[str, str]:
-    """Return errors in position and angle as text."""
-    return {k: f"{_format(e[0])} mm / {_format(e[1])} deg" for k, e in errors.items()}
-
-
-def _format_pair(values: FloatArray) -> str:
-    return f"{values[0]:.2f} and {values[1]:.2f}"
-
-
-def _format(value: float) -> str:
-    return f"{value:.2g}" if np.isfinite(value) else "none (diverged)"
+        judge_groups(words, "map_better", draws, better, rows=rows),
+        judge_groups(words, "map_tolerances", draws, wrong, rows=rows, factor=FACTOR),
+        judge_groups(words, "map_near_best", tripod, near, rows=rows),
+    )
