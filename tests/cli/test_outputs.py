@@ -171,7 +171,7 @@ def test_import_with_a_failed_calibration_changes_no_file(run) -> None:
     for words in ("-o printer.yaml --data heights.csv", "-o old.csv --data heights.csv --force"):
         code, out, err = run(f"import printer.cfg {words} --corrected corrected.cfg")
         assert (code, out) == (1, "")
-        assert "2 equations from 2 poses cannot determine" in err
+        assert "2 equations" in err
         assert read_all_files() == before
 
 

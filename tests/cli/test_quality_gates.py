@@ -85,7 +85,7 @@ def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
     out, err = capsys.readouterr()
     assert err.startswith("loopcal: quality gate not met: ")
     assert err.count("\n") == 1
-    assert out.endswith("Written to run: result.json, arrays.npz, robot.yaml\n")
+    assert out.endswith("Written to run: result.json, arrays.npz, robot-not-calibrated.yaml\n")
     result = json.loads((folder_with_wrong_cell / "run" / "result.json").read_text())
     assert result["passed"] is False
     (failure,) = [f for f in result["findings"] if f["severity"] == "failure"]

@@ -66,7 +66,7 @@ TAKEN_OPTIONS = ("limit_position", "limit_angle", "choose_model", "free_limb", "
 @limit_options
 @seed_option("the choice of held-out poses")
 @data_options
-@force_option("the run")
+@force_option("the run", ", and call the robot file of a failed calibration robot.yaml")
 @verbose_option
 @json_option
 def calibrate(
@@ -91,7 +91,8 @@ def calibrate(
       calibrated                    use the result
       calibrated with reservations  usable; a warning affects its accuracy
       undecided                     no held-out poses, or too few
-      not calibrated                exit code 2; the run folder is still written
+      not calibrated                exit code 2; the run folder is still written, but its robot
+                                    file is called robot-not-calibrated.yaml
 
     "Not calibrated" means that the fit did not converge, the residuals contradict the stated noise,
     errors on held-out poses grew, or a limit is exceeded.
@@ -107,6 +108,7 @@ def calibrate(
     from loopcal import workflow
     from loopcal.io import load_robot
     from loopcal.io.runs.run_folder import build_document, load_prior, refuse_run_folder, save_run
+    from loopcal.io.runs.run_verdict import name_robot_file
     from loopcal.report.calibration_view import view_calibration
 
     inputs = _list_inputs(robot, data, prior)
@@ -129,7 +131,8 @@ def calibrate(
     if as_json:
         terminal.print_json(build_document(report, inputs, sys.argv))
     else:
-        written = f"Written to {output}: result.json, arrays.npz, robot.yaml"
+        names = f"result.json, arrays.npz, {name_robot_file(report, force)}"
+        written = f"Written to {output}: {names}"
         terminal.print_page([*view_calibration(report, verbose, hint_for), "", written])
     terminal.print_failures(report.failures, shown=not as_json)
     return report.exit_code
@@ -237,7 +240,7 @@ def validate(
 @click.option(
     "--steps", type=click.IntRange(min=1), default=3, help="Iterations of the shifted commands."
 )
-@force_option("the output file")
+@force_option("the output file", ", and compute also from a calibration that failed")
 @json_option
 def compensate(
     run: Path,
@@ -255,7 +258,8 @@ def compensate(
     RUN is a run folder, or a robot file (then no uncertainty is known). Each target states the
     error before and after compensation, what no actuator can correct, and its uncertainty.
 
-    The exit code is 2 where a target cannot be reached.
+    The exit code is 2 where a target cannot be reached, or where RUN failed; then nothing is
+    written without --force.
 
     \b
     Examples:
@@ -267,13 +271,16 @@ def compensate(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.runs.compensation_file import format_compensation, load_targets
-    from loopcal.io.runs.run_folder import load_posterior_or_robot
+    from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
     from loopcal.mechanism import Mechanism
     from loopcal.report.calibration_view import with_hint
     from loopcal.report.compensation_view import view_compensation
 
     inputs = (run, targets, None if controller is None else Path(controller))
     refuse_outputs((output,), inputs, force)
+    failure = find_failure(run)
+    if failure is not None and not force:
+        return terminal.print_failures([with_hint(failure, hint_for)])
     known = load_posterior_or_robot(run)
     robot = known if isinstance(known, Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
@@ -289,8 +296,9 @@ def compensate(
         click.echo(text, nl=False)
     else:
         terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
-    return terminal.print_failures(
+    missed = [
         f"target {label!r}: {with_hint(result.findings[i], hint_for)}"
         for i, label in enumerate(labels)
         if not result.usable[i]
-    )
+    ]
+    return terminal.print_failures([*([] if failure is None else [failure]), *missed])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,18 +22,19 @@ from loopcal.cli.options import (
     format_option,
     json_option,
     name_option,
-    read_checked_measurements,
+    print_convention_note,
+    read_measurements,
     refuse_given,
 )
 from loopcal.errors import DataError
 from loopcal.units import Dimension, list_symbols
 
 if TYPE_CHECKING:
-    from loopcal.estimate import Identification
     from loopcal.findings import Finding
     from loopcal.io.formats.program_format import Format, Imported, ImportOptions
     from loopcal.mechanism import Mechanism
     from loopcal.report.text_page import Block
+    from loopcal.workflow import CalibrationReport
 
 READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
 WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
@@ -84,7 +86,7 @@ SHOWN = 20
     metavar="LINK",
     help="Link that is the platform (urdf); by default the one on a fixed joint.",
 )
-@force_option("an output file")
+@force_option("an output file", ", and write --corrected even where the calibration failed")
 @json_option
 def import_(
     file: Path,
@@ -103,7 +105,8 @@ def import_(
     With --profile, FILE is text that an instrument exported; it becomes a measurement file (see
     docs/exports.md).
 
-    With --corrected, the exit code is 2 where the calibration did not converge.
+    With --corrected, the exit code is 2 where the calibration failed, as in loopcal calibrate. Then
+    the corrected file is not written without --force.
 
     \b
     Examples:
@@ -118,6 +121,7 @@ def import_(
     from loopcal.diagnose import compare_stored_geometry
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.formats.import_export import choose_format, save_imported
+    from loopcal.report.calibration_view import with_hint
 
     if profile is not None:
         _convert_export(file, profile, output, force, as_json)
@@ -139,25 +143,29 @@ def import_(
         if source.stores_fit and imported.measurements is not None:
             stored = compare_stored_geometry(robot, imported.measurements)
             noted += [] if stored is None else [stored.finding]
-        fit = changes = None
+        correction = None
         if corrected is not None and data is not None:
-            fit, changes = _correct_file(source, robot, file, data, corrected)
+            correction = _correct_file(source, robot, file, data, corrected, force)
     document: dict[str, Any] = {
         "robot": output,
         "data": data,
-        "corrected": corrected,
+        "corrected": corrected if correction is not None and correction.is_written else None,
         "notes": [str(finding) for finding in noted],
         "findings": imported.findings,
     }
     if as_json:
-        terminal.print_json({**document, "fit": fit, "changes": changes})
+        calibration = {
+            "fit": correction and correction.report.identification,
+            "verdict": correction and correction.report.verdict,
+            "reasons": correction and correction.report.failures,
+            "changes": correction and correction.changes,
+        }
+        terminal.print_json({**document, **calibration})
     else:
-        terminal.print_page(_view_import(robot, document, noted, fit, changes or ()))
-    if fit is None or fit.converged:
+        terminal.print_page(_view_import(robot, document, noted, correction))
+    if correction is None or correction.failure is None:
         return 0
-    return terminal.print_failures(
-        [f"the calibration did not converge ({fit.status.name.lower()})"]
-    )
+    return terminal.print_failures([with_hint(correction.failure, hint_for)])
 
 
 def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
@@ -226,27 +234,52 @@ def _make_import_options(source: Format, name: str, settings: dict[str, Any]) ->
     return ImportOptions(name, **stated)
 
 
+@dataclass(frozen=True)
+class _Correction:
+    """A calibration with imported measurements, and what it changed in the file.
+
+    `failure` : why it failed; then the file is only written where that was demanded.
+    """
+
+    report: CalibrationReport
+    failure: Finding | None
+    changes: tuple[str, ...]
+    is_written: bool
+
+
 def _correct_file(
-    source: Format, robot: Mechanism, file: Path, data: Path, output: Path
-) -> tuple[Identification, tuple[str, ...]]:
+    source: Format, robot: Mechanism, file: Path, data: Path, output: Path, force: bool
+) -> _Correction:
     """Calibrate with the imported measurements, and write the corrected file."""
-    from loopcal.estimate import identify
+    from loopcal.findings import report_finding
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import export_robot
     from loopcal.io.formats.program_format import ExportSource
+    from loopcal.io.runs.run_verdict import list_reasons
+    from loopcal.workflow import calibrate
 
-    fit = identify(robot, read_checked_measurements([data], robot))
-    exported = export_robot(ExportSource(fit.robot), source, file)
+    report = calibrate(robot, read_measurements([data], robot))
+    print_convention_note(report.conventions, [data])
+    failure, is_written = None, force or not report.failures
+    if report.failures:
+        failure = report_finding(
+            "gates.correction-not-written",
+            file=str(output),
+            reasons=list_reasons(report.failures),
+            is_written=is_written,
+        )
+    if not is_written:
+        return _Correction(report, failure, (), is_written)
+    exported = export_robot(ExportSource(report.robot), source, file)
     write_text(output, exported.text)
-    return fit, tuple(str(finding) for finding in exported.findings)
+    return _Correction(report, failure, tuple(map(str, exported.findings)), is_written)
 
 
 def _view_import(
     robot: Mechanism,
     document: dict[str, Any],
     noted: Sequence[Finding],
-    fit: Identification | None,
-    changes: tuple[str, ...],
+    correction: _Correction | None,
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
     from loopcal.report.calibration_view import view_fit, with_hint
@@ -257,10 +290,12 @@ def _view_import(
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")
     page += [f"note: {with_hint(finding, hint_for)}" for finding in noted]
-    if fit is None:
-        data = document["data"] or "DATA"
-        return [*page, f"Next: loopcal calibrate {document['robot']} {data} -o run"]
-    page += [*view_fit(fit), *changes]
+    following = f"Next: loopcal calibrate {document['robot']} {document['data'] or 'DATA'} -o run"
+    if correction is None:
+        return [*page, following]
+    page += [*view_fit(correction.report.identification), *correction.changes]
+    if not correction.is_written:
+        return [*page, following]
     return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
 
 
@@ -273,7 +308,7 @@ def _view_import(
     metavar="FILE",
 )
 @file_option("-o", "--output", help="File to write.", required=True)
-@force_option("the output file")
+@force_option("the output file", ", and write also the numbers of a calibration that failed")
 @json_option
 def export(
     source: str,
@@ -282,10 +317,11 @@ def export(
     output: Path,
     force: bool,
     as_json: bool,
-) -> None:
+) -> int:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
 
-    A note names what the format cannot express.
+    A note names what the format cannot express. The exit code is 2 where the calibration of RUN
+    failed; then nothing is written without --force.
 
     \b
     Examples:
@@ -296,16 +332,25 @@ def export(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import choose_format, export_robot, load_source
+    from loopcal.io.runs.run_folder import find_failure
     from loopcal.report.calibration_view import with_hint
 
     target = choose_format(output, format_name, is_written=True)
     refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
+    failure = find_failure(source)
+    failures = [] if failure is None else [failure]
+    if failures and not force:
+        if as_json:
+            document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
+            terminal.print_json(document)
+        return terminal.print_failures(with_hint(failure, hint_for) for failure in failures)
     exported = export_robot(load_source(source), target, into)
     write_text(output, exported.text)
     if as_json:
         notes = [str(finding) for finding in exported.findings]
-        document = {"output": output, "format": target.name, "notes": notes}
+        document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
         terminal.print_json(document)
-        return
-    noted = [with_hint(finding, hint_for) for finding in exported.findings]
-    terminal.print_page([*noted, f"Written to {output}"])
+    else:
+        noted = [with_hint(finding, hint_for) for finding in exported.findings]
+        terminal.print_page([*noted, f"Written to {output}"])
+    return terminal.print_failures(failures)

@@ -47,6 +47,9 @@ HINTS = {
     "fit.too-few-equations": "use --method map",
     "noise.assumed": "use --sigma-height or another --sigma option of loopcal import, or write the "
     "noise in the file",
+    "gates.correction-not-written": "use --force to write it nevertheless",
+    "gates.run-not-calibrated": "use --force to write them nevertheless",
+    "gates.run-without-verdict": "use --force to write its numbers nevertheless",
     "noise.residuals-too-large": "exclude a pose with --drop POSE, or use --loss huber",
     "noise.residuals-too-small": "use --noise estimated",
     "noise.too-few-degrees": "use --noise given",

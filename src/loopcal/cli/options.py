@@ -107,9 +107,9 @@ def flag_option(*names: str, help: str) -> Decorator:  # noqa: A002
     return click.option(*names, is_flag=True, help=help)
 
 
-def force_option(what: str) -> Decorator:
-    """Return the option that lets a command replace what exists."""
-    return flag_option("--force", help=f"Replace {what} if it exists.")
+def force_option(what: str, more: str = "") -> Decorator:
+    """Return the option that lets a command replace what exists, and `more`."""
+    return flag_option("--force", help=f"Replace {what} if it exists{more}.")
 
 
 def seed_option(what: str) -> Decorator:

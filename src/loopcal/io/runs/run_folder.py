@@ -7,7 +7,8 @@ result.json    `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validati
                `nulls`
 arrays.npz     `Identification.arrays()`, `initial` (values of all parameters before the
                calibration) and the fitted rows, by name, SI (no pickles)
-robot.yaml     the corrected robot file: the nominal file plus its `identified:` table
+robot.yaml     the corrected robot file: the nominal file plus its `identified:` table; of a
+               calibration that failed it is called robot-not-calibrated.yaml (`run_verdict`)
 """
 
 from __future__ import annotations
@@ -21,12 +22,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import DataError, FileError
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
 from loopcal.io.core.text_file import as_path, read_text, sha256
 from loopcal.io.data.measurement_file import Paths, list_measurement_files, load_measurements
 from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
+from loopcal.io.runs.run_verdict import (
+    FAILED_ROBOT,
+    ROBOT,
+    WARNING,
+    find_run_failure,
+    name_robot_file,
+)
 from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
@@ -35,7 +43,7 @@ if TYPE_CHECKING:
     from loopcal.workflow import CalibrationReport
 
 FORMAT = 1
-RESULT, ARRAYS, ROBOT = "result.json", "arrays.npz", "robot.yaml"
+RESULT, ARRAYS = "result.json", "arrays.npz"
 
 MADE_BY: Mapping[str, str] = {
     "command": "the command line, as a list of words",
@@ -93,6 +101,7 @@ def write_run_folder(
     arrays: Mapping[str, np.ndarray],
     robot_text: str,
     force: bool = False,
+    robot_name: str = ROBOT,
 ) -> Path:
     """Write a run folder whole or not at all, and return it.
 
@@ -100,7 +109,7 @@ def write_run_folder(
     ----------
     path : the folder to make. result : content of result.json; `format` is added.
     arrays : name -> array, SI. robot_text : of the corrected robot file.
-    force : replace an older run.
+    force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
 
     Raises
     ------
@@ -111,7 +120,7 @@ def write_run_folder(
     text = to_json({"format": FORMAT, **result})
     with replace_folder(path) as folder:
         (folder / RESULT).write_text(text, encoding="utf-8")
-        (folder / ROBOT).write_text(robot_text, encoding="utf-8")
+        (folder / robot_name).write_text(robot_text, encoding="utf-8")
         with (folder / ARRAYS).open("wb") as stream:
             np.savez(stream, allow_pickle=False, **arrays)
     return path
@@ -137,7 +146,8 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     if not isinstance(result, dict) or result.get("format", 0) > FORMAT:
         sentence = f"this run has a newer format than {FORMAT}"
         raise FileError(f"{sentence}; use a newer loopcal, or repeat the run", path)
-    if missing := [name for name in (ARRAYS, ROBOT) if not (path / name).is_file()]:
+    names = (ARRAYS, _find_robot_file(path).name)
+    if missing := [name for name in names if not (path / name).is_file()]:
         sentence = f"this run folder is damaged: {' and '.join(missing)} missing"
         raise FileError(f"{sentence}; restore it, or repeat the calibration", path)
     try:
@@ -147,6 +157,12 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         sentence = f"this run folder is damaged: {ARRAYS} cannot be read ({error})"
         raise FileError(f"{sentence}; repeat the calibration", path) from error
     return result, arrays
+
+
+def _find_robot_file(path: Path) -> Path:
+    """Return the robot file of a run folder, which has another name where the run failed."""
+    failed = path / FAILED_ROBOT
+    return failed if failed.is_file() else path / ROBOT
 
 
 @dataclass(frozen=True)
@@ -175,6 +191,11 @@ class Run:
             f", {self.result['verdict'].replace('_', ' ')}" if "verdict" in self.result else ""
         )
         return f"<Run {str(self.path)!r}: {self.robot.name}{verdict}>"
+
+    @property
+    def failure(self) -> Finding | None:
+        """Why the numbers of this run are not for a machine; None where they are."""
+        return find_run_failure(self.path, self.result)
 
     @property
     def held_out(self) -> tuple[str, ...]:
@@ -241,7 +262,7 @@ def save_run(
     path : the folder to make. report : of `loopcal.calibrate`, with a robot from `load_robot`.
     inputs : role -> file, such as `{"robot": .., "data": ..}`; their names and digests are kept.
     command : the command line that made the report.
-    force : replace an older run.
+    force : replace an older run, and call the robot file of a calibration that failed robot.yaml.
 
     Raises
     ------
@@ -250,7 +271,9 @@ def save_run(
     """
     document = build_document(report, inputs, command)
     text = format_robot(report.robot, report.identification.plus_minus)
-    return write_run_folder(path, document, report.arrays(), text, force)
+    name = name_robot_file(report, force)
+    text = WARNING + text if name == FAILED_ROBOT else text
+    return write_run_folder(path, document, report.arrays(), text, force, name)
 
 
 def build_document(
@@ -271,7 +294,7 @@ def load_run(path: str | Path) -> Run:
     """
     path = as_path(path, "run folder")
     result, arrays = read_run_folder(path)
-    robot = load_robot(path / ROBOT)
+    robot = load_robot(_find_robot_file(path))
     initial = robot.with_values(arrays.get("initial", robot.parameters.nominal))
     names = [row["name"] for row in result.get("fit", {}).get("local") or ()]
     values, initial_values = (
@@ -295,6 +318,15 @@ def load_run_or_robot(path: str | Path) -> Run:
         return load_run(path)
     robot = load_robot(path)
     return Run(path, {}, robot, robot.nominal)
+
+
+def find_failure(path: str | Path) -> Finding | None:
+    """Return why the numbers of a run, or of a robot file in its folder, are not for a machine."""
+    path = as_path(path, "run folder or robot file")
+    folder = path.parent if path.name in (ROBOT, FAILED_ROBOT) else path
+    if not (folder / RESULT).is_file():
+        return None
+    return find_run_failure(folder, read_run_folder(folder)[0])
 
 
 def load_posterior(path: str | Path) -> Posterior:

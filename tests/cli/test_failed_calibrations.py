@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers of a calibration that failed are written for no machine, unless that is demanded."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.cli.exchange_commands import WRITTEN_FORMATS
+from loopcal.io import load_robot, load_run
+from loopcal.io.runs.run_verdict import FAILED_ROBOT, ROBOT, find_run_failure
+from loopcal.mechanism import inverse
+
+STEP = 0.0125
+"""Length of a motor step [mm]."""
+
+ARM, RADIUS, STOP = 269.0, 130.25, 250.0
+TRUE_STOPS = (250.4, 249.7, 250.1)
+"""[mm]."""
+
+
+def run(command: str) -> int:
+    """Run a command line; return its exit code."""
+    return main(command.split())
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Path:
+    """Write the run of a calibration whose limit is below its noise, and one that passes."""
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "targets.csv").write_text("x [mm],y [mm],z [mm]\n10,20,30\n")
+    words = f"simulate linear-delta --kind position --draw-errors -o {folder}/data.csv --seed 3"
+    assert run(words) == 0
+    words = f"calibrate linear-delta {folder}/data.csv --hold-out 0.25 --limit-position"
+    assert run(f"{words} 0.1um -o {folder}/failed") == 2
+    assert run(f"{words} 1mm -o {folder}/good") == 0
+    return folder
+
+
+@pytest.fixture
+def folder(runs, tmp_path, monkeypatch, capsys) -> Path:
+    """Return a copy of the runs to work in."""
+    shutil.copytree(runs, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    return tmp_path
+
+
+def test_robot_of_a_failed_calibration_has_another_name(folder, capsys) -> None:
+    assert sorted(p.name for p in Path("failed").iterdir()) == sorted(
+        ["arrays.npz", "result.json", FAILED_ROBOT]
+    )
+    assert Path("failed", FAILED_ROBOT).read_text().startswith("# NOT CALIBRATED")
+    assert Path("good", ROBOT).is_file()
+    failed, good = load_run("failed"), load_run("good")
+    np.testing.assert_array_equal(failed.robot.values, good.robot.values)
+    assert good.failure is None
+    assert failed.failure is not None
+    assert failed.failure.code == "gates.run-not-calibrated"
+    assert run("validate failed data.csv --allow-fitted-data") == 0  # to look at it is allowed
+    capsys.readouterr()
+    words = "calibrate linear-delta data.csv --hold-out 0.25 --limit-position 0.1um -o failed"
+    assert run(f"{words} --force") == 2
+    assert "arrays.npz, robot.yaml" in capsys.readouterr().out
+    assert Path("failed", ROBOT).is_file()
+    assert not Path("failed", FAILED_ROBOT).exists()
+    assert run("export failed -o c.json") == 2  # the verdict stays
+
+
+@pytest.mark.parametrize("name", WRITTEN_FORMATS)
+def test_no_format_is_written_from_a_failed_calibration(folder, capsys, name) -> None:
+    for source in ("failed", f"failed/{FAILED_ROBOT}", "./failed/"):
+        assert run(f"export {source} --format {name} -o out.txt") == 2
+        err = capsys.readouterr().err
+        assert "quality gate not met: failed is not calibrated: The position error" in err
+        assert "use --force to write them" in err
+        assert not Path("out.txt").exists()
+    if name in ("linuxcnc", "urdf"):
+        return  # of other machines
+    assert run(f"export failed --format {name} -o out.txt --force") == 2
+    assert "failed is not calibrated" in capsys.readouterr().err
+    assert run(f"export good --format {name} -o good.txt") == 0
+    assert Path("out.txt").read_text() == Path("good.txt").read_text()
+
+
+def test_refused_export_is_one_json_document(folder, capsys) -> None:
+    assert run("export failed -o out.json --json") == 2
+    document = json.loads(capsys.readouterr().out)
+    assert document["output"] is None
+    assert [r["code"] for r in document["reasons"]] == ["gates.run-not-calibrated"]
+
+
+def test_failed_calibration_computes_no_commands(folder, capsys) -> None:
+    for words in ("", "-o new.csv", "--mode commands -o new.csv"):
+        assert run(f"compensate failed targets.csv {words}") == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert "failed is not calibrated" in err
+        assert not Path("new.csv").exists()
+    assert run("compensate failed targets.csv -o new.csv --force") == 2
+    assert run("compensate good targets.csv -o good.csv") == 0
+    assert Path("new.csv").read_text() == Path("good.csv").read_text()
+
+
+CONVERGED = {"status": "converged"}
+
+
+@pytest.mark.parametrize(
+    ("result", "code"),
+    [
+        ({}, None),
+        ({"verdict": "calibrated", "passed": True, "fit": CONVERGED}, None),
+        ({"verdict": "undecided", "passed": True, "fit": CONVERGED}, None),
+        ({"verdict": "not_calibrated", "fit": CONVERGED}, "gates.run-not-calibrated"),
+        (
+            {"verdict": "calibrated", "passed": True, "fit": {"status": "stopped"}},
+            "gates.run-not-calibrated",
+        ),
+        ({"passed": True, "reasons": [], "fit": CONVERGED}, None),
+        ({"passed": False, "reasons": ["It grew."], "fit": CONVERGED}, "gates.run-not-calibrated"),
+        ({"fit": CONVERGED}, "gates.run-without-verdict"),
+        ({"fit": {"status": "out_of_steps"}}, "gates.run-not-calibrated"),
+        ({"passed": True}, "gates.run-without-verdict"),
+    ],
+)
+def test_runs_of_all_versions_are_judged(result, code) -> None:
+    failure = find_run_failure(Path("run"), result)
+    assert (None if failure is None else failure.code) == code
+
+
+def write_printer(wrong: float = 0.0) -> None:
+    """Write a printer.cfg whose end stops are off, with 13 probed heights, one of them wrong."""
+    lines = [
+        "[printer]", "kinematics: delta", f"delta_radius: {RADIUS}", "[stepper_a]",
+        f"step_distance: {STEP}", f"position_endstop: {STOP}", f"arm_length: {ARM}",
+        "[stepper_b]", f"step_distance: {STEP}", "[stepper_c]", f"step_distance: {STEP}",
+    ]  # fmt: skip
+    Path("printer.cfg").write_text("\n".join(lines) + "\n")
+    assert run("import printer.cfg -o nominal.yaml --force") == 0
+    nominal = load_robot("nominal.yaml")
+    values = nominal.values.copy()
+    for k, stop in enumerate(TRUE_STOPS, 1):
+        values[nominal.parameters.index(f"tower{k}.stop")] = stop * 1e-3
+    rng = np.random.default_rng(5)
+    turns = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+    points = [(0, 0), *((r * np.cos(a), r * np.sin(a)) for r in (0.04, 0.08) for a in turns)]
+    heights = rng.normal(0, 1e-5, len(points))
+    at = np.column_stack([points, heights])
+    steps = np.round(inverse(nominal.with_values(values), at).q * 1e3 / STEP, 3)
+    probed = heights * 1e3 + rng.normal(0, 0.01, len(points))  # [mm]
+    probed[4] += wrong
+    lines += ["#*# <---------------------- SAVE_CONFIG ---------------------->"]
+    lines += ["#*# [delta_calibrate]"]
+    for i, (height, stable) in enumerate(zip(probed, steps, strict=True)):
+        lines += [f"#*# height{i} = {height:.6f}"]
+        lines += [f"#*# height{i}_pos = {','.join(f'{s:.3f}' for s in stable)}"]
+    Path("printer.cfg").write_text("\n".join(lines) + "\n")
+
+
+IMPORT = "import printer.cfg -o p.yaml --data heights.csv --corrected corrected.cfg --sigma-height 0.01mm"
+
+
+def test_import_corrects_a_file_where_the_calibration_passes(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_printer()
+    assert run(IMPORT) == 0
+    assert run("import corrected.cfg -o again.yaml") == 0
+    again = load_robot("again.yaml")
+    for k, stop in enumerate(TRUE_STOPS, 1):
+        # [m]: ten times the noise of the probe
+        assert abs(again.values[again.parameters.index(f"tower{k}.stop")] - stop * 1e-3) < 1e-4
+
+
+def test_import_does_not_correct_a_file_where_the_calibration_failed(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_printer(wrong=3.0)
+    capsys.readouterr()
+    assert run(IMPORT) == 2
+    out, err = capsys.readouterr()
+    assert "corrected.cfg was not written" in err
+    assert "residuals exceed the stated noise" in err
+    assert "use --force" in err
+    assert "Written" not in out
+    assert not Path("corrected.cfg").exists()
+    assert Path("p.yaml").is_file()
+    assert Path("heights.csv").is_file()
+    assert run(f"{IMPORT} --force --json") == 2
+    document = json.loads(capsys.readouterr().out)
+    assert document["corrected"] == "corrected.cfg"
+    assert document["verdict"] == "not_calibrated"
+    assert [r["code"] for r in document["reasons"]] == ["noise.residuals-too-large"]
+    assert Path("corrected.cfg").is_file()
