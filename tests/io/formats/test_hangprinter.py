@@ -140,14 +140,15 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
         ({"motor_pos_samp": None}, "'motor_pos_samp' is not a list of rows of numbers"),
         (
             {"motor_pos_samp": [[1, 2, 3, 4], [1, 2, 3]]},
-            "'motor_pos_samp' is not a list of rows of numbers",
+            "row 2 of 'motor_pos_samp' has 3 numbers, but 4 are needed",
         ),
+        ({"motor_pos_samp": [[1, 2, 3, "x"]]}, "'motor_pos_samp' is not a list of rows of numbers"),
         ({"motor_pos_samp": [[1, 2]]}, "has 2 motors in a row"),
         (
             {"motor_pos_samp": [[1, 2, 3, 4]]},
             "'xyz_of_samp' has 9 poses, but 'motor_pos_samp' only 1",
         ),
-        ({"xyz_of_samp": [[1, 2]]}, "'xyz_of_samp' is not a list of rows of numbers, 3 in each"),
+        ({"xyz_of_samp": [[1, 2]]}, "row 1 of 'xyz_of_samp' has 2 numbers, but 3 are needed"),
         ({"xyz_of_samp": [[1, 2, float("inf")]]}, "'xyz_of_samp' is not a list of rows of numbers"),
         (
             {"mechanical_advantage": [2, 2, 2]},

@@ -113,7 +113,10 @@ def test_export_without_a_file_gives_a_block_to_paste(tmp_path) -> None:
             ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2\n"),
             ":12: 'height0_pos' .* has 2 numbers",
         ),
-        (("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\n"), "'height0_pos' of .* is missing"),
+        (
+            ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\n"),
+            ":11: 'height0' .* without 'height0_pos'",
+        ),
         (
             ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2,3\n"),
             r"'rotation_distance' of \[stepper_b\] is missing",
@@ -141,3 +144,61 @@ def test_step_distance_includes_the_gear_ratio(tmp_path) -> None:
     )
     found = klipper.get_step_distance(read_config(tmp_path / "printer.cfg"), "stepper_a")
     assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)
+
+
+RECORDS = {
+    "height": ("height", {"": "0.1", "_pos": "20000,20000,{i}"}),
+    "manual_height": ("manual_height", {"": "0.1", "_pos": "20000,20000,{i}"}),
+    "distance": ("distance", {"": "50", "_pos1": "2000,2000,{i}", "_pos2": "1000,2000,{i}"}),
+}
+
+
+def list_records(kind: str, count: int = 6) -> list[str]:
+    """Return the lines of some records of a kind."""
+    name, parts = RECORDS[kind]
+    texts = (
+        (f"{name}{i}{part}", text.format(i=i)) for i in range(count) for part, text in parts.items()
+    )
+    return [f"{option}: {text}" for option, text in texts]
+
+
+@pytest.mark.parametrize(
+    ("kind", "part"), [(kind, part) for kind, (_, parts) in RECORDS.items() for part in parts]
+)
+@pytest.mark.parametrize("number", [0, 3, 5])
+def test_record_without_a_part_is_refused_with_its_line(tmp_path, kind, part, number) -> None:
+    """Klipper ignores the rest silently where it is the value that is missing."""
+    lines = list_records(kind)
+    kept = [line for line in lines if not line.startswith(f"{kind}{number}{part}:")]
+    assert len(kept) == len(lines) - 1
+    text = SHORT.replace("[stepper_b]", "[delta_calibrate]\n" + "\n".join(kept) + "\n[stepper_b]")
+    with pytest.raises(FileError) as refused:
+        read(tmp_path, text)
+    assert refused.value.code == "files.probe-part-missing"
+    assert f"without '{kind}{number}{part}'" in str(refused.value)
+    line = text.splitlines()[refused.value.line - 1]
+    assert line.startswith(f"{kind}{number}")
+
+
+@pytest.mark.parametrize("kind", RECORDS)
+@pytest.mark.parametrize("number", [0, 3])
+def test_gap_in_the_records_is_refused_with_its_line(tmp_path, kind, number) -> None:
+    lines = [line for line in list_records(kind) if not line.startswith(f"{kind}{number}")]
+    text = SHORT.replace("[stepper_b]", "[delta_calibrate]\n" + "\n".join(lines) + "\n[stepper_b]")
+    with pytest.raises(FileError) as refused:
+        read(tmp_path, text)
+    assert refused.value.code == "files.probe-left-out"
+    assert f"there is no '{kind}{number}'" in str(refused.value)
+    assert text.splitlines()[refused.value.line - 1].startswith(f"{kind}{number + 1}")
+
+
+def test_all_records_of_a_complete_file_are_read(tmp_path) -> None:
+    lines = [*list_records("height"), *list_records("distance", 2)]
+    stepper = "[stepper_b]\nstep_distance: 0.0125\n"
+    text = SHORT.replace("[stepper_a]", "[stepper_a]\nstep_distance: 0.0125")
+    text = text.replace("[stepper_c]", "[stepper_c]\nstep_distance: 0.0125")
+    text = text.replace("[stepper_b]\n", "[delta_calibrate]\n" + "\n".join(lines) + "\n" + stepper)
+    (tmp_path / "full.cfg").write_text(text)
+    imported = klipper.read(tmp_path / "full.cfg", ImportOptions("full"))
+    assert imported.measurements is not None
+    assert [len(rows) for rows in imported.measurements.observations] == [6, 2]

@@ -27,13 +27,16 @@ def format_scaled(value: float, factor: float) -> str:
 
 
 def format_exact(value: float, factor: float) -> str:
-    """Return the shortest text (12 digits at least) from which `parse_exact` makes the same double.
+    """Return the shortest text (12 to 17 digits) from which `parse_exact` makes the same double.
 
-    Such a text exists for every double, because `parse_exact` rounds only once.
+    17 digits suffice for every double: rounding to them changes a number by at most 0.5e-16 of it,
+    and half the distance of two doubles is at least 0.55e-16 of them.
     """
     scaled = Decimal(value) / Decimal(repr(factor))
     texts = (f"{float(scaled):.{digits}g}" for digits in DIGITS)
-    return next((text for text in texts if parse_exact(text, factor) == value), f"{scaled:.24g}")
+    # rounded once: through a double, the last digit may be that of a neighbor
+    nearest = f"{scaled:.{DIGITS[-1]}g}"
+    return next((text for text in texts if parse_exact(text, factor) == value), nearest)
 
 
 def parse_exact(text: str, factor: float) -> float:

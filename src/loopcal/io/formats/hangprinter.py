@@ -290,6 +290,8 @@ def _parse_numbers(
     wanted += "" if width is None else f", {width} in {'all' if ndim == 1 else 'each'}"
     if key not in content:
         raise FileError(f"the key {key!r} is missing; add {wanted}", path)
+    if ndim == 2:
+        _refuse_short_row(content[key], key, path, width)
     try:
         values = np.array(content[key], dtype=float)
     except (TypeError, ValueError):
@@ -298,6 +300,20 @@ def _parse_numbers(
     if not has_shape or not np.isfinite(values).all():
         raise FileError(f"{key!r} is not {wanted}; correct it", path)
     return values
+
+
+def _refuse_short_row(rows: Any, key: str, path: Path, width: int | None) -> None:
+    """Raise FileError for the first row with another length than `width`, or than most rows."""
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+        return
+    lengths = [len(row) for row in rows]
+    usual = max(lengths, key=lengths.count, default=0) if width is None else width
+    for number, length in enumerate(lengths, 1):
+        if length != usual:
+            finding = report_finding(
+                "files.row-incomplete", key=key, row=number, length=length, usual=usual
+            )
+            raise FileError(finding, path)
 
 
 def _format(value: float, digits: int = 12) -> str:

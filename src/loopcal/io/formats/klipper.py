@@ -18,7 +18,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -232,22 +231,44 @@ def write(source: ExportSource, into: Path | None) -> Exported:
 
 
 def _parse_probes(cfg: KlipperConfig) -> _Probes:
-    """Return the probes of [delta_calibrate]; like Klipper, up to the first missing number."""
+    """Return the probes of [delta_calibrate]; FileError for a record that lacks a part."""
     probes = _Probes({}, [], [])
     for name in ("height", "manual_height"):
-        for i in count():
-            if not cfg.has(PROBED, f"{name}{i}"):
-                break
-            probes.positions[f"{name}{i}"] = _parse_steps(cfg, f"{name}{i}_pos")
-            probes.heights.append((f"{name}{i}", cfg.number(PROBED, f"{name}{i}")))
-    for i in count():
-        if not cfg.has(PROBED, f"distance{i}"):
-            break
-        ends = (f"distance{i}_pos1", f"distance{i}_pos2")
+        for record in _list_records(cfg, name, ("", "_pos")):
+            probes.positions[record] = _parse_steps(cfg, f"{record}_pos")
+            probes.heights.append((record, cfg.number(PROBED, record)))
+    for record in _list_records(cfg, "distance", ("", "_pos1", "_pos2")):
+        ends = (f"{record}_pos1", f"{record}_pos2")
         for end in ends:
             probes.positions[end] = _parse_steps(cfg, end)
-        probes.distances.append((*ends, cfg.number(PROBED, f"distance{i}")))
+        probes.distances.append((*ends, cfg.number(PROBED, record)))
     return probes
+
+
+def _list_records(cfg: KlipperConfig, name: str, parts: Sequence[str]) -> list[str]:
+    """Return the names of the records `height0`, `height1`, ... of which any part exists.
+
+    Klipper reads up to the first number that is missing, and ignores all records behind it.
+
+    Raises
+    ------
+    FileError : a record lacks one of its parts (suffixes of its name), or a number is left out; at
+        a line of the record, or of the next one.
+    """
+    pattern = re.compile(rf"{name}(\d+)({'|'.join(parts)})")
+    found: dict[int, list[str]] = {}
+    for section, option in cfg.values:
+        if section == PROBED and (match := pattern.fullmatch(option)):
+            found.setdefault(int(match[1]), []).append(option)
+    for place, number in enumerate(sorted(found)):
+        present = found[number]
+        lacking = [part for part in parts if f"{name}{number}{part}" not in present]
+        code = "files.probe-part-missing" if lacking else "files.probe-left-out"
+        if lacking or number != place:
+            missing = f"{name}{number}{lacking[0]}" if lacking else f"{name}{place}"
+            finding = report_finding(code, present=present[0], missing=missing, section=PROBED)
+            raise cfg.error(finding, PROBED, present[0])
+    return [f"{name}{number}" for number in range(len(found))]
 
 
 def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:

@@ -84,7 +84,7 @@ class ValueFile(ABC):
         """Return whether a value exists."""
         return name in self.values
 
-    def error(self, sentence: str, *name: str) -> FileError:
+    def error(self, sentence: str | Finding, *name: str) -> FileError:
         """Return an error at the line of a value, without a line where it does not exist."""
         line = self.values[name[0], name[1]].line + 1 if name in self.values else None
         return FileError(sentence, self.path, line)
