@@ -87,7 +87,7 @@ def test_calibrate_runs_as_a_shell_command(tmp_path, data_folder) -> None:
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
         "arrays.npz",
         "result.json",
-        "robot.yaml",
+        "robot-not-calibrated.yaml",
     ]
 
 
