@@ -154,13 +154,7 @@ def import_(
         "findings": imported.findings,
     }
     if as_json:
-        calibration = {
-            "fit": correction and correction.report.identification,
-            "verdict": correction and correction.report.verdict,
-            "reasons": correction and correction.report.failures,
-            "changes": correction and correction.changes,
-        }
-        terminal.print_json({**document, **calibration})
+        terminal.print_json({**document, **_list_calibration(correction)})
     else:
         terminal.print_page(_view_import(robot, document, noted, correction))
     if correction is None or correction.failure is None:
@@ -245,6 +239,17 @@ class _Correction:
     failure: Finding | None
     changes: tuple[str, ...]
     is_written: bool
+
+
+def _list_calibration(correction: _Correction | None) -> dict[str, Any]:
+    """Return the calibration of an import for JSON; its parts are None where there is none."""
+    report = None if correction is None else correction.report
+    return {
+        "fit": report and report.identification,
+        "verdict": report and report.verdict,
+        "reasons": report and report.failures,
+        "changes": correction and correction.changes,
+    }
 
 
 def _correct_file(
