@@ -4,27 +4,30 @@
     covariance = D C D' + J_q S_q J_q'        expanded uncertainty U = k sqrt(diag), k = 2
 
 with the error model D = d twist / d parameter, the covariance C of the parameters, and the
-variances S_q of the readings where the actuators have a sigma. A direction that the data do not
-determine makes those components infinite that it moves, and no others. Directions that only move a
-frame as a whole are excluded, and the result says so. JCGM 100; derivation:
+variances S_q of the readings where the actuators have a sigma. D refers to a frame, see
+`loopcal.diagnose.error_frames`: motions of the base and platform frames that the measurements do
+not determine are no errors, and the result says so. A direction that the data do not determine
+makes those components infinite that it moves in this frame, and no others. JCGM 100; derivation:
 docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal import geometry
-from loopcal.diagnose import NO_MOTION, FrameMotions, find_frame_motions, twist_weights
+from loopcal.diagnose import NO_MOTION, ErrorFrame, choose_error_frame, twist_weights
+from loopcal.diagnose.error_frames import FITTED, RELATIVE, solve_home
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding
 from loopcal.mechanism import (
     Mechanism,
     Solution,
@@ -33,17 +36,20 @@ from loopcal.mechanism import (
     inverse,
     resolve_poses,
 )
+from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.typing import BoolArray, FloatArray
 
 COVERAGE = 2.0
-"""Factor k of the expanded uncertainty: about 95 % of normal errors."""
+"""Factor k of the expanded uncertainty of a component: about 95 % of normal errors."""
+
+LEVEL = 0.95
+"""Share of the errors below the expanded uncertainty of a length or an angle."""
 
 COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
 BLOCK = 1024
 """Poses whose sensitivities are in memory at once."""
 
 Axes = Literal["base", "platform"]
-Gauge = Literal["left out", "infinite"]
 Point = Literal["tool", "platform"]
 
 
@@ -92,6 +98,16 @@ class PoseUncertainty:
         return COVERAGE * self.sd
 
     @property
+    def expanded_position(self) -> FloatArray:
+        """(n,) length that 95 % of the displacements of the point do not exceed [m]."""
+        return _expand_length(self.covariance[:, 3:, 3:])
+
+    @property
+    def expanded_orientation(self) -> FloatArray:
+        """(n,) angle that 95 % of the rotations of the platform do not exceed [rad]."""
+        return _expand_length(self.covariance[:, :3, :3])
+
+    @property
     def position(self) -> FloatArray:
         """(n,) root mean square of the displacement of the point [m]."""
         return np.sqrt((self.sd[:, 3:] ** 2).sum(axis=1))
@@ -110,15 +126,19 @@ class PoseUncertainty:
             "expanded": self.expanded,
             "position_rms": self.position,
             "orientation_rms": self.orientation,
+            "position_95": self.expanded_position,
+            "orientation_95": self.expanded_orientation,
         }
 
 
 def pose_uncertainty(
     fit: Identification | Posterior,
     poses: ArrayLike | Solution,
-    frame: Axes = "base",
-    gauge: Gauge = "left out",
+    axes: Axes = "base",
+    frame: str = FITTED,
     point: Point = "tool",
+    origin: Solution | None = None,
+    origin_name: str = "1",
 ) -> PoseUncertainty:
     """Compute the uncertainty of poses of the calibrated robot.
 
@@ -127,10 +147,13 @@ def pose_uncertainty(
     fit : the identification, or the posterior of a run folder.
     poses : (n, 4, 4) T_base_platform, (n, c) controlled coordinates [m, rad], or a solution of the
         calibrated robot.
-    frame : axes of the components. gauge : "left out" excludes undetermined directions that move
-        the base or platform frame as a whole (the frame is then the one that the estimate
-        defines); "infinite" includes them.
+    axes : of the components.
+    frame : in which the errors are stated. "fitted": after the best rigid fit, over the measured
+        poses, of the base and platform frames as far as the measurements do not determine them.
+        "base": in the base frame of the robot file. "relative": relative to the pose `origin`. Or
+        the name of the frame of an instrument, such as "tracker".
     point : the point whose displacement is meant: that of the tool, or the platform's origin.
+    origin : solution of one pose; default: the first of `poses`. origin_name : its name.
 
     Returns
     -------
@@ -138,13 +161,9 @@ def pose_uncertainty(
 
     Raises
     ------
-    EstimationError : an option that is not allowed.
+    EstimationError : an option that is not allowed, or an unreachable `origin`.
     """
-    for name, value, allowed in (
-        ("frame", frame, Axes),
-        ("gauge", gauge, Gauge),
-        ("point", point, Point),
-    ):
+    for name, value, allowed in (("axes", axes, Axes), ("point", point, Point)):
         if value not in get_args(allowed):
             raise EstimationError(
                 f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(allowed)))}"
@@ -153,38 +172,20 @@ def pose_uncertainty(
     posterior = fit.posterior if isinstance(fit, Identification) else fit
     robot = posterior.robot
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
-    motions = find_frame_motions(posterior)
-    roots = _covariance_roots(posterior, motions, gauge)
+    if frame == RELATIVE and origin is None:
+        origin = solution.take(np.arange(1))
+    chosen = choose_error_frame(posterior, frame, origin, origin_name)
     blocks = []
     for first in range(0, len(solution.q), BLOCK):
         rows = np.arange(first, min(first + BLOCK, len(solution.q)))
-        H = transport(robot, solution.T[rows], frame, point)
-        blocks.append(_covariance(posterior, solution.take(rows), roots, H))
+        H = transport(robot, solution.T[rows], axes, point)
+        blocks.append(_covariance(posterior, solution.take(rows), chosen, H))
     T = np.where(solution.converged[:, None, None], solution.T, np.nan)
-    excluded = motions.count if gauge == "left out" else 0
-    reference = report_finding(
-        "accuracy.frame", point=point, axes=frame, count=excluded, frames=tuple(motions.frames)
-    )
-    return PoseUncertainty(T, np.concatenate(blocks), reference)
-
-
-def _covariance_roots(
-    posterior: Posterior, motions: FrameMotions, gauge: Gauge
-) -> tuple[FloatArray, FloatArray]:
-    """Return directions times their standard deviations (p, r), and those of infinite variance
-    (p, o), both in tolerances.
-    """
-    directions = posterior.directions.copy()
-    if gauge == "left out":
-        directions[:, ~posterior.determined] = motions.kept
-    infinite = np.isinf(posterior.variance)
-    return directions[:, ~infinite] * np.sqrt(posterior.variance[~infinite]), directions[
-        :, infinite
-    ]
+    return PoseUncertainty(T, np.concatenate(blocks), chosen.describe(point, axes))
 
 
 def _covariance(
-    posterior: Posterior, solution: Solution, roots: tuple[FloatArray, FloatArray], H: FloatArray
+    posterior: Posterior, solution: Solution, frame: ErrorFrame, H: FloatArray
 ) -> FloatArray:
     """Return the covariance (n, 6, 6) of poses.
 
@@ -192,26 +193,45 @@ def _covariance(
     """
     robot = posterior.robot
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    D = H @ (S.parameters[0][:, :, posterior.places] * posterior.unit)
-    finite, infinite = roots
-    factors = [D @ finite]
+    D = S.parameters[0][:, :, posterior.places] * posterior.unit
+    size = np.linalg.norm(D * twist_weights(robot)[:, None], axis=(1, 2))
+    D = H @ frame.relate(D, solution.T)
+    is_infinite = np.isinf(posterior.variance)
+    known = posterior.directions[:, ~is_infinite] * np.sqrt(posterior.variance[~is_infinite])
+    factors = [D @ known, H @ frame.own_errors(solution.T)]
     sigma = np.array([a.sigma or 0.0 for a in robot.actuators])
     if sigma.any():
         factors.append(H @ (S.readings[0] * sigma))
     root = np.concatenate(factors, axis=2)
     covariance = root @ root.swapaxes(1, 2)
-    if infinite.shape[1]:
-        weight = twist_weights(robot)
-        limit = NO_MOTION * np.linalg.norm(D * weight[:, None], axis=(1, 2))
-        moved = np.linalg.norm(D @ infinite, axis=2) * weight > limit[:, None]
-        covariance[moved[:, :, None] | moved[:, None, :]] = np.nan
-        pose, component = np.nonzero(moved)
+    if is_infinite.any():
+        unknown = posterior.directions[:, is_infinite]
+        moved = np.linalg.norm(D @ unknown, axis=2) * twist_weights(robot)
+        lost = moved > NO_MOTION * size[:, None]
+        covariance[lost[:, :, None] | lost[:, None, :]] = np.nan
+        pose, component = np.nonzero(lost)
         covariance[pose, component, component] = np.inf
     covariance[~solution.converged] = np.nan
     return covariance
 
 
-def transport(robot: Mechanism, T: FloatArray, frame: Axes, point: Point) -> FloatArray:
+def _expand_length(covariance: FloatArray) -> FloatArray:
+    """Return lengths (n,) that a normal vector of covariance (n, 3, 3) exceeds in 5 % of cases.
+
+    Its square is a sum of weighted chi-square variables; its distribution is that of `c` times a
+    chi-square variable of h degrees of freedom with the same mean and variance (Satterthwaite,
+    Biometrics Bulletin 2(6) 110, 1946, doi 10.2307/3002019). With one direction it is exact.
+    """
+    mean = np.trace(covariance, axis1=1, axis2=2)
+    square = (covariance * covariance).sum(axis=(1, 2))
+    usable = np.isfinite(square) & (square > 0.0)
+    degrees = np.where(usable, mean, 1.0) ** 2 / np.where(usable, square, 1.0)
+    quantile = compute_chi_square_quantile(degrees, 1.0 - LEVEL)
+    length = np.sqrt(np.where(usable, mean, 0.0) / degrees * quantile)
+    return np.where(usable, length, np.where(mean > 0.0, np.inf, mean))
+
+
+def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> FloatArray:
     """Return (n, 6, 6) from twists of the platform origin in base axes to those of a point in other
     axes.
     """
@@ -220,7 +240,7 @@ def transport(robot: Mechanism, T: FloatArray, frame: Axes, point: Point) -> Flo
     H = np.zeros((len(T), 6, 6))
     H[:, :3, :3] = H[:, 3:, 3:] = np.eye(3)
     H[:, 3:, :3] = -geometry.hat(arm)
-    if frame == "platform":
+    if axes == "platform":
         turn = np.zeros_like(H)
         turn[:, :3, :3] = turn[:, 3:, 3:] = R.swapaxes(1, 2)
         H = turn @ H
@@ -298,7 +318,8 @@ def accuracy_map(
     measured: ArrayLike,
     poses: ArrayLike | int = 400,
     seed: int = 0,
-    frame: Axes = "base",
+    axes: Axes = "base",
+    frame: str = FITTED,
 ) -> AccuracyMap:
     """Compute the uncertainty of poses over the workspace, and compare it with the measured poses.
 
@@ -308,7 +329,8 @@ def accuracy_map(
     measured : (m, a) readings of the measured poses, as in `Measurements.readings` [m, rad].
     poses : (n, c) controlled coordinates, for instance a grid, or the number of poses to draw from
         the robot's workspace.
-    seed : of that draw. frame : axes of the components.
+    seed : of that draw. axes : of the components. frame : see `pose_uncertainty`; "relative" means
+        relative to the home pose.
 
     Raises
     ------
@@ -317,11 +339,15 @@ def accuracy_map(
     check_argument(fit, "fit", Identification, Posterior)
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     coordinates = resolve_poses(robot, poses, seed)
+    home = solve_home(robot)
+    compute = partial(
+        pose_uncertainty, fit, axes=axes, frame=frame, origin=home, origin_name="home"
+    )
     return AccuracyMap(
         names=robot.controlled,
         coordinates=coordinates,
-        uncertainty=pose_uncertainty(fit, coordinates, frame),
-        measured=pose_uncertainty(fit, forward(robot, measured), frame),
+        uncertainty=compute(poses=coordinates),
+        measured=compute(poses=forward(robot, measured)),
     )
 
 

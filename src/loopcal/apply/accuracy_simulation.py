@@ -3,7 +3,9 @@
 
 Every trial has its own true machine and its own noise. Predicted are the standard deviations from
 D C D' of one fit. Observed is the root mean square, over all trials, of the pose error between the
-identified and the true machine at the same readings. JCGM 101; see docs/theory/uncertainty.md.
+identified and the true machine at the same readings. Both are those after the best rigid fit, over
+the measured poses, of the motions of frames that the instrument does not determine. JCGM 101; see
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -15,12 +17,14 @@ from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
+from loopcal.diagnose.error_frames import fit_unfixed_frames
+from loopcal.engine import State
 from loopcal.errors import EstimationError
 from loopcal.estimate.identification import IdentifiedTrials, identify_trials
-from loopcal.estimate.inference.posterior import compute_posterior
 from loopcal.estimate.methods.penalties import LeastSquares, Method
+from loopcal.estimate.trial_posteriors import compute_trial_posterior
 from loopcal.measure import Instrument, Trials, sample_truth, simulate_trials
-from loopcal.mechanism import Mechanism, Solution, Status, forward, forward_trials, inverse
+from loopcal.mechanism import Mechanism, Status, forward, forward_trials, inverse
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 
 BATCH = 250
@@ -33,7 +37,7 @@ class AccuracySimulation:
 
     Attributes
     ----------
-    predicted : of the fit of the first trial: platform origin, base axes, no direction excluded.
+    predicted : of the fit of the first trial, with its frame: platform origin, base axes.
     observed : (n, 6) root mean square error [rad, m].
     trials, failed : number of fits that converged, and that did not.
     """
@@ -79,17 +83,27 @@ def simulate_accuracy(
     measured = simulate_trials(robot, truth, commanded, instrument, seed)
     compared = inverse(robot.nominal, poses)
     method = method or LeastSquares()
-    predicted, squares, converged = None, np.zeros((len(compared.q), 6)), 0
+    posterior, squares, converged = None, np.zeros((len(compared.q), 6)), 0
     for first in range(0, trials, BATCH):
         progress(first, trials, "calibrating simulated machines")
-        fits = identify_trials(robot, _take_trials(measured, slice(first, first + BATCH)), method)
-        valid, errors = _compare_with_truth(fits, truth[first : first + BATCH], compared)
+        batch = _take_trials(measured, slice(first, first + BATCH))
+        fits = identify_trials(robot, batch, method)
+        valid, errors = _compare_with_truth(fits, batch, compared.q, compared.state)
+        if posterior is None and valid.any():
+            posterior = compute_trial_posterior(fits, batch, int(np.flatnonzero(valid)[0]))
+        if posterior is None:
+            continue
+        frames = fit_unfixed_frames(posterior)
+        if frames.motions.shape[1]:
+            closed, reference = _compare_with_truth(fits, batch, measured.readings)
+            valid &= closed
+            errors = frames.remove(errors, compared.T, reference)
+        errors = errors[valid]
         squares += (errors**2).sum(axis=0)
         converged += len(errors)
-        if predicted is None and valid.any():
-            predicted = _predict_errors(fits, int(np.flatnonzero(valid)[0]), compared)
-    if predicted is None:
+    if posterior is None:
         raise EstimationError(f"none of the {trials} trials converged; check poses and method")
+    predicted = pose_uncertainty(posterior, forward(posterior.robot, compared.q), point="platform")
     observed = np.sqrt(squares / converged)
     return AccuracySimulation(predicted, observed, converged, trials - converged)
 
@@ -107,28 +121,15 @@ def _take_trials(trials: Trials, chosen: slice) -> Trials:
 
 
 def _compare_with_truth(
-    fits: IdentifiedTrials, truth: FloatArray, compared: Solution
+    fits: IdentifiedTrials, trials: Trials, readings: FloatArray, start: State | None = None
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which trials (t,) have a fit and all poses, and their pose errors (v, n, 6)."""
+    """Return which trials (t,) have a fit and all poses at readings (n, a), and the errors (t, n,
+    6) of these poses.
+    """
     states = [
-        forward_trials(fits.free_parameters.robot, values, compared.q[None], compared.state)
-        for values in (fits.values, truth)
+        forward_trials(fits.free_parameters.robot, values, readings[None], start)
+        for values in (fits.values, trials.truth)
     ]
     is_closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
     valid = fits.converged & is_closed[0] & is_closed[1]
-    return valid, geometry.pose_difference(states[0].T[valid], states[1].T[valid])
-
-
-def _predict_errors(fits: IdentifiedTrials, trial: int, compared: Solution) -> PoseUncertainty:
-    """Return the uncertainty of the poses by the fit of one trial."""
-    free, chosen = fits.free_parameters, np.array([trial])
-    identified = free.robot.with_values(fits.values[trial])
-    posterior = compute_posterior(
-        identified,
-        free.places,
-        free.tolerance,
-        fits.decomposition.take(chosen),
-        fits.penalty[chosen],
-    )
-    solution = forward(identified, compared.q)
-    return pose_uncertainty(posterior, solution, gauge="infinite", point="platform")
+    return valid, geometry.pose_difference(states[0].T, states[1].T)

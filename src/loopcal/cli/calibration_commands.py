@@ -20,6 +20,7 @@ from loopcal.cli.options import (
     file_option,
     flag_option,
     force_option,
+    frame_option,
     json_option,
     limit_options,
     print_convention_note,
@@ -30,7 +31,14 @@ from loopcal.cli.options import (
     verbose_option,
 )
 
-TAKEN_OPTIONS = ("limit_position", "limit_angle", "choose_model", "free_limb", "allow_still")
+TAKEN_OPTIONS = (
+    "limit_position",
+    "limit_angle",
+    "choose_model",
+    "free_limb",
+    "frame",
+    "allow_still",
+)
 """Options of the command that options of the library have by the same name."""
 
 
@@ -63,6 +71,7 @@ TAKEN_OPTIONS = ("limit_position", "limit_angle", "choose_model", "free_limb", "
     help="With --prior: a limb that was repaired, such as leg3, whose parameters return to nominal "
     "with their tolerances.",
 )
+@frame_option()
 @limit_options
 @seed_option("the choice of held-out poses")
 @data_options
@@ -240,6 +249,7 @@ def validate(
 @click.option(
     "--steps", type=click.IntRange(min=1), default=3, help="Iterations of the shifted commands."
 )
+@frame_option()
 @force_option("the output file", ", and compute also from a calibration that failed")
 @json_option
 def compensate(
@@ -249,6 +259,7 @@ def compensate(
     mode: Literal["readings", "commands"],
     controller: str | None,
     steps: int,
+    frame: str,
     force: bool,
     as_json: bool,
 ) -> int:
@@ -286,7 +297,9 @@ def compensate(
     coordinates, labels = load_targets(targets, robot)
     old = None if controller is None else load_robot(controller)
     with terminal.ProgressBar() as progress:
-        result = compensate_targets(known, coordinates, mode, old, steps, labels, progress)
+        result = compensate_targets(
+            known, coordinates, mode, old, steps, labels, progress, frame=frame
+        )
     text = format_compensation(result)
     if output is not None:
         write_text(output, text)

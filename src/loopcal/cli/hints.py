@@ -55,6 +55,7 @@ HINTS = {
     "noise.too-few-degrees": "use --noise given",
     "prior.machine-changed": "use --free-limb LIMB",
     "prior.tolerances-too-narrow": "use --method auto",
+    "plan.frame-unbounded": "use --frame fitted",
     "plan.goal-missed": "use a smaller --hold-out, or --criterion I",
     "plan.goal-unreachable": "draw more poses with --candidates, or relax --accuracy",
     "plan.groups-excluded": "use fewer --points, or relax --min-margin or --max-tilt",

@@ -123,6 +123,18 @@ def format_option(names: Sequence[str], help_text: str) -> Decorator:
     return click.option("--format", "format_name", type=click.Choice(names), help=help_text)
 
 
+def frame_option(names: str = "fitted, base, relative, or the frame of an instrument") -> Decorator:
+    """Return the option for the frame in which errors are stated."""
+    return click.option(
+        "--frame",
+        default="fitted",
+        metavar="NAME",
+        show_default=True,
+        help=f"Frame in which errors are stated: {names}. 'fitted' is after the best rigid fit of "
+        "the base and platform frames, as far as the measurements do not determine them.",
+    )
+
+
 def _limit_option(name: str, kind: Quantity, quantity: str, example: str) -> Decorator:
     text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
     return click.option(name, type=kind, help=f"{text}; above it the exit code is 2.")

@@ -26,6 +26,7 @@ from loopcal.cli.options import (
     file_option,
     flag_option,
     force_option,
+    frame_option,
     is_given,
     json_option,
     name_option,
@@ -114,6 +115,7 @@ EXCLUDED_BY_PLANE_LINE = {
     help="Number of candidate poses to draw.",
 )
 @flag_option("--curve", help="Also compute the expected errors by the number of poses.")
+@frame_option("fitted, base, or relative (to home)")
 @seed_option("all random choices")
 @force_option("the plan")
 @json_option
@@ -225,6 +227,7 @@ def _make_plan_options(
         target=target,
         goal=goal,
         hold_out=options["hold_out"],
+        frame=options["frame"],
         constraints=make_constraints(options),
         allowed_poses=None if allowed is None else load_poses(allowed, robot),
         n_candidates=options["candidates"],

@@ -10,6 +10,8 @@ from loopcal.diagnose.cross_validation import CrossValidation as CrossValidation
 from loopcal.diagnose.cross_validation import build_regularization_path as build_regularization_path
 from loopcal.diagnose.cross_validation import cross_validate as cross_validate
 from loopcal.diagnose.cross_validation import score_leave_one_out as score_leave_one_out
+from loopcal.diagnose.error_frames import ErrorFrame as ErrorFrame
+from loopcal.diagnose.error_frames import choose_error_frame as choose_error_frame
 from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
 from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
 from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck as ClusterCheck

@@ -57,21 +57,24 @@ class FrameMotions:
         nothing else remains.
     frames : names of the moved frames: (), ("base",), ("platform",) or both. count : number of
         independent combinations that move frames.
+    motions : (12, g) motions of the two frames by these combinations, in the units of
+        `loopcal.estimate.frame_freedoms.frame_twists`, each of length one.
     """
 
     kept: FloatArray
     frames: tuple[str, ...]
     count: int
+    motions: FloatArray
 
 
 def find_frame_motions(posterior: Posterior) -> FrameMotions:
     """Separate motions of frames from the directions that the data of a fit do not determine."""
     null = posterior.directions[:, ~posterior.determined]
     if null.shape[1] == 0:
-        return FrameMotions(null, (), 0)
+        return FrameMotions(null, (), 0, np.zeros((12, 0)))
     robot, readings, values = (
         posterior.robot,
-        _probe_readings(posterior.robot),
+        probe_readings(posterior.robot),
         posterior.robot.values,
     )
     state = forward_trials(robot, values[None], readings[None])
@@ -84,13 +87,16 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
     _, s, vt = np.linalg.svd(_without_span([base, platform], moved), full_matrices=False)
     gauge = vt[s <= limit].T
     moving = moved @ gauge
-    count = int((np.linalg.svd(moving, compute_uv=False) > limit).sum()) if gauge.shape[1] else 0
+    _, s, combine = np.linalg.svd(moving, full_matrices=False)
+    moving = moving @ combine[s > limit].T
+    count = moving.shape[1]
     frames: tuple[str, ...] = ("base", "platform") if count else ()
     for name, frame in (("base", base), ("platform", platform)):
         if len(frames) == 2 and np.linalg.norm(_without_span([frame], moving)) <= limit:
             frames = (name,)  # only one where it suffices
     infinite = np.isinf(posterior.variance[~posterior.determined])
-    return FrameMotions(null @ _gauge_projector(gauge, infinite), frames, count)
+    kept = null @ _gauge_projector(gauge, infinite)
+    return FrameMotions(kept, frames, count, _explain_motions(moving, base, platform, robot.size))
 
 
 def twist_weights(robot: Mechanism) -> FloatArray:
@@ -102,7 +108,7 @@ def twist_weights(robot: Mechanism) -> FloatArray:
 
 def probe_workspace(free: FreeParameters, joints: Iterable[str] = ()) -> ObservedPoses:
     """Return poses about home with evenly spread readings, without those out of reach."""
-    poses = observe_poses(free, _probe_readings(free.robot), joints)
+    poses = observe_poses(free, probe_readings(free.robot), joints)
     return observe_poses(free, poses.readings[poses.is_reached], joints)
 
 
@@ -147,7 +153,7 @@ def _gauge_projector(gauge: FloatArray, infinite: BoolArray) -> FloatArray:
     return projector - basis @ (basis.T @ projector)
 
 
-def _probe_readings(robot: Mechanism) -> FloatArray:
+def probe_readings(robot: Mechanism) -> FloatArray:
     """Return readings (PROBES, a) about those of home."""
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     spread = [
@@ -163,15 +169,21 @@ def _weigh_motions(
     """Return weighted motions at poses (n, 4, 4): (6 n, p) by `twists` (n, 6, p), (6 n, 6) by the
     base frame and (6 n, 6) by the platform frame.
     """
-    R, t = T[:, :3, :3], T[:, :3, 3]
-    zero, eye = np.zeros_like(R), np.broadcast_to(np.eye(3), R.shape)
-    base = np.block([[eye, zero], [-geometry.hat(t), eye]])
-    platform = np.block([[R, zero], [zero, R]])
-    weight = twist_weights(robot)[:, None]
+    M, weight = geometry.differentiate_by_frames(T), twist_weights(robot)[:, None]
     motions, base, platform = (
-        (weight * D).reshape(-1, D.shape[-1]) for D in (twists, base, platform)
+        (weight * D).reshape(-1, D.shape[-1]) for D in (twists, M[:, :, :6], M[:, :, 6:])
     )
     return motions, base, platform
+
+
+def _explain_motions(
+    moving: FloatArray, base: FloatArray, platform: FloatArray, size: float
+) -> FloatArray:
+    """Return the motions (12, g) of both frames that explain weighted motions (6 n, g) of poses."""
+    unit = np.array([1.0 / size] * 3 + [1.0] * 3)
+    both = np.concatenate([base * unit, platform * unit], axis=1)
+    motion = np.linalg.lstsq(both, moving, rcond=NO_MOTION)[0]
+    return motion / np.linalg.norm(motion, axis=0)
 
 
 def _without_span(frames: Sequence[FloatArray], moved: FloatArray) -> FloatArray:

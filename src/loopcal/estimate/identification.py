@@ -20,12 +20,13 @@ from loopcal.estimate.fit_input import (
     count_spare_equations,
     exclude_poses,
 )
+from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import compute_posterior, scale_variances
 from loopcal.estimate.inference.residual_test import run_residual_test
-from loopcal.estimate.linearization import Start
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
@@ -249,7 +250,13 @@ def _assemble(
     d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
-    nuisance = _estimate_nuisance(weighted, robot, fit, d, penalty, variance)
+    linearization = None
+    if problem.nuisance is not None:
+        linearization = weighted.linearize(fit.deviation, fit.start)
+    nuisance = _estimate_nuisance(weighted, linearization, robot, d, penalty, variance)
+    frames = find_measured_frames(
+        weighted, data, fit.deviation, fit.start, options.prior, linearization, variance
+    )
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
     excluded, estimates = tuple(options.excluded_poses), solution.estimates
@@ -280,7 +287,9 @@ def _assemble(
         options=options,
         free_parameters=free,
         covariance=d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance,
-        posterior=compute_posterior(corrected, free.places, free.tolerance, d, penalty, variance),
+        posterior=compute_posterior(
+            corrected, free.places, free.tolerance, d, penalty, variance, frames
+        ),
         spectrum=Spectrum(
             int(plain.rank[0]), float(plain.condition[0]), plain.singular_values[0], d.tolerance
         ),
@@ -312,16 +321,15 @@ def _test_prior(free: FreeParameters, fit: Descent, method: Method) -> PriorConf
 
 def _estimate_nuisance(
     problem: Problem,
+    linearization: Linearization | None,
     robot: Mechanism,
-    fit: Descent,
     d: Decomposition,
     penalty: FloatArray,
     variance: float,
 ) -> NuisanceEstimate:
-    """Return the nuisance parameters at the estimate, linearized there once more."""
-    if problem.nuisance is None:
+    """Return the nuisance parameters at the estimate, where the rows are linearized."""
+    if problem.nuisance is None or linearization is None:
         return empty_nuisance_estimate(problem.parameters)
-    linearization = problem.linearize(fit.deviation, fit.start)
     return estimate_nuisance(problem.nuisance, linearization, robot, d, penalty, variance)
 
 

@@ -10,11 +10,12 @@ docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal import engine
+from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_at_readings
 from loopcal.estimate.problem_construction import problem_of
@@ -59,6 +60,14 @@ class ObservedPoses:
         """name -> (1, n) values [SI] of the joints that were asked for."""
         return self.linearized.joints
 
+    def by_frames(self) -> ObservedPoses:
+        """Return the poses with derivatives by motions of the base and platform frames, see
+        `frame_twists`, in place of the parameters.
+        """
+        by_frames = frame_twists(self.T, self.free.robot.size)
+        moved = replace(self.linearized, by_parameters=by_frames, joints_by_parameters={})
+        return replace(self, linearized=moved)
+
     @property
     def is_reached(self) -> BoolArray:
         """(n,) poses at which the loops close."""
@@ -80,14 +89,15 @@ def observe_rows(
 ) -> FloatArray:
     """Return whitened rows (1, M, U + p + 1), [nuisance | machine | residual], of measurements.
 
-    `values` (U,) are those of the nuisance parameters `nuisance`.
+    `values` (U,) are those of the nuisance parameters `nuisance`. The columns of the machine are
+    those of `poses.linearized`.
     """
     linearized = poses.linearized
     evaluated = evaluate_measurements(
         measured, linearized.T, values[None], nuisance, linearized.joints
     )
     rows = whiten_rows(evaluated, linearized.by_parameters, linearized.joints_by_parameters)
-    p, u = len(poses.free), len(nuisance)
+    p, u = linearized.by_parameters.shape[-1], len(nuisance)
     return np.concatenate([rows[..., p : p + u], rows[..., :p], rows[..., p + u :]], axis=-1)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import LeverageRows, Linearization, Start
-from loopcal.estimate.nuisance.elimination import NodeMembers, NuisanceElimination, fold_node_rows
+from loopcal.estimate.nuisance.elimination import NuisanceElimination, fold_node_rows, list_members
 from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
 from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
 from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
@@ -340,7 +340,7 @@ class Problem:
         is_needed = _needed_poses(self.rows, len(readings))
         blocks = divide_poses(readings, self.rows, is_needed, BLOCK)
         members = tuple(
-            tuple(_members(self.nuisance, rows) for rows in block.rows) for block in blocks
+            tuple(list_members(self.nuisance, rows) for rows in block.rows) for block in blocks
         )
         names = list_sensed_joints(r.kind for r in self.rows)
         return ExactPoses(
@@ -382,16 +382,6 @@ def _count_by_component(rows: Sequence[ObservationRows], member: IntArray) -> In
             np.int64
         )
     return total
-
-
-def _members(
-    nuisance: NuisanceElimination | None, rows: ObservationRows
-) -> tuple[NodeMembers, ...]:
-    """Return the rows of a kind by nodes; all are of the machine without nuisance parameters."""
-    if nuisance is not None:
-        return nuisance.members(rows)
-    numbers = np.arange(len(rows.poses))
-    return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
 
 
 def _of_trials(count: IntArray, trials: IntArray) -> IntArray:

@@ -60,3 +60,19 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
     # joined, not assigned: automatic derivatives put jax in the place of numpy
     top = np.concatenate([turned, np.zeros_like(lever)], axis=-1)
     return np.concatenate([top, np.concatenate([lever, turned], axis=-1)], axis=-2)
+
+
+def differentiate_by_frames(T: FloatArray) -> FloatArray:
+    """Return the twists (..., 6, 12) of platforms by motions of their base and platform frames.
+
+    A motion (w, c) of the base frame moves a pose by `(w, c + w x t)`, one of the platform frame by
+    `(R w, R c)`.
+
+    Parameters
+    ----------
+    T : (..., 4, 4) T_base_platform [m].
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    zero, eye = np.zeros_like(R), np.broadcast_to(np.eye(3), R.shape)
+    top = np.concatenate([eye, zero, R, zero], axis=-1)
+    return np.concatenate([top, np.concatenate([-hat(t), eye, zero, R], axis=-1)], axis=-2)

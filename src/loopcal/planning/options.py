@@ -35,6 +35,9 @@ class PlanOptions:
         plan then has the smallest number of poses that reaches it.
     hold_out : number of further poses for validation, drawn evenly; default one for four poses of
         the fit.
+    frame : in which errors are stated: "fitted", after the best rigid fit of the base and platform
+        frames as far as no measurement determines them; "base", the base frame of the robot file;
+        "relative", relative to the home pose.
     constraints : margin from singularities, tilt, line of sight. Strokes, joint limits and cones
         are always respected.
     allowed_poses : (n, c) controlled coordinates to choose from [m, rad]; default: about
@@ -58,6 +61,7 @@ class PlanOptions:
     target: Target = "pose"
     goal: float | None = None
     hold_out: int | None = None
+    frame: str = "fitted"
     constraints: Constraints = field(default_factory=Constraints)
     allowed_poses: FloatArray | None = field(default=None, repr=False)
     n_candidates: int = 1000

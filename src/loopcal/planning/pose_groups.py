@@ -25,6 +25,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import DataError
+from loopcal.estimate.frame_freedoms import unfixed_motions
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import observe_poses, observe_rows
 from loopcal.measure import (
@@ -45,6 +46,8 @@ BLOCK = 256
 """Groups whose rows are computed at once."""
 MOST = 5000
 """Largest number of candidate combinations: as many rows are computed in some seconds."""
+ENOUGH = 100
+"""Groups from which the motions of frames are found that no group determines."""
 DENSE = 20
 """Up to this many times the requested number all combinations are enumerated before drawing."""
 
@@ -101,19 +104,28 @@ def linearize_candidate_groups(
 
 
 def linearize_groups(
-    free: FreeParameters, instrument: Instrument, readings: FloatArray, members: IntArray
+    free: FreeParameters,
+    instrument: Instrument,
+    readings: FloatArray,
+    members: IntArray,
+    by_frames: bool = False,
 ) -> GroupRows:
-    """Return the rows of groups with these members (N, k), at readings (n, a) of all poses."""
+    """Return the rows of groups with these members (N, k), at readings (n, a) of all poses.
+
+    With `by_frames` the machine's columns are motions of frames, see `ObservedPoses.by_frames`.
+    """
     mounted = instrument.with_tool(free.robot)
     nuisance = _list_nuisance(mounted, members[:1])
     blocks = [
-        _linearize_block(free, mounted, readings, members[i : i + BLOCK])
+        _linearize_block(free, mounted, readings, members[i : i + BLOCK], by_frames)
         for i in range(0, len(members), BLOCK)
     ]
     stated = nuisance.table.free & ~np.isnan(nuisance.table.tolerance)
     weight = np.where(stated, 1.0 / np.where(stated, nuisance.table.tolerance, 1.0), 0.0)
-    prior = np.concatenate([np.diag(weight), np.zeros((len(nuisance), len(free)))], axis=1)
-    return GroupRows(np.concatenate(blocks), members, nuisance.table.names, prior)
+    rows = np.concatenate(blocks)
+    prior = np.zeros((len(nuisance), rows.shape[2]))
+    prior[:, : len(nuisance)] = np.diag(weight)
+    return GroupRows(rows, members, nuisance.table.names, prior)
 
 
 def combine_prior(
@@ -158,6 +170,25 @@ def decompose_information(
     return decompose(factor, np.full(1, len(flat)))
 
 
+def find_group_motions(
+    free: FreeParameters, instrument: Instrument, readings: FloatArray, members: IntArray
+) -> FloatArray:
+    """Return the motions (12, k) of frames that measurements of these groups do not determine.
+
+    Parameters
+    ----------
+    readings : (n, a) of all poses. members : (N, k) of the groups; some of them are enough.
+    """
+    chosen = np.linspace(0, len(members) - 1, min(ENOUGH, len(members))).astype(int)
+    groups = linearize_groups(free, instrument, readings, members[np.unique(chosen)], True)
+    o, width = len(groups.nuisance), groups.rows.shape[2]
+    allowed = groups.rows[is_allowed(groups.rows)].reshape(-1, width)
+    flat = np.concatenate([allowed, groups.nuisance_prior])
+    rows = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None]
+    factor = eliminate_from_factor(engine.fold(empty_factor(1, width), rows), o)
+    return unfixed_motions(factor, float(np.linalg.norm(allowed[:, o:])))
+
+
 def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters:
     """Return the nuisance parameters of the instrument."""
     count = int(members.max()) + 1
@@ -174,7 +205,11 @@ def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple[Sensor, 
 
 
 def _linearize_block(
-    free: FreeParameters, mounted: Instrument, readings: FloatArray, members: IntArray
+    free: FreeParameters,
+    mounted: Instrument,
+    readings: FloatArray,
+    members: IntArray,
+    by_frames: bool,
 ) -> FloatArray:
     """Return the rows (b, r, o + p) of some groups."""
     poses, places = np.unique(members, return_inverse=True)
@@ -200,7 +235,8 @@ def _linearize_block(
             Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", "")
         )
     data = Measurements(free.robot.name, observed.readings, tuple(observations))
-    whitened = observe_rows(observed, data, nuisance, nuisance.values())[0, :, :-1]
+    columns = observed.by_frames() if by_frames else observed
+    whitened = observe_rows(columns, data, nuisance, nuisance.values())[0, :, :-1]
     counts = [len(part) * len(part.kind.noise_columns) for part in observations]
     pieces = np.split(whitened, np.cumsum(counts)[:-1])
     rows = np.concatenate(

@@ -151,6 +151,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         before=problem.predict_errors(np.zeros(0, dtype=np.int64)),
         random=_predict_random(problem, n, criterion, rng),
         after=after,
+        frame=problem.prediction.frame.describe(),
     )
     quality = DesignQuality(
         _compute_figures(problem, rows[chosen]),
@@ -307,8 +308,10 @@ def _collect_notes(problem: PlanningProblem) -> tuple[Finding, ...]:
         notes.append(
             report_finding("plan.tolerances-missing", missing=int(assumed.sum()), parameters=p)
         )
-    if problem.prediction.frames:
-        notes.append(report_finding("plan.frames-undetermined", frames=problem.prediction.frames))
+    frame = problem.prediction.frame
+    if frame.fitted or frame.undetermined:
+        frames = frame.fitted or frame.undetermined
+        notes.append(report_finding("plan.frames-undetermined", frames=frames))
     if rank < p:
         notes.append(report_finding("plan.unobservable", count=p - rank, parameters=p))
     return tuple(notes)

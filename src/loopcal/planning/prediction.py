@@ -3,8 +3,9 @@
 
     d tool = (size * rotation, displacement)      [m]
 
-without the rigid motions of a frame that no measurement of this instrument determines: the frame
-then is the one that the estimate defines. Derivation: docs/theory/gauge.md.
+in a stated frame, see `loopcal.diagnose.error_frames`: after the best rigid fit of the base and
+platform frames as far as no measurement of this instrument determines them. Derivation:
+docs/theory/gauge.md.
 """
 
 from __future__ import annotations
@@ -14,16 +15,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.apply.accuracy import transport
-from loopcal.diagnose import find_frame_motions
+from loopcal.diagnose import ErrorFrame
+from loopcal.diagnose.error_frames import (
+    BASE,
+    FITTED,
+    RELATIVE,
+    check_frame,
+    follow_pose,
+    refer_errors,
+    solve_home,
+)
+from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.information import observe_poses
-from loopcal.findings import Quantity
+from loopcal.findings import Quantity, report_finding
 from loopcal.mechanism import Mechanism, Solution
-from loopcal.numerics.decomposition import Decomposition
 from loopcal.planning.options import Target
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
+
+FRAMES = (FITTED, BASE, RELATIVE)
+"""Frames in which a plan can state errors."""
 
 DIMENSIONS: dict[Target, Dimension] = {
     "pose": Dimension.LENGTH,
@@ -42,13 +54,13 @@ class Prediction:
     rotations, displacements : (k, 3, p) derivatives of its rotation [rad] and displacement [m] by
         the parameters in tolerances.
     size : makes rotations comparable with displacements [m].
-    frames : names of the frames whose rigid motions are left out.
+    frame : in which errors are stated.
     """
 
     rotations: FloatArray
     displacements: FloatArray
     size: float
-    frames: tuple[str, ...]
+    frame: ErrorFrame
 
     def __len__(self) -> int:
         return len(self.displacements)
@@ -70,24 +82,37 @@ class Prediction:
 
 
 def linearize_prediction(
-    free: FreeParameters, solution: Solution, observable: Decomposition
+    free: FreeParameters, solution: Solution, unfixed: FloatArray, frame: str = FITTED
 ) -> Prediction:
-    """Return how the tool's pose depends on the parameters.
+    """Return how the tool's pose depends on the parameters, in a frame.
 
     Parameters
     ----------
-    solution : the poses to predict. observable : of `decompose_information`.
+    solution : the poses to predict.
+    unfixed : (12, k) motions of frames that the measurements will not determine.
+    frame : "fitted": after the best rigid fit of these motions over the poses to predict; "base":
+        in the base frame of the robot file; "relative": relative to the home pose.
+
+    Raises
+    ------
+    EstimationError : no such frame.
     """
+    check_frame(frame, FRAMES)
     poses = observe_poses(free, solution.q)
-    tool_twists = transport(free.robot, poses.T[0], "base", "tool") @ poses.twists[0]
-    used, V = observable.used[0], observable.directions[0]
-    variance = np.where(used, 1.0, np.where(free.assumed.any(), np.inf, 1.0))
-    posterior = Posterior(free.robot, free.places, free.tolerance, V, variance, used)
-    motions = find_frame_motions(posterior)
-    # P removes rigid motions of frames from a deviation and leaves the rest as it is
-    P = V[:, used] @ V[:, used].T + motions.kept @ V[:, ~used].T
-    kept = tool_twists[poses.is_reached] @ P
-    return Prediction(kept[:, :3], kept[:, 3:], free.robot.size, motions.frames)
+    T, twists = poses.T[0, poses.is_reached], poses.twists[0, poses.is_reached]
+    followed = None
+    if frame == RELATIVE:
+        home = observe_poses(free, solve_home(free.robot).q)
+        own = np.zeros((6, 0))
+        followed = follow_pose(free.robot, home.T[0, 0], home.twists[0, 0], own, "home")
+    chosen = refer_errors(free.robot, frame, (T, twists), unfixed, followed)
+    if chosen.undetermined and free.assumed.any():
+        missing = int(free.assumed.sum())
+        raise EstimationError(
+            report_finding("plan.frame-unbounded", frames=chosen.undetermined, missing=missing)
+        )
+    kept = transport(free.robot, T, "base", "tool") @ chosen.relate(twists, T)
+    return Prediction(kept[:, :3], kept[:, 3:], free.robot.size, chosen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,11 @@ import numpy as np
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.fit_input import check_argument
+from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.inference.measured_frames import intersect_motions
 from loopcal.estimate.information import collect_information, count_equations
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.findings import report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators
 from loopcal.measure.array_checks import check_type
@@ -38,6 +41,7 @@ from loopcal.planning.pose_groups import (
     GroupRows,
     combine_prior,
     decompose_information,
+    find_group_motions,
     linearize_candidate_groups,
 )
 from loopcal.planning.prediction import ExpectedErrors, Prediction, linearize_prediction
@@ -250,6 +254,7 @@ def prepare_problem(
     if earlier is not None:
         observable = decompose_information(free, groups, earlier)
     to_predict = _select_predicted(candidates, options)
+    unfixed = _find_unfixed_motions(free, mounted, candidates, groups, options.measured)
     return PlanningProblem(
         free,
         mounted,
@@ -258,7 +263,7 @@ def prepare_problem(
         groups,
         combine_prior(free, groups, earlier),
         observable,
-        linearize_prediction(free, to_predict, observable),
+        linearize_prediction(free, to_predict, unfixed, options.frame),
         n_equations,
         tuple(dict.fromkeys([*labels, *options.used_names])),
     )
@@ -315,6 +320,23 @@ def _fold_measured(
     nuisance = int((table.free & np.isnan(table.tolerance)).sum())
     n_equations = max(count_equations(robot, measured) - nuisance, 0)
     return factor[0, :-1, :-1], n_equations, tuple(measured.labels)
+
+
+def _find_unfixed_motions(
+    free: FreeParameters,
+    mounted: Instrument,
+    candidates: Candidates,
+    groups: GroupRows,
+    measured: Measurements | None,
+) -> FloatArray:
+    """Return the motions (12, k) of frames that no measurement, earlier or new, determines."""
+    motions = find_group_motions(free, mounted, candidates.solution.q, groups.members)
+    if measured is None:
+        return motions
+    problem = problem_of(free, measured)
+    z = free.deviation(free.robot.values[None])
+    earlier = find_measured_frames(problem, measured, z, problem.start(z))
+    return intersect_motions(motions, earlier.unfixed)
 
 
 def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:

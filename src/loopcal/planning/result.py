@@ -116,11 +116,13 @@ class ErrorForecast:
     random : with as many poses drawn evenly, median of several draws; None where there are too few
         candidates.
     after : with the planned poses.
+    frame : point, axes and frame of these errors.
     """
 
     before: ExpectedErrors | None
     random: ExpectedErrors | None
     after: ExpectedErrors
+    frame: Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +232,7 @@ class Plan:
             counted=name_groups(self.poses.groups.shape[1]),
             target=target,
             reduction=share,
+            **self.errors.frame.data,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -245,6 +248,7 @@ class Plan:
             "figures": dict(self.quality.figures),
             "efficiency": self.quality.efficiency,
             "n_candidates": self.quality.n_candidates,
+            "frame": str(self.errors.frame),
             "expected": {k: None if e is None else dict(vars(e)) for k, e in forecast.items()},
             "path_length": poses.path_length,
             "seed": self.options.seed,

@@ -154,7 +154,7 @@ def _report(
     fit, fitted, held_out = result.fit, split.fitted, split.held_out
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count.begin("examining the residuals")
-    examination = examine_fit(fit, fitted, count.progress) if fit.converged else None
+    examination = examine_fit(fit, fitted, count.progress, options.frame) if fit.converged else None
     count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from loopcal.apply.validation_findings import check_limit
+from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, Posterior
 from loopcal.estimate.fit_input import check_argument
@@ -31,6 +32,8 @@ class CalibrationOptions:
     choose_model : free only as many parameters as held-out predictions justify.
     prior : the posterior of an earlier calibration of this machine; its knowledge is kept.
     free_limb : with `prior`: a limb that was repaired, which starts again from its tolerances.
+    frame : in which expected errors are stated: "fitted", "base", "relative", or the name of the
+        frame of an instrument, see `loopcal.pose_uncertainty`.
     check_conventions : refuse data that fit far better in another unit, order, sign or column; see
         `loopcal.check_conventions`. allow_still : accept targets that no pose moves.
 
@@ -48,6 +51,7 @@ class CalibrationOptions:
     choose_model: bool = False
     prior: Posterior | None = None
     free_limb: str | None = None
+    frame: str = FITTED
     check_conventions: bool = True
     allow_still: bool = False
 

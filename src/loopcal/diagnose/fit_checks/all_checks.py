@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck, check_clusters
 from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_correlated_groups
 from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimate_calibration_gain
@@ -60,7 +61,10 @@ class FitExamination:
 
 
 def examine_fit(
-    fit: Identification, data: Measurements, progress: Progress = report_no_progress
+    fit: Identification,
+    data: Measurements,
+    progress: Progress = report_no_progress,
+    frame: str = FITTED,
 ) -> FitExamination:
     """Examine a fit with the data it was made from.
 
@@ -68,6 +72,7 @@ def examine_fit(
     ----------
     fit : an identification. data : the measurements it was made from.
     progress : receives the progress of the search for outliers, which takes longest.
+    frame : in which expected errors are stated, see `choose_error_frame`.
     """
     check_fitted_data(fit, data)
     return FitExamination(
@@ -75,5 +80,5 @@ def examine_fit(
         check_lack_of_fit(fit, data),
         check_clusters(fit, data),
         find_correlated_groups(fit),
-        estimate_calibration_gain(fit, data),
+        estimate_calibration_gain(fit, data, frame),
     )

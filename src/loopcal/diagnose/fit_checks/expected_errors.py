@@ -2,10 +2,10 @@
 """Predict the gain of a calibration: pose errors expected from the tolerances, and after the fit.
 
 With D the error model at a pose in units of tolerance, the covariance of the pose is D D' before
-and D C D' after calibration, C the covariance of z. A direction that the data do not determine
-keeps its tolerance, because its estimate is the nominal value. Where the noise is as large as the
-effect of the tolerances, the error after calibration is no smaller, and another instrument is
-needed.
+and D C D' after calibration, C the covariance of z. Both refer to one frame, see
+`loopcal.diagnose.error_frames`. A direction that the data do not determine keeps its tolerance,
+because its estimate is the nominal value. Where the noise is as large as the effect of the
+tolerances, the error after calibration is no smaller, and another instrument is needed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from loopcal import geometry
+from loopcal.diagnose.error_frames import FITTED, choose_error_frame, solve_home
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
@@ -56,13 +58,21 @@ class CalibrationGain:
         return content
 
 
-def estimate_calibration_gain(fit: Identification, data: Measurements) -> CalibrationGain:
+def estimate_calibration_gain(
+    fit: Identification, data: Measurements, frame: str = FITTED
+) -> CalibrationGain:
     """Compare the errors expected after calibration with those that the tolerances allow.
 
     Parameters
     ----------
     fit : an identification; its tolerances must be stated. data : the measurements it was made
         from, or other readings.
+    frame : in which the errors are stated, see `loopcal.diagnose.choose_error_frame`; "relative"
+        means relative to the home pose.
+
+    Raises
+    ------
+    EstimationError : no such frame.
     """
     free = fit.free_parameters
     if free.assumed.any():
@@ -75,21 +85,26 @@ def estimate_calibration_gain(fit: Identification, data: Measurements) -> Calibr
     state = forward_trials(fit.robot, values, readings)
     reached = np.asarray(state.status == Status.CONVERGED)[0]
     parameters = differentiate_pose(fit.robot, values, readings, state).parameters
-    D = parameters[0, reached][..., free.places]
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
     posterior = fit.posterior
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
-    factor = posterior.unit[:, None] * posterior.directions * np.sqrt(variance)
+    factor = posterior.directions * np.sqrt(variance)
     if not reached.any() or np.isnan(factor).any():
         return _unpredicted("model.gain-without-intervals")
-    angle_before, position_before = _rms_errors(D * free.tolerance)
-    angle_after, position_after = _rms_errors(D @ factor)
+    T = state.T[0, reached]
+    chosen_frame = choose_error_frame(posterior, frame, solve_home(fit.robot), "home")
+    H = geometry.transport_matrix(T[:, :3, :3] @ fit.robot.tool[:3, 3])
+    D = parameters[0, reached][..., free.places] * posterior.unit
+    D, own = H @ chosen_frame.relate(D, T), H @ chosen_frame.own_errors(T)
+    angle_before, position_before = _rms_errors(D * (free.tolerance / posterior.unit))
+    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, own], axis=2))
     pairs = ((position_before, position_after), (angle_before, angle_after))
     is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)
     finding = report_finding(
         "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
         position=_quantities(fit.robot, Dimension.LENGTH, *pairs[0]),
         orientation=_quantities(fit.robot, Dimension.ANGLE, *pairs[1]),
+        **chosen_frame.describe().data,
     )
     return CalibrationGain(
         position_before, position_after, angle_before, angle_after, is_worthwhile, finding

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.inference.measured_frames import MeasuredFrames, frames_from_arrays
 from loopcal.estimate.inference.residual_test import ResidualTest
 from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.findings import report_finding
@@ -38,6 +39,8 @@ class Posterior:
     variance : (p,) of each direction; infinite for unknown ones, NaN without intervals.
     determined : (p,) True for directions that the rows determine; of the others at most a prior is
         known.
+    frames : which frames the measurements determine; None where it is not known, as in run folders
+        of earlier versions.
     """
 
     robot: Mechanism
@@ -46,6 +49,7 @@ class Posterior:
     directions: FloatArray
     variance: FloatArray
     determined: BoolArray
+    frames: MeasuredFrames | None = None
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -64,12 +68,13 @@ class Posterior:
         """(p,) estimates [SI]."""
         return self.robot.values[self.places]
 
-    def arrays(self) -> dict[str, FloatArray]:
+    def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `posterior_from_arrays` reads."""
-        return {
+        own = {
             PREFIX + name: np.asarray(getattr(self, attribute))
             for name, attribute in STORED.items()
         }
+        return own if self.frames is None else {**own, **self.frames.arrays()}
 
 
 def compute_posterior(
@@ -79,6 +84,7 @@ def compute_posterior(
     decomposition: Decomposition,
     penalty: FloatArray,
     noise: float = 1.0,
+    frames: MeasuredFrames | None = None,
 ) -> Posterior:
     """Return the posterior of trial 0 of a decomposition.
 
@@ -86,7 +92,7 @@ def compute_posterior(
     ----------
     robot : at the estimate. places, tolerance : (p,) of the free parameters.
     decomposition, penalty : of the fit; columns scaled by tolerance.
-    noise : variance of the whitened rows.
+    noise : variance of the whitened rows. frames : which frames the measurements determine.
     """
     directions, variance, determined = decomposition.knowledge(penalty, noise)
     return Posterior(
@@ -96,6 +102,7 @@ def compute_posterior(
         directions=directions,
         variance=variance,
         determined=determined,
+        frames=frames,
     )
 
 
@@ -142,4 +149,5 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         raise EstimationError(
             report_finding("prior.other-count", identified=len(unit), free=len(places))
         )
-    return Posterior(robot, places, unit, directions, variance, determined.astype(bool))
+    frames = frames_from_arrays(arrays)
+    return Posterior(robot, places, unit, directions, variance, determined.astype(bool), frames)

@@ -43,12 +43,15 @@ class Prior:
     ----------
     names : (p,) parameters. mean, unit : (p,) [SI]; `unit` makes columns comparable.
     rows : (r, p) B [1 / SI].
+    unfixed : (12, k) motions of frames that the earlier measurements do not determine, see
+        `MeasuredFrames`; None where it is not known.
     """
 
     names: tuple[str, ...]
     mean: FloatArray
     unit: FloatArray
     rows: FloatArray
+    unfixed: FloatArray | None = None
 
     def __repr__(self) -> str:
         """Return the numbers of rows and parameters."""
@@ -75,7 +78,7 @@ class Prior:
         more, center = np.zeros((len(names), len(self.names))), self.mean.copy()
         more[np.arange(len(names)), places] = 1.0 / tolerance
         center[places] = mean
-        return Prior(self.names, center, self.unit, np.concatenate([self.rows, more]))
+        return replace(self, mean=center, rows=np.concatenate([self.rows, more]))
 
 
 class WithPrior:
@@ -165,7 +168,8 @@ def prior_from(earlier: Posterior) -> Prior:
     known = np.isfinite(earlier.variance)
     whitening = np.diag(1.0 / np.sqrt(np.where(known, earlier.variance, 1.0)))[known]
     rows = np.linalg.solve(earlier.directions.T, whitening.T).T / earlier.unit
-    return Prior(earlier.names, np.array(earlier.estimate), earlier.unit, rows)
+    unfixed = None if earlier.frames is None else earlier.frames.unfixed
+    return Prior(earlier.names, np.array(earlier.estimate), earlier.unit, rows, unfixed)
 
 
 def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:

@@ -212,6 +212,16 @@ def plan_elimination(
     return NuisanceElimination(local, tree, is_free, is_free & ~np.isnan(local.table.tolerance))
 
 
+def list_members(
+    nuisance: NuisanceElimination | None, rows: ObservationRows
+) -> tuple[NodeMembers, ...]:
+    """Return the rows of a kind by nodes; all are of the machine without nuisance parameters."""
+    if nuisance is not None:
+        return nuisance.members(rows)
+    numbers = np.arange(len(rows.poses))
+    return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
+
+
 def divide_among_nodes(
     kind: KindRows, members: Iterable[NodeMembers], tree: EliminationTree | None
 ) -> list[NodeRows]:

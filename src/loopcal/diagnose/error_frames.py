@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames in which errors of poses are stated: the one place that refers a pose error to a frame.
+
+With D (6, p) the twist of a pose by the parameters and M (6, 12) that by motions of the base and
+platform frames, the error of a pose in any of these frames is
+
+    D de - M (G de + K eta)
+
+    fitted        G = N pinv(A) D_ref, A = M_ref N: what is left after the best rigid fit of the
+                  motions N that the measurements do not determine, over the reference poses
+    base          G = 0: the base frame of the robot file
+    an instrument G de + K eta is the error of its frame, with independent errors eta of variance 1
+    relative      G takes the error of the first pose away, as a motion of the base
+
+In the last two, motions of the platform that the measurements do not determine are fitted, too.
+Rotations are multiplied by the robot's size in the fit, and displacements are those of the tool.
+Derivation: docs/theory/gauge.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.diagnose.frame_motions import find_frame_motions, probe_readings, twist_weights
+from loopcal.errors import EstimationError, suggest_names
+from loopcal.estimate.frame_freedoms import MOTIONS, frame_twists
+from loopcal.estimate.inference.measured_frames import InstrumentFrame
+from loopcal.estimate.inference.posterior import Posterior
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    Status,
+    compute_readings,
+    differentiate_pose,
+    forward,
+    forward_trials,
+)
+from loopcal.typing import FloatArray
+
+FITTED, BASE, RELATIVE = "fitted", "base", "relative"
+"""Frames that exist for every calibration; the others are the names of its instruments' frames."""
+
+FIT_TOLERANCE = 1e-8
+"""Singular values of the motions of frames, relative to the largest, up to which a motion does not
+move the reference poses, or the errors do not contain it: the square root of double rounding.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorFrame:
+    """A frame in which errors of poses are stated.
+
+    Attributes
+    ----------
+    name : "fitted", "base", "relative", or the name of the frame of an instrument.
+    size : of the robot [m]. by_parameters : (12, p) G. own : (12, k) K.
+    fitted : frames of which motions are fitted: (), ("base",), ("platform",) or both.
+    undetermined : frames that the measurements do not determine, and that are not fitted.
+    origin : name of the pose to which others are relative; "" in other frames.
+    """
+
+    name: str
+    size: float
+    by_parameters: FloatArray
+    own: FloatArray
+    fitted: tuple[str, ...] = ()
+    undetermined: tuple[str, ...] = ()
+    origin: str = ""
+
+    def relate(self, twists: FloatArray, T: FloatArray) -> FloatArray:
+        """Return twists (n, 6, p) of poses T (n, 4, 4) by the parameters, relative to the frame."""
+        return twists - frame_twists(T, self.size) @ self.by_parameters
+
+    def own_errors(self, T: FloatArray) -> FloatArray:
+        """Return twists (n, 6, k) of poses by errors of the frame itself, of variance 1."""
+        return -frame_twists(T, self.size) @ self.own
+
+    def describe(self, point: str = "tool", axes: str = "base") -> Finding:
+        """Return point, axes and frame in words."""
+        return report_finding(
+            "accuracy.frame",
+            point=point,
+            axes=axes,
+            frame=self.name,
+            fitted=self.fitted,
+            undetermined=self.undetermined,
+            origin=self.origin,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFit:
+    """The best rigid fit of some motions of frames over m reference poses.
+
+    Attributes
+    ----------
+    poses : (m, 4, 4). motions : (12, k) those that move these poses. size : of the robot [m].
+    solution : (12, 6 m) motion that fits stacked twists of these poses best.
+    """
+
+    poses: FloatArray
+    motions: FloatArray
+    size: float
+    solution: FloatArray
+
+    def __call__(self, twists: FloatArray) -> FloatArray:
+        """Return the motions (12, r) that fit twists (m, 6, r) of the reference poses best."""
+        return self.solution @ twists.reshape(self.solution.shape[1], -1)
+
+    def remove(self, twists: FloatArray, T: FloatArray, reference: FloatArray) -> FloatArray:
+        """Return errors (t, n, 6) of t machines at poses T (n, 4, 4) without the motions that fit
+        their errors `reference` (t, m, 6) at the reference poses best.
+        """
+        motion = self(np.moveaxis(reference, 0, -1))
+        return twists - np.moveaxis(frame_twists(T, self.size) @ motion, -1, 0)
+
+
+def fit_frames(robot: Mechanism, T: FloatArray, motions: FloatArray) -> FrameFit:
+    """Return the best fit of motions (12, k) over reference poses T (m, 4, 4).
+
+    Rotations count times the robot's size, and displacements are those of the tool.
+    """
+    arm, m = T[:, :3, :3] @ robot.tool[:3, 3], len(T)
+    weight = twist_weights(robot)[:, None] * geometry.transport_matrix(arm)
+    by_frames = (weight @ frame_twists(T, robot.size)).reshape(6 * m, MOTIONS)
+    u, s, vt = np.linalg.svd(by_frames @ motions, full_matrices=False)
+    # where the orientation is constant, opposite motions of both frames move nothing
+    used = s > FIT_TOLERANCE * np.linalg.norm(by_frames)
+    moving = motions @ vt[used].T
+    inverse = (u[:, used] / s[used]).T.reshape(-1, m, 1, 6)
+    return FrameFit(T, moving, robot.size, moving @ np.matmul(inverse, weight).reshape(-1, 6 * m))
+
+
+def fit_unfixed_frames(posterior: Posterior) -> FrameFit:
+    """Return the fit of the motions of frames that a calibration does not determine, over its
+    measured poses.
+    """
+    T, _ = reference_poses(posterior)
+    return fit_frames(posterior.robot, T, list_unfixed_motions(posterior))
+
+
+def choose_error_frame(
+    posterior: Posterior,
+    frame: str = FITTED,
+    origin: Solution | None = None,
+    origin_name: str = "1",
+) -> ErrorFrame:
+    """Return a frame for the errors of poses of a calibrated robot.
+
+    Parameters
+    ----------
+    frame : "fitted" fits the motions of the base and platform frames that the measurements do not
+        determine, and is the base frame of the robot file where they determine all; "base" is that
+        base frame in any case; "relative" is the first pose; the name of the frame of an
+        instrument, such as "tracker", is that frame.
+    origin : pose (1,) of the calibrated robot to which others are relative. origin_name : its name.
+
+    Raises
+    ------
+    EstimationError : no such frame (the text lists those that exist), or an unreachable origin.
+    """
+    robot = posterior.robot
+    instruments = {} if posterior.frames is None else posterior.frames.instruments
+    check_frame(frame, (FITTED, BASE, RELATIVE, *instruments))
+    reference, motions = reference_poses(posterior), list_unfixed_motions(posterior)
+    if frame in (FITTED, BASE):
+        return refer_errors(robot, frame, reference, motions)
+    if frame != RELATIVE:
+        followed = _follow_instrument(posterior, instruments[frame])
+        return refer_errors(robot, frame, reference, motions, followed)
+    if origin is None or not origin.converged.all():
+        raise EstimationError(
+            f"errors cannot be relative to pose {origin_name!r}, which the robot does not reach; "
+            "use another pose, or another frame"
+        )
+    S = differentiate_pose(robot, robot.values[None], origin.q[None], origin.state)
+    sigma = np.array([actuator.sigma or 0.0 for actuator in robot.actuators])
+    twists = S.parameters[0, 0][:, posterior.places] * posterior.unit
+    by_readings = (S.readings[0, 0] * sigma)[:, sigma > 0.0]
+    followed = follow_pose(robot, origin.T[0], twists, by_readings, origin_name)
+    return refer_errors(robot, RELATIVE, reference, motions, followed)
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedMotion:
+    """Motions of both frames that a pose or an instrument makes, to which errors are relative.
+
+    Attributes
+    ----------
+    by_frames : (12, 12) by motions of the base and platform frames. by_parameters : (12, p).
+    own : (12, k) by errors of its own, of variance 1. name : of the pose; else "".
+    """
+
+    by_frames: FloatArray
+    by_parameters: FloatArray
+    own: FloatArray
+    name: str = ""
+
+
+def refer_errors(
+    robot: Mechanism,
+    frame: str,
+    reference: tuple[FloatArray, FloatArray],
+    motions: FloatArray,
+    followed: FollowedMotion | None = None,
+) -> ErrorFrame:
+    """Return the frame in which errors are stated.
+
+    Parameters
+    ----------
+    reference : poses (m, 4, 4) over which frames are fitted, and their twists (m, 6, p).
+    motions : (12, k) that the measurements do not determine; those that `followed` leaves are
+        fitted, unless the frame is "base".
+    """
+    T, twists = reference
+    p = twists.shape[2]
+    nothing = FollowedMotion(
+        np.zeros((MOTIONS, MOTIONS)), np.zeros((MOTIONS, p)), np.zeros((MOTIONS, 0))
+    )
+    begin = followed or nothing
+    M = frame_twists(T, robot.size)
+    fit = fit_frames(robot, T, motions - begin.by_frames @ motions)
+    extra = fit(twists - M @ begin.by_parameters)
+    moved = _moved_frames(fit, extra, twists)
+    if frame == BASE or not moved:
+        undetermined = moved if frame == BASE else ()
+        return ErrorFrame(
+            frame, robot.size, begin.by_parameters, begin.own, (), undetermined, begin.name
+        )
+    by_parameters, own = begin.by_parameters + extra, begin.own - fit(M @ begin.own)
+    return ErrorFrame(frame, robot.size, by_parameters, own, moved, (), begin.name)
+
+
+def follow_pose(
+    robot: Mechanism, T: FloatArray, twists: FloatArray, own: FloatArray, name: str
+) -> FollowedMotion:
+    """Return the motions of the base that move a pose T (4, 4) like motions of both frames, like
+    its twists (6, p) by the parameters, and like its own errors (6, k).
+    """
+    M = frame_twists(T, robot.size)
+    motions = [np.linalg.solve(M[:, :6], columns) for columns in (M, twists, own)]
+    return FollowedMotion(*(_as_base_motion(motion) for motion in motions), name)
+
+
+def _follow_instrument(posterior: Posterior, frame: InstrumentFrame) -> FollowedMotion:
+    """Return the motions of the base that move it like the frame of an instrument."""
+    of_frame = frame_twists(frame.T, posterior.robot.size)[:, :6]
+    moved = [
+        np.linalg.solve(of_frame, twists)
+        for twists in (frame.by_parameters * posterior.unit, frame.own)
+    ]
+    by_frames = np.diag(np.repeat([1.0, 0.0], 6))
+    return FollowedMotion(by_frames, *(_as_base_motion(motion) for motion in moved))
+
+
+def solve_home(robot: Mechanism) -> Solution:
+    """Return the home pose (1,) of a robot, to which errors may be relative."""
+    return forward(robot, compute_readings(robot, robot.values[None], robot.home_state)[0])
+
+
+def check_frame(frame: str, allowed: Sequence[str]) -> None:
+    """Raise EstimationError for a frame that does not exist."""
+    if frame not in allowed:
+        raise EstimationError(
+            f"frame is {frame!r}{suggest_names(frame, allowed)}; it must be one of "
+            f"{', '.join(map(repr, allowed))}"
+        )
+
+
+def list_unfixed_motions(posterior: Posterior) -> FloatArray:
+    """Return an orthonormal basis (12, k) of the motions of frames that a fit does not determine.
+
+    They are those of its measurements, and those of the directions that it does not determine.
+    """
+    known = np.zeros((MOTIONS, 0)) if posterior.frames is None else posterior.frames.unfixed
+    if posterior.determined.all():
+        return known
+    moved = find_frame_motions(posterior).motions
+    u, s, _ = np.linalg.svd(np.concatenate([known, moved], axis=1), full_matrices=False)
+    return u[:, s > FIT_TOLERANCE]
+
+
+def reference_poses(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
+    """Return the poses (m, 4, 4) over which frames are fitted, and their twists (m, 6, p).
+
+    They are the measured poses; poses about home where a run folder does not name these.
+    """
+    robot, frames = posterior.robot, posterior.frames
+    readings = probe_readings(robot)
+    if frames is not None and len(frames.readings):
+        readings = frames.readings
+    state = forward_trials(robot, robot.values[None], readings[None])
+    reached = state.status[0] == Status.CONVERGED
+    D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
+    usable = reached & np.isfinite(D).all(axis=(1, 2))
+    return state.T[0, usable], D[usable][:, :, posterior.places] * posterior.unit
+
+
+def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:
+    """Return which frames a motion (12, p) that fits twists (m, 6, p) moves: the fewest."""
+    M = frame_twists(fit.poses, fit.size)
+    weight = np.array([fit.size] * 3 + [1.0] * 3)[:, None]
+    moved = (weight * (M @ motion)).reshape(6 * len(M), -1)
+    length = np.linalg.norm(moved)
+    if not length > FIT_TOLERANCE * np.linalg.norm(weight * twists):
+        return ()
+    for name, columns in (("base", slice(0, 6)), ("platform", slice(6, 12))):
+        of_frame = (weight * M[:, :, columns]).reshape(6 * len(M), -1)
+        left = moved - of_frame @ np.linalg.lstsq(of_frame, moved, rcond=FIT_TOLERANCE)[0]
+        if np.linalg.norm(left) <= FIT_TOLERANCE * length:
+            return (name,)
+    return ("base", "platform")
+
+
+def _as_base_motion(motion: FloatArray) -> FloatArray:
+    """Return a motion (6, ..) of the base as one of both frames (12, ..)."""
+    return np.concatenate([motion, np.zeros_like(motion)])

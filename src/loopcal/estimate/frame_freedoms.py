@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions of the base and platform frames that measurements do not determine.
+
+Let M (6, 12) be the twist of a pose by a motion g of the two frames, J the derivative of a measured
+row by that twist, and F that by the setup parameters (frames, targets, surfaces, offsets). A motion
+g that solves `J M g + F b = 0` for all rows, with any b, changes no measured value. The solutions
+are the null space of what is left of J M once F is eliminated. A setup parameter with a stated
+tolerance adds its row; tolerances of the machine do not. See docs/theory/gauge.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import cast
+
+import numpy as np
+
+from loopcal import engine, geometry
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.measured_frames import (
+    InstrumentFrame,
+    MeasuredFrames,
+    intersect_motions,
+)
+from loopcal.estimate.inference.prior import Prior
+from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.nuisance.elimination import (
+    EliminatedNuisance,
+    divide_among_nodes,
+    fold_node_rows,
+    list_members,
+)
+from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_rows
+from loopcal.estimate.problem import Problem
+from loopcal.measure import Measurements, NuisanceParameters
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.numerics.decomposition import empty_factor
+from loopcal.numerics.tree_elimination import NodeFactors
+from loopcal.typing import FloatArray, IntArray
+
+MOTIONS = 12
+"""Numbers of a motion of both frames: (w, c) of the base, then (w, c) of the platform."""
+
+UNFIXED = 1e-8
+"""Share of the largest effect on the measured rows up to which a motion of a frame has none: the
+square root of double rounding.
+"""
+
+MOST_READINGS = 200
+"""Largest number of measured poses that are kept with a fit."""
+
+
+def frame_twists(T: FloatArray, size: float) -> FloatArray:
+    """Return the twists (.., 6, 12) of poses T (.., 4, 4) by motions of the two frames [m].
+
+    Rotations of the frames are multiplied by the robot's `size`, so that all twelve numbers are
+    lengths; see `geometry.differentiate_by_frames`.
+    """
+    unit = np.array([1.0 / size] * 3 + [1.0] * 3)
+    return geometry.differentiate_by_frames(T) * np.r_[unit, unit]
+
+
+def find_unfixed_motions(
+    problem: Problem, T: FloatArray, joints: Mapping[str, FloatArray], nuisance: FloatArray | None
+) -> FloatArray:
+    """Return an orthonormal basis (12, k) of the motions of frames that change no measured value.
+
+    Parameters
+    ----------
+    problem : of one machine. T : (n, 4, 4) its poses. joints : name -> (1, n) values [SI].
+    nuisance : (1, U) values of the setup parameters; None without any.
+    """
+    by_frames = frame_twists(T, problem.free.robot.size)[None]
+    poses = LinearizedPoses(T[None], np.ones((1, len(T)), dtype=bool), by_frames, joints)
+    elimination, parts, effect = problem.nuisance, [], 0.0
+    tree = None if elimination is None else elimination.tree
+    for rows in problem.rows:
+        if len(rows.poses):
+            kind = linearize_rows(rows, poses, np.zeros(1, dtype=np.int64), nuisance)
+            effect = float(np.hypot(effect, np.linalg.norm(kind.by_parameters)))
+            parts += divide_among_nodes(kind, list_members(elimination, rows), tree)
+    factors = None if tree is None else NodeFactors(tree, 1, MOTIONS)
+    factor = fold_node_rows(empty_factor(1, MOTIONS), factors, parts)
+    if elimination is not None and factors is not None and nuisance is not None:
+        factor = engine.fold(factor, elimination.eliminate(factors, nuisance)[1])
+    return unfixed_motions(factor, effect)
+
+
+def unfixed_motions(factor: FloatArray, effect: float) -> FloatArray:
+    """Return the null space (12, k) of a triangular factor (1, 13, 13) of rows by frame motions.
+
+    `effect` is the length of these rows before setup parameters were eliminated, of which
+    UNFIXED or less is rounding.
+    """
+    _, s, vt = np.linalg.svd(factor[0, :MOTIONS, :MOTIONS])
+    return vt[s <= UNFIXED * effect].T
+
+
+def find_measured_frames(
+    problem: Problem,
+    data: Measurements,
+    deviation: FloatArray,
+    start: Start,
+    prior: Prior | None = None,
+    linearization: Linearization | None = None,
+    noise: float = 1.0,
+) -> MeasuredFrames:
+    """Return how the measurements of one machine determine frames, at deviation (1, p).
+
+    Parameters
+    ----------
+    problem, data : measurements. start : near the poses and setup parameters.
+    prior : an earlier calibration, which may determine frames that these measurements do not.
+    linearization : there; without it the frames of the instruments are not described.
+    noise : variance of the whitened rows.
+    """
+    readings = data.readings
+    if len(readings) > MOST_READINGS:
+        readings = readings[np.linspace(0, len(readings) - 1, MOST_READINGS).astype(int)]
+    readings = readings[np.isfinite(readings).all(axis=1)]
+    located = problem.poses.locate(deviation, start)
+    if located is None:
+        return MeasuredFrames(np.zeros((MOTIONS, 0)), readings)
+    nuisance = None if problem.nuisance is None else start.nuisance
+    unfixed = find_unfixed_motions(problem, *located, nuisance)
+    if prior is not None and prior.unfixed is not None:
+        unfixed = intersect_motions(unfixed, prior.unfixed)
+    eliminated = None if linearization is None else linearization.nuisance
+    local = None if problem.nuisance is None else problem.nuisance.local
+    frames = _describe_instruments(problem.free, data, local, eliminated, noise)
+    return MeasuredFrames(unfixed, readings, frames)
+
+
+def _describe_instruments(
+    free: FreeParameters,
+    data: Measurements,
+    local: NuisanceParameters | None,
+    eliminated: EliminatedNuisance | None,
+    noise: float,
+) -> dict[str, InstrumentFrame]:
+    """Return the frames in which the kinds of measurements measure."""
+    frames: dict[str, InstrumentFrame] = {}
+    for name, stated, is_unknown in _list_frames(data):
+        if not is_unknown:
+            nothing = np.zeros((6, len(free)))
+            frames[name] = InstrumentFrame(stated, nothing, np.zeros((6, 6)))
+        elif local is not None and eliminated is not None:
+            axes = (*setup.ROTATION_AXES, *setup.POSITION_AXES)
+            places = np.array([local.table.index(f"{name}.{axis}") for axis in axes])
+            frames[name] = _describe_unknown(stated, places, eliminated, free, noise)
+    return frames
+
+
+def _list_frames(data: Measurements) -> Iterable[tuple[str, FloatArray, bool]]:
+    """Return name, stated T_base_frame (4, 4) and whether it is unknown of each complete frame."""
+    listed: dict[str, tuple[FloatArray, bool]] = {}
+    for rows in data.observations:
+        name, stated = getattr(rows.kind, "frame", None), getattr(rows.kind, "T_base_frame", None)
+        item = rows.kind.possible_setup.get("frame")
+        if name is None or stated is None or item is None or len(item.parameters) != 6:
+            continue
+        is_unknown = "frame" in rows.kind.unknown
+        for session in np.unique(rows.session).tolist():
+            full = f"{session}.{name}" if session else name
+            listed[full] = (cast(FloatArray, stated), is_unknown)
+    return [(name, *parts) for name, parts in listed.items()]
+
+
+def _describe_unknown(
+    stated: FloatArray,
+    places: IntArray,
+    eliminated: EliminatedNuisance,
+    free: FreeParameters,
+    noise: float,
+) -> InstrumentFrame:
+    """Return a frame whose six parameters have these places among the setup parameters."""
+    values = eliminated.best[0, places]
+    L = setup.linearize_frame(values)
+    elimination = eliminated.elimination
+    nodes = elimination.tree.node[places]
+    own = np.zeros((6, 6))
+    if (nodes >= 0).any():
+        node = np.array([int(nodes.max())])
+        path, root, _ = elimination.at_nodes(node)
+        rows = np.zeros((6, root.shape[-1]))
+        for i, place in enumerate(places):
+            match = np.flatnonzero(path[0] == place)
+            if len(match):
+                rows[i] = root[0, match[0]]
+        triangle = np.linalg.qr(rows.T, mode="r")
+        own[:, : len(triangle)] = triangle.T
+    slope = elimination.slope[0, places] / free.tolerance
+    T = setup.place_frame(stated, values)
+    return InstrumentFrame(T, L @ slope, np.sqrt(noise) * (L @ own))
