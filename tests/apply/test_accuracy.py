@@ -107,11 +107,11 @@ def test_size_of_pose_uncertainty_does_not_depend_on_the_axes(fit):
 
 
 def test_uncertainty_without_torsion_is_infinite_about_the_normal_only(fit_5):
-    result = pose_uncertainty(fit_5, TEST_POSES, "platform", gauge="infinite", point="platform")
+    result = pose_uncertainty(fit_5, TEST_POSES, "platform", frame="base", point="platform")
     assert np.array_equal(
         np.isinf(result.sd), np.tile([False, False, True, False, False, False], (5, 1))
     )
-    in_base = pose_uncertainty(fit_5, TEST_POSES, "base", gauge="infinite", point="platform")
+    in_base = pose_uncertainty(fit_5, TEST_POSES, "base", frame="base", point="platform")
     assert np.isinf(
         in_base.sd[:, :3]
     ).all()  # tilted poses: the normal has a part along each axis of the base
@@ -122,8 +122,8 @@ def test_rotation_of_the_platform_frame_is_left_out_and_reported(fit_5):
     result = pose_uncertainty(fit_5, TEST_POSES)
     assert np.isfinite(result.sd).all()
     assert result.reference.code == "accuracy.frame"
-    assert result.reference.data["frames"] == ("platform",)
-    assert result.reference.data["count"] == 1
+    assert result.reference.data["fitted"] == ("platform",)
+    assert "after the best rigid fit of the platform frame" in result.frame
 
 
 def make_base_unobservable(fit, extra=None):
@@ -154,7 +154,7 @@ def test_unknown_base_gives_six_rigid_motions_of_the_base_frame(fit):
     assert (motions.count, motions.frames) == (6, ("base",))
     assert np.abs(motions.kept).max() < 1e-9
     assert np.isfinite(pose_uncertainty(known, TEST_POSES).sd).all()
-    assert np.isinf(pose_uncertainty(known, TEST_POSES, gauge="infinite").sd).all()
+    assert np.isinf(pose_uncertainty(known, TEST_POSES, frame="base").sd).all()
 
 
 def test_unobservable_leg_length_keeps_infinite_uncertainty(fit):
@@ -166,9 +166,7 @@ def test_unobservable_leg_length_keeps_infinite_uncertainty(fit):
 def test_frame_known_from_its_prior_alone_is_left_out(fit):
     known = make_base_unobservable(fit)
     with_prior = replace(known, variance=np.where(known.determined, known.variance, 1.0))
-    left_out, kept = (
-        pose_uncertainty(with_prior, TEST_POSES, gauge=g) for g in ("left out", "infinite")
-    )
+    left_out, kept = (pose_uncertainty(with_prior, TEST_POSES, frame=f) for f in ("fitted", "base"))
     np.testing.assert_allclose(left_out.sd, pose_uncertainty(known, TEST_POSES).sd, rtol=1e-9)
     assert (kept.position > 5 * left_out.position).all()
 
@@ -184,9 +182,12 @@ def test_unreachable_poses_have_nan_uncertainty(fit):
 
 def test_unknown_frame_option_is_refused(fit):
     with pytest.raises(
-        EstimationError, match="frame is 'world'; it must be one of 'base', 'platform'"
+        EstimationError, match="axes is 'world'; it must be one of 'base', 'platform'"
     ):
         pose_uncertainty(fit, TEST_POSES, "world")  # pyright: ignore[reportArgumentType]
+    names = "it must be one of 'fitted', 'base', 'relative', 'frame'"
+    with pytest.raises(EstimationError, match=f"frame is 'world'.*; {names}"):
+        pose_uncertainty(fit, TEST_POSES, frame="world")
 
 
 def test_accuracy_map_marks_extrapolated_poses():

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.diagnose import twist_weights
+from loopcal.diagnose.error_frames import FITTED, fit_unfixed_frames
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
@@ -81,7 +82,8 @@ class Compensation:
     readings : (n, a) of the actuators at the targets [m, rad].
     commands : (n, c) coordinates to command [m, rad]; None where readings are set.
     wanted, reached : (n, 4, 4) platform poses; `reached` is that of the identified robot.
-    before : (n, 6) error of the machine when its controller commands the target unchanged.
+    before : (n, 6) error of the machine when its controller commands the target unchanged, in the
+        frame of `uncertainty` where that is "fitted", else in the base frame.
     remaining : (n, 6) error after compensation. not_compensable : (n, 6) the part of it that no
         reading can remove.
     residual_position, residual_orientation : (steps + 1, n) [m], [rad] distance from the best
@@ -159,6 +161,7 @@ def compensate(
     steps: int = 3,
     labels: tuple[str, ...] = (),
     progress: Progress = report_no_progress,
+    frame: str = FITTED,
 ) -> Compensation:
     """Compute readings or shifted commands for targets.
 
@@ -166,14 +169,13 @@ def compensate(
     ----------
     fit : the identification, the posterior of a run folder (both give uncertainties), or a
         calibrated robot.
-    targets : (n, 4, 4) T_base_platform or (n, c) controlled coordinates [m, rad]. For freedoms that
-        a target in coordinates does not state, the wanted pose is that of the controller's
-        geometry.
+    targets : (n, 4, 4) T_base_platform or (n, c) controlled coordinates [m, rad]. Freedoms that
+        coordinates do not state have the values that the controller's geometry gives them.
     mode : "readings" to set the actuators, "commands" for a controller whose geometry cannot be
         changed.
     controller : that geometry; default: the nominal robot. steps : fixed-point steps of "commands".
-    labels : of the targets; default "1", "2", ... progress : receives the passes over all targets
-        that are done.
+    labels : of the targets; default "1", "2", ... progress : receives the passes that are done.
+    frame : of the uncertainty, see `pose_uncertainty`; "relative": to the first target.
 
     Returns
     -------
@@ -182,11 +184,12 @@ def compensate(
     Raises
     ------
     DataError : unknown mode, no step, targets of another shape.
+    EstimationError : no such frame.
     """
     check_argument(fit, "fit", Identification, Posterior, Mechanism)
     _check_settings(mode, steps)
     source = fit.posterior if isinstance(fit, Identification) else fit
-    robot = source if isinstance(source, Mechanism) else source.robot
+    robot, posterior = (source, None) if isinstance(source, Mechanism) else (source.robot, source)
     old = controller or robot.nominal
     count = StepCounter(progress, PASSES + (steps if mode == "commands" else 0))
     count.begin(TASK)
@@ -203,11 +206,16 @@ def compensate(
     else:
         result = _shift_commands(robot, old, uncorrected, best, steps, count)
     count.begin(TASK)
-    final = result.final
+    final, distances = result.final, result.distances
     not_compensable = geometry.pose_difference(best.T, wanted)
+    names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
+    uncertainty = None
+    if posterior is not None:
+        uncertainty = pose_uncertainty(posterior, final, frame=frame, origin_name=names[0])
+        before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
     return Compensation(
         mode=mode,
-        labels=tuple(labels) or tuple(str(i + 1) for i in range(len(wanted))),
+        labels=names,
         robot=robot,
         controller=old,
         readings=final.q,
@@ -217,11 +225,28 @@ def compensate(
         before=before,
         remaining=geometry.pose_difference(final.T, wanted),
         not_compensable=not_compensable,
-        residual_position=np.linalg.norm(result.distances[..., 3:], axis=2),
-        residual_orientation=np.linalg.norm(result.distances[..., :3], axis=2),
-        uncertainty=None if isinstance(source, Mechanism) else pose_uncertainty(source, final),
+        residual_position=np.linalg.norm(distances[..., 3:], axis=2),
+        residual_orientation=np.linalg.norm(distances[..., :3], axis=2),
+        uncertainty=uncertainty,
         findings=_report_targets(robot, uncorrected, best, result, not_compensable),
     )
+
+
+def _remove_unfixed_frames(
+    posterior: Posterior, controller: Mechanism, T: FloatArray, errors: FloatArray, frame: str
+) -> FloatArray:
+    """Return errors (n, 6) at poses T (n, 4, 4), in the frame "fitted" after the best rigid fit of
+    frames that the measurements do not determine, over the measured poses.
+    """
+    frames = fit_unfixed_frames(posterior)
+    if frame != FITTED or not frames.motions.shape[1]:
+        return errors
+    commanded = inverse(controller, frames.poses)
+    reached = forward(posterior.robot, commanded.q)
+    if not (commanded.converged & reached.converged).all():
+        return errors
+    reference = geometry.pose_difference(reached.T, frames.poses)
+    return frames.remove(errors[None], T, reference[None])[0]
 
 
 def _check_settings(mode: str, steps: int) -> None:

@@ -30,8 +30,8 @@ def view_compensation(result: Compensation) -> list[Block]:
     if result.uncertainty is not None:
         columns += [Column("U", length.symbol), Column("U", angle.symbol)]
         values += [
-            2 * result.uncertainty.position / length.factor_to_si,
-            2 * result.uncertainty.orientation / angle.factor_to_si,
+            result.uncertainty.expanded_position / length.factor_to_si,
+            result.uncertainty.expanded_orientation / angle.factor_to_si,
         ]
     cells = tuple(
         (label, result.reach[i].value, *(format_number(float(column[i]), 3) for column in values))
@@ -48,5 +48,8 @@ def view_compensation(result: Compensation) -> list[Block]:
                 f"{format_number(turn, 3)} {angle} from the best reachable poses."
             )
     if result.uncertainty is not None:
-        blocks.append(f"U = 2 x rms uncertainty: {result.uncertainty.frame}.")
+        blocks.append(
+            "Errors are distances and angles; 95 % of those that remain are below U. Frame: "
+            f"{result.uncertainty.frame}."
+        )
     return blocks

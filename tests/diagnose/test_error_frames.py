@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of pose errors: what measurements leave open, and errors after the best rigid fit."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from loopcal import geometry, load_robot, pose_uncertainty
+from loopcal.diagnose import estimate_calibration_gain
+from loopcal.diagnose.error_frames import fit_unfixed_frames
+from loopcal.errors import EstimationError
+from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from
+from loopcal.estimate.frame_freedoms import frame_twists
+from loopcal.estimate.inference.posterior import posterior_from_arrays
+from loopcal.measure import KINDS, Gaussian, Instrument, Sensor, StatedValue, sample_truth, simulate
+from loopcal.mechanism import forward, inverse, sample_workspace
+from loopcal.planning import PlanOptions, plan
+
+SIGMA = 5e-6
+PLACES = np.array([[0.06, 0.0, 0.01], [-0.03, 0.05, 0.01], [-0.03, -0.05, 0.02]])
+THREE_TARGETS = {
+    "targets": ("a", "b", "c"),
+    "places": PLACES,
+    "unknown": ("frame", "targets"),
+    "frame": "tracker",
+}
+
+
+def instrument(kind="pose", **settings):
+    """An instrument of one kind with 5 micrometers and 5 microradians of noise."""
+    made = KINDS[kind](**settings)
+    return Instrument((Sensor(made, Gaussian(np.full(len(made.noise_columns), SIGMA))),))
+
+
+@cache
+def calibrated(kind="pose", seed=3, robot="hexapod-42", **settings):
+    """A simulated machine and its fit."""
+    return calibrate(instrument(kind, **settings), seed, robot)
+
+
+def calibrate(measured_by, seed=3, name="hexapod-42"):
+    robot = load_robot(name)
+    truth = robot.with_values(sample_truth(robot, 1, seed)[0])
+    data = simulate(truth, sample_workspace(robot, 40, 1).coordinates, measured_by, seed)
+    return truth, identify(robot, data)
+
+
+@cache
+def three_targets(seed=3):
+    return calibrate(instrument("position", **THREE_TARGETS), seed)
+
+
+KNOWN_POINT = np.array([[0.02, 0.01, 0.03]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "base", "platform"),
+    [
+        ("pose", {}, 0, 0),
+        ("pose", {"unknown": ("frame",)}, 6, 0),
+        ("pose", {"unknown": ("tool",)}, 0, 6),
+        ("pose", {"unknown": ("frame", "tool")}, 6, 6),
+        ("position", {"places": KNOWN_POINT}, 0, 3),
+        ("position", {"places": KNOWN_POINT, "unknown": ("frame",)}, 6, 3),
+        ("position", {"places": KNOWN_POINT, "unknown": ("targets",)}, 0, 6),
+        ("position", {"targets": ("a", "b", "c"), "places": PLACES}, 0, 0),
+        ("position", THREE_TARGETS, 6, 6),
+        ("component", {"components": ("z",)}, 3, 3),
+    ],
+)
+def test_unfixed_motions_are_those_that_counting_gives(kind, settings, base, platform):
+    _, fit = calibrate(instrument(kind, **settings))
+    unfixed = fit.posterior.frames.unfixed
+    ranks = [np.linalg.matrix_rank(part, tol=1e-6) for part in (unfixed[:6], unfixed[6:])]
+    assert (unfixed.shape[1], *ranks) == (base + platform, base, platform)
+    np.testing.assert_allclose(unfixed.T @ unfixed, np.eye(base + platform), atol=1e-12)
+
+
+def test_a_stated_tolerance_of_the_instrument_frame_is_a_datum():
+    robot = load_robot("hexapod-42")
+    poses = sample_workspace(robot, 40, 1).coordinates
+    data = simulate(robot, poses, instrument("pose", unknown=("frame",), frame="tracker"), 1)
+    axes = ("rx", "ry", "rz", "x", "y", "z")
+    stated = tuple(StatedValue(f"tracker.{axis}", sd=1e-4) for axis in axes)
+    fits = [identify(robot, d, LeastSquares()) for d in (data, replace(data, stated_values=stated))]
+    counts = [fit.posterior.frames.unfixed.shape[1] for fit in fits]
+    assert counts == [6, 0]
+    free, datum = (pose_uncertainty(fit, poses) for fit in fits)
+    assert "(absolute)" in datum.frame
+    assert "absolute" not in free.frame
+    # the datum's own uncertainty, 0.1 mm and 0.1 mrad along and about each axis
+    assert 0.95e-4 < np.median(datum.sd[:, 3]) < 1.1e-4
+    assert np.median(free.sd[:, 3]) < 5e-6
+
+
+def align_nonlinearly(T, true):
+    """Return the errors (n, 6) of poses after the best rigid motions of both frames, by an
+    independent nonlinear fit."""
+    weight = np.array([robot_size()] * 3 + [1.0] * 3)
+
+    def errors(motion):
+        base, platform = (geometry.apply_twist(np.eye(4), part) for part in motion.reshape(2, 6))
+        return geometry.pose_difference(T, base @ true @ platform)
+
+    best = least_squares(
+        lambda m: (errors(m) * weight).ravel() * 1e5, np.zeros(12), x_scale=1e-4, xtol=1e-15
+    )
+    return errors(best.x)
+
+
+def robot_size():
+    return load_robot("hexapod-42").size
+
+
+def test_linear_rigid_fit_of_true_errors_agrees_with_a_nonlinear_alignment():
+    truth, fit = three_targets()
+    frames = fit_unfixed_frames(fit.posterior)
+    readings = fit.posterior.frames.readings
+    T, true = (forward(r, readings).T for r in (fit.robot, truth))
+    raw = geometry.pose_difference(T, true)
+    linear = frames.remove(raw[None], T, raw[None])[0]
+    nonlinear = align_nonlinearly(T, true)
+    assert np.abs(linear - nonlinear).max() < 1e-3 * np.abs(nonlinear).max()
+    assert np.abs(raw).max() > 3 * np.abs(nonlinear).max()
+
+
+def test_figures_of_three_targets_in_an_unknown_frame_have_the_size_of_the_true_error():
+    """A true error of 0.0035 mm was reported as 0.05 mm to 0.46 mm."""
+    robot = load_robot("hexapod-42")
+    test = inverse(robot, sample_workspace(robot, 60, 5).coordinates).q
+    square, stated, expected = [], [], []
+    for seed in range(4):
+        truth, fit = three_targets(seed)
+        frames = fit_unfixed_frames(fit.posterior)
+        (T, true), (Tr, true_r) = (
+            [forward(r, q).T for r in (fit.robot, truth)]
+            for q in (test, fit.posterior.frames.readings)
+        )
+        reference = geometry.pose_difference(Tr, true_r)[None]
+        errors = frames.remove(geometry.pose_difference(T, true)[None], T, reference)[0]
+        square.append((errors[:, 3:] ** 2).sum(axis=1).mean())
+        stated.append((pose_uncertainty(fit, forward(fit.robot, test)).position ** 2).mean())
+    data = simulate(
+        truth,
+        sample_workspace(robot, 40, 1).coordinates,
+        instrument("position", **THREE_TARGETS),
+        3,
+    )
+    expected = estimate_calibration_gain(fit, data).position_after
+    true_error = np.sqrt(np.mean(square))
+    assert true_error < 4e-6
+    assert np.sqrt(np.mean(stated)) == pytest.approx(true_error, rel=0.25)
+    assert expected == pytest.approx(true_error, rel=0.35)
+    planned = plan(
+        robot,
+        instrument("position", **THREE_TARGETS),
+        options=PlanOptions(n_poses=40, n_candidates=200),
+    )
+    assert 0.4 * true_error < planned.errors.random.position < 1.6 * true_error
+    assert planned.errors.after.position < planned.errors.random.position
+    assert "after the best rigid fit of the base and platform frames" in str(planned)
+
+
+def test_known_datum_is_called_absolute_and_fits_nothing():
+    _, fit = calibrated()
+    at = sample_workspace(fit.robot, 5, 7).coordinates
+    fitted, base = (pose_uncertainty(fit, at, frame=name) for name in ("fitted", "base"))
+    assert np.array_equal(fitted.covariance, base.covariance)
+    assert fitted.frame == "tool point, base axes, in the base frame of the robot file (absolute)"
+    assert base.frame == fitted.frame
+    instrument_frame = pose_uncertainty(fit, at, frame="frame")
+    np.testing.assert_allclose(instrument_frame.sd, base.sd, rtol=1e-12)
+
+
+def test_base_frame_without_a_datum_is_not_called_absolute():
+    _, fit = three_targets()
+    result = pose_uncertainty(fit, sample_workspace(fit.robot, 5, 7).coordinates, frame="base")
+    assert "although the measurements do not determine the base and platform frames" in result.frame
+    assert "absolute" not in result.frame
+    assert (result.position > 1e-5).all()
+
+
+def test_a_fit_of_frames_changes_no_dimension_of_the_machine():
+    """Errors after the fit do not depend on how the fit places the undetermined frames."""
+    _, fit = three_targets()
+    posterior = fit.posterior
+    null = ~posterior.determined
+    variance = np.where(null, 1e4, 1.0) * posterior.variance
+    looser = replace(posterior, variance=variance)
+    at = sample_workspace(fit.robot, 5, 7).coordinates
+    np.testing.assert_allclose(
+        pose_uncertainty(looser, at).sd, pose_uncertainty(posterior, at).sd, rtol=1e-5
+    )
+    base = [pose_uncertainty(p, at, frame="base").sd.max() for p in (looser, posterior)]
+    assert base[0] > 50 * base[1]
+
+
+def test_errors_relative_to_a_pose_vanish_there_and_agree_with_a_simulation():
+    truth_of = load_robot("hexapod-42")
+    at = inverse(truth_of, sample_workspace(truth_of, 6, 7).coordinates).q
+    pairs = [calibrated(seed=seed) for seed in range(12)]
+    predicted = pose_uncertainty(pairs[0][1], forward(pairs[0][1].robot, at), frame="relative")
+    assert "relative to the pose 1" in predicted.frame
+    assert np.abs(predicted.sd[0]).max() < 1e-12
+    errors = []
+    for truth, fit in pairs:
+        T, true = (forward(r, at).T for r in (fit.robot, truth))
+        relative, true_relative = (geometry.invert_pose(P[:1]) @ P for P in (T, true))
+        moved = T[:1] @ true_relative  # back in base axes
+        errors.append(geometry.pose_difference(T[:1] @ relative, moved))
+    rms = np.sqrt((np.array(errors)[:, 1:] ** 2).sum(axis=2).mean())
+    stated = np.sqrt((predicted.sd[1:] ** 2).sum(axis=1).mean())
+    assert stated == pytest.approx(rms, rel=0.25)
+    absolute = pose_uncertainty(pairs[0][1], forward(pairs[0][1].robot, at), frame="base")
+    assert np.abs(absolute.sd[0]).min() > 1e-9
+
+
+def test_pose_in_the_instrument_frame_has_the_error_of_both():
+    """Joint covariance of machine and frame against simulated calibrations."""
+    robot = load_robot("hexapod-42")
+    at = inverse(robot, sample_workspace(robot, 6, 7).coordinates).q
+    square = []
+    for seed in range(8):
+        truth, fit = calibrated("pose", seed, unknown=("frame",), frame="tracker")
+        frame = fit.posterior.frames.instruments["tracker"].T  # the true one is the identity
+        T, true = forward(fit.robot, at).T, forward(truth, at).T
+        square.append(geometry.pose_difference(geometry.invert_pose(frame) @ T, true)[:, 3:] ** 2)
+    stated = pose_uncertainty(fit, forward(fit.robot, at), frame="tracker")
+    assert stated.frame.endswith("in the frame 'tracker' of the instrument")
+    rms = np.sqrt(np.array(square).sum(axis=2).mean())
+    assert np.sqrt((stated.position**2).mean()) == pytest.approx(rms, rel=0.25)
+
+
+def test_frames_survive_the_run_folder():
+    _, fit = three_targets()
+    back = posterior_from_arrays(fit.robot, fit.arrays())
+    at = sample_workspace(fit.robot, 3, 7).coordinates
+    for frame in ("fitted", "tracker", "relative"):
+        both = (pose_uncertainty(p, at, frame=frame).sd for p in (fit.posterior, back))
+        assert np.array_equal(*both)
+    older = {k: v for k, v in fit.arrays().items() if not k.startswith("frames_")}
+    from_older = pose_uncertainty(posterior_from_arrays(fit.robot, older), at)
+    np.testing.assert_allclose(
+        from_older.position, pose_uncertainty(fit, at).position, rtol=0.2
+    )  # poses about home in place of the measured ones
+    with pytest.raises(
+        EstimationError, match="frame is 'laser'.* must be one of 'fitted', .*'tracker'"
+    ):
+        pose_uncertainty(fit, at, frame="laser")
+
+
+def test_an_earlier_calibration_in_a_known_frame_determines_it():
+    truth, first = calibrated()
+    robot = load_robot("hexapod-42")
+    poses = sample_workspace(robot, 20, 2).coordinates
+    data = simulate(truth, poses, instrument("pose", unknown=("frame",)), 9)
+    again = identify(robot, data, options=FitOptions(prior=prior_from(first.posterior)))
+    assert again.posterior.frames.unfixed.shape[1] == 0
+    assert "(absolute)" in pose_uncertainty(again, poses[:2]).frame
+
+
+def test_opposite_motions_of_both_frames_are_no_motion_of_a_delta():
+    robot = load_robot("linear-delta")
+    data = simulate(robot, sample_workspace(robot, 30, 1).coordinates, instrument(), 1)
+    fit = identify(robot, data)
+    at = sample_workspace(robot, 4, 2).coordinates
+    fitted, base = (pose_uncertainty(fit, at, frame=name) for name in ("fitted", "base"))
+    assert np.array_equal(fitted.sd, base.sd)
+    assert np.abs(frame_twists(fitted.T, robot.size) @ fit.posterior.frames.unfixed).max() < 1e-9
+
+
+def test_plan_without_tolerances_refuses_unbounded_errors_in_the_base_frame():
+    robot = load_robot("hexapod-42")
+    entries = tuple(replace(p, tolerance=None) for p in robot.parameters.entries)
+    bare = replace(robot, parameters=replace(robot.parameters, entries=entries))
+    options = PlanOptions(n_poses=40, hold_out=0, n_candidates=60, frame="base")
+    with pytest.raises(EstimationError, match="does not determine the base frame, and 42"):
+        plan(bare, instrument("pose", unknown=("frame",)), options=options)
+    for frame in ("fitted", "relative"):
+        result = plan(
+            bare, instrument("pose", unknown=("frame",)), options=replace(options, frame=frame)
+        )
+        assert np.isfinite(result.errors.after.position)
+    with pytest.raises(EstimationError, match="must be one of 'fitted', 'base', 'relative'"):
+        plan(robot, instrument(), options=replace(options, frame="tracker"))
