@@ -167,12 +167,10 @@ def compensate(
 
     Parameters
     ----------
-    fit : the identification, the posterior of a run folder (both give uncertainties), or a
-        calibrated robot.
+    fit : identification, posterior of a run folder (both give uncertainties), or calibrated robot.
     targets : (n, 4, 4) T_base_platform or (n, c) controlled coordinates [m, rad]. Freedoms that
         coordinates do not state have the values that the controller's geometry gives them.
-    mode : "readings" to set the actuators, "commands" for a controller whose geometry cannot be
-        changed.
+    mode : "readings" to set the actuators, "commands" for a controller that cannot be changed.
     controller : that geometry; default: the nominal robot. steps : fixed-point steps of "commands".
     labels : of the targets; default "1", "2", ... progress : receives the passes that are done.
     frame : of the uncertainty, see `pose_uncertainty`; "relative": to the first target.
