@@ -17,6 +17,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import quote_cell
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.text_file import as_path
-from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME
+from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.exports.export_lines import (
     Line,
@@ -109,8 +110,8 @@ def _check_readings(row: Row, known: Row, profile: Profile) -> None:
 def list_headers(profile: Profile) -> dict[str, str | None]:
     """Return column -> unit of the measurement file, None for text."""
     units = {name: source.symbol for name, source in profile.columns.items() if name != "pose"}
-    units |= {name: "1" for name in ("qw", "qx", "qy", "qz") if profile.record.matrix}
-    names = [column.name for column in profile.kind.columns]
+    units |= {name: "1" for name in ("qw", "qx", "qy", "qz") if profile.record.matrix_places}
+    names = [column.name for column in profile.measured]
     first: dict[str, str | None] = {"pose": None}
     if len(profile.targets) < 2:
         measured = [profile.name_measured(name) for name in names]
@@ -126,7 +127,7 @@ def list_headers(profile: Profile) -> dict[str, str | None]:
 
 def _belongs_to_target(name: str, profile: Profile) -> bool:
     """Return whether a column belongs to a target, not to the pose."""
-    values = {strip_target(column.name) for column in profile.kind.columns}
+    values = {strip_target(column.name) for column in profile.measured}
     return name.removeprefix(SIGMA) in values or name.startswith((COVARIANCE, NOTE))
 
 
@@ -218,17 +219,20 @@ def _parse_row(line: Line, profile: Profile) -> Row:
     for name, source in profile.columns.items():
         cells = [_get_cell(line, place) for place in source.places]
         if source.symbol is not None:
-            row[name] = _parse_number(cells[0], profile, name)
+            number = _parse_number(cells[0], profile, name)
+            row[name] = _scale_sigma(number, source, name) if name.startswith(SIGMA) else number
             continue
         text = " ".join("" if cell in profile.missing else cell for cell in cells).strip()
         if source.pattern is not None:
             row |= _match_name(text, source.pattern)
         else:
-            row[name] = _parse_time(text, source) if name == "time" else text
+            row[name] = _parse_time(text, source) if name == TIME else text
+    if (use := row.get(USE_COLUMN.name, "")) not in ("", *USE_COLUMN.choices):
+        raise Misfit(f"the use {use!r} is not {' or '.join(USE_COLUMN.choices)}")
     if "pose" in profile.columns and (not row["pose"] or LINK in row["pose"]):
         raise Misfit(f"{row['pose']!r} is not a name of a pose: it is empty or contains {LINK!r}")
-    if profile.record.matrix:
-        cells = (_get_cell(line, place) for place in profile.record.matrix)
+    if profile.record.matrix_places:
+        cells = (_get_cell(line, place) for place in profile.record.matrix_places)
         row |= _to_quaternion([_parse_number(cell, profile, "matrix") for cell in cells])
     return row
 
@@ -254,6 +258,18 @@ def _parse_number(text: str, profile: Profile, name: str) -> str:
     if value is None:
         raise Misfit(f"{text!r} is not a number for {name!r}")
     return profile.with_point(text)
+
+
+def _scale_sigma(text: str, source: ColumnSource, name: str) -> str:
+    """Return a standard deviation times its factor, not below its floor; "" where it is missing."""
+    if not text:
+        return ""
+    scaled = Decimal(text) * Decimal(repr(source.factor))
+    if scaled < Decimal(source.least):
+        return source.least
+    if scaled <= 0:
+        raise Misfit(f"{name!r} is {text}, but must be positive; state a 'floor' in the profile")
+    return text if source.factor == 1.0 else f"{scaled.normalize():.17g}"
 
 
 def _match_name(name: str, pattern: re.Pattern[str]) -> Row:

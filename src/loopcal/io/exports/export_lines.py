@@ -12,10 +12,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
-from loopcal.errors import FileError
+from loopcal.errors import FileError, suggest_names
+from loopcal.findings import report_finding
 from loopcal.io.core.text_file import read_bytes
-from loopcal.io.exports.profile import Profile
+from loopcal.io.exports.profile import Profile, normalize_name
 
 
 class Misfit(Exception):  # noqa: N818
@@ -50,9 +52,9 @@ def read_lines(path: Path, profile: Profile) -> tuple[list[Line], int]:
     """
     record = profile.record
     sources = [place for source in profile.columns.values() for place in source.places]
-    named = {place for place in (*sources, *record.matrix) if isinstance(place, str)}
+    named = {place for place in (*sources, *record.matrix_places) if isinstance(place, str)}
     lines: list[Line] = []
-    header, first, skipped = None, None, 0
+    header, nearest, skipped = None, None, 0
     text = _decode(path, profile).replace("\r\n", "\n").replace("\r", "\n")
     for number, line in enumerate(text.split("\n"), 1):
         is_comment = record.comment is not None and line.lstrip().startswith(record.comment)
@@ -61,19 +63,47 @@ def read_lines(path: Path, profile: Profile) -> tuple[list[Line], int]:
             skipped += bool(line.strip())
             continue
         cells = _split(line, profile.delimiter)
-        if named and named <= set(cells):
-            header = _parse_header(path, number, cells, named)
+        names = [normalize_name(cell) for cell in cells] if named else []
+        if named and named <= set(names):
+            header = _parse_header(path, number, names, named)
         elif not named or header is not None:
             lines.append(Line(number, cells, header))
             continue
-        first = first or (number, cells)
+        count = len(named & set(names))
+        if nearest is None or count > nearest[0]:
+            nearest = (count, number, names)
         skipped += 1
     if named and header is None:
-        names, number = ", ".join(sorted(named)), first[0] if first else None
-        shown = f"; the first line is {' | '.join(first[1])!r}" if first else ""
+        _refuse_header(path, profile, named, nearest)
+    return lines, skipped
+
+
+def _refuse_header(
+    path: Path, profile: Profile, named: set[str], nearest: tuple[int, int, list[str]] | None
+) -> NoReturn:
+    """Raise FileError for an export without the header of a profile.
+
+    `nearest` : the first of the lines with the most of these names: their count, number and cells.
+    """
+    if nearest is None or nearest[0] == 0:
+        names, number = ", ".join(sorted(named)), None if nearest is None else nearest[1]
+        shown = "" if nearest is None else f"; the first line is {' | '.join(nearest[2])!r}"
         sentence = f"no line names the columns {names} of {profile.file.path}{shown}"
         raise FileError(f"{sentence}; correct the profile", path, number)
-    return lines, skipped
+    _, number, cells = nearest
+    known = {cell.casefold(): cell for cell in reversed(cells) if cell}
+    missing = []
+    for name in sorted(named - set(cells)):
+        same = known.get(name.casefold())
+        close = f" (did you mean {same!r}?)" if same else suggest_names(name, known.values())
+        missing.append(f"{name!r}{close}")
+    finding = report_finding(
+        "files.export-column-missing",
+        profile=str(profile.file.path),
+        missing=tuple(missing),
+        columns=tuple(cell for cell in cells if cell),
+    )
+    raise FileError(finding, path, number)
 
 
 def check_count(line: Line, delimiter: str | None) -> None:
