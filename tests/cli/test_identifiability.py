@@ -22,7 +22,7 @@ def run(tmp_path, monkeypatch, capsys):
 
 
 def test_3_prs_without_psi_has_one_unidentifiable_combination(run):
-    code, out, err = run("3-prs --measure x,y,z,phi,theta")
+    code, out, err = run("3-prs --measure x,y,z,phi,theta --verbose")
     assert (code, err) == (0, "")
     assert "determine 32 of 33 parameter combinations" in out
     document = json.loads(run("3-prs --measure x,y,z,phi,theta --json")[1])
@@ -125,3 +125,37 @@ def test_invalid_sigma_reading_is_refused_in_one_sentence(run, words, sentence):
     assert (code, out) == (1, "")
     assert sentence in err
     assert err.count("\n") == 1
+
+
+def test_the_summary_says_what_is_undetermined_and_what_to_measure(run):
+    out = " ".join(run("hexapod-42 --frames base,tool")[1].split())
+    assert "determine 30 of 42 parameter combinations (rank tolerance 1e-11 of" in out
+    assert "12 undetermined combinations only move the base and platform frames" in out
+    assert "Measure the pose as well: this determines all of them." in out
+    assert "leg1.base.x" not in out
+    summary, full = (run(f"hexapod-42 --frames base,tool{more}")[1] for more in ("", " -v"))
+    assert len(summary.splitlines()) < 20 < len(full.splitlines())
+    assert "leg1.base.x" in full
+
+
+def test_directions_that_change_poses_are_named_in_the_summary(run):
+    document = json.loads(run("linear-delta --draw 20 --kind component --components z --json")[1])
+    codes = {finding["code"]: finding["data"] for finding in document["summary"]}
+    assert codes["identifiability.rank"]["rank"] == document["rank"]
+    undetermined = document["n_parameters"] - document["rank"]
+    parts = [codes.get(f"identifiability.{code}") for code in ("frames-only", "changes-poses")]
+    assert sum(part["count"] for part in parts if part) == undetermined
+
+
+def test_a_rank_tolerance_is_applied_and_printed(run):
+    usual = json.loads(run("hexapod-42 --json")[1])
+    cut = json.loads(run("hexapod-42 --json --rank-tolerance 0.02")[1])
+    s = usual["singular_values"]
+    assert cut["rank"] == sum(value > 0.02 * s[0] for value in s) < usual["rank"] == 42
+    assert cut["tolerance"] == 0.02
+    assert "(rank tolerance 2e-02 of" in " ".join(
+        run("hexapod-42 --rank-tolerance 0.02")[1].split()
+    )
+    code, _, err = run("hexapod-42 --rank-tolerance 1")
+    assert code != 0
+    assert "--rank-tolerance" in err

@@ -167,7 +167,7 @@ def test_text_is_short_and_json_has_all_attributes():
     result = identifiability(hexapod(), hexapod_data(6))
     rank = result.findings[0]
     assert rank.code == "identifiability.rank"
-    assert rank.data == {"rank": 36, "parameters": 42, "equations": 36}
+    assert rank.data == {"rank": 36, "parameters": 42, "equations": 36, "tolerance": 1e-11}
     assert [f.code for f in result.findings].count("fit.unidentifiable") == 6
     assert len(str(result).splitlines()) < 40
     assert len(repr(result)) < 120

@@ -17,6 +17,14 @@ if TYPE_CHECKING:
 METHODS = ("auto", "map", "ls", "ridge", "tsvd")
 LOSSES = ("none", "huber", "tukey")
 
+rank_tolerance_option = click.option(
+    "--rank-tolerance",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    metavar="SHARE",
+    help="Share of the largest singular value below which one counts as zero.  [default: 1e-11]",
+)
+"""Decorator of a command that decides a rank."""
+
 fit_options = add_options(
     click.option(
         "--method",
@@ -50,6 +58,7 @@ fit_options = add_options(
         default=LOSSES[0],
         help="Reduce the weight of poses that are far from the fit.",
     ),
+    rank_tolerance_option,
     click.option(
         "--drop",
         multiple=True,
@@ -79,6 +88,7 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
         TruncationGCV,
         Tukey,
     )
+    from loopcal.numerics.decomposition import RANK_TOLERANCE
 
     name, lam, keep = options["method"], options["lam"], options["keep"]
     for option, value, needed in (("--lam", lam, "ridge"), ("--keep", keep, "tsvd")):
@@ -100,4 +110,5 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
         loss=losses[options["loss"]](),
         noise=options["noise"],
         excluded_poses=options["drop"],
+        rank_tolerance=options["rank_tolerance"] or RANK_TOLERANCE,
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
+from loopcal.cli.fit_options import rank_tolerance_option
 from loopcal.cli.instrument_options import (
     DESCRIPTION,
     draw_option,
@@ -34,6 +35,7 @@ from loopcal.cli.options import (
     robot_argument,
     seed_option,
     take_flags,
+    verbose_option,
 )
 from loopcal.errors import DataError
 
@@ -41,6 +43,10 @@ if TYPE_CHECKING:
     from loopcal.diagnose import IdentifiableSubset
     from loopcal.mechanism import Mechanism
     from loopcal.workflow.simulated_measurements import SimulatedMeasurements
+
+
+DETAILS = "every combination, the singular values and a table of all parameters"
+"""What the summary of identifiability leaves out."""
 
 
 @click.command()
@@ -61,7 +67,9 @@ if TYPE_CHECKING:
 @force_option("the output file")
 @instrument_options
 @sigma_reading_option
+@rank_tolerance_option
 @data_options
+@verbose_option
 @json_option
 def identifiability(
     robot: str,
@@ -73,6 +81,8 @@ def identifiability(
     output: Path | None,
     force: bool,
     sigma_reading: str | None,
+    rank_tolerance: float | None,
+    verbose: bool,
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -95,6 +105,7 @@ def identifiability(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.data.measurement_file import load_poses
     from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.numerics.decomposition import RANK_TOLERANCE
     from loopcal.report.identifiability_view import view_identifiability
     from loopcal.workflow.identifiability_report import analyze_identifiability
     from loopcal.workflow.simulated_measurements import predict_noise_free
@@ -117,13 +128,16 @@ def identifiability(
         measurements = predict_noise_free(
             machine, make_instrument(options), targets, reading_sigma=sigma, seed=seed
         )
-    report = analyze_identifiability(machine, measurements, reduced)
+    tolerance = rank_tolerance or RANK_TOLERANCE
+    report = analyze_identifiability(machine, measurements, reduced, tolerance)
     if report.subset is not None and output is not None:
         _write_subset(output, report.subset)
     if as_json:
         terminal.print_json(report.to_dict())
         return
-    page = [*drawn, *view_identifiability(report)]
+    page = [*drawn, *view_identifiability(report, verbose)]
+    if not verbose:
+        page.append(f"Hint: use --verbose for {DETAILS}")
     if output is not None:
         page += ["", f"Written to {output}: the robot with the other parameters fixed"]
     terminal.print_page(page)

@@ -38,6 +38,7 @@ from loopcal.diagnose.fit_checks.start_values import (
 from loopcal.diagnose.frame_motions import NO_MOTION as NO_MOTION
 from loopcal.diagnose.frame_motions import FrameMotions as FrameMotions
 from loopcal.diagnose.frame_motions import find_frame_motions as find_frame_motions
+from loopcal.diagnose.frame_motions import interpret_fit as interpret_fit
 from loopcal.diagnose.frame_motions import twist_weights as twist_weights
 from loopcal.diagnose.identifiable_parameters import Identifiability as Identifiability
 from loopcal.diagnose.identifiable_parameters import identifiability as identifiability

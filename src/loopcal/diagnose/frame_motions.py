@@ -19,6 +19,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.information import ObservedPoses, observe_poses
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import (
     Mechanism,
@@ -113,14 +114,9 @@ def probe_workspace(free: FreeParameters, joints: Iterable[str] = ()) -> Observe
 
 
 def interpret_combinations(
-    free: FreeParameters, combinations: tuple[Combination, ...], directions: FloatArray
+    free: FreeParameters, combinations: tuple[Combination, ...]
 ) -> tuple[Combination, ...]:
-    """Return combinations with the motion of the robot that each of them stands for.
-
-    Parameters
-    ----------
-    directions : (d, p) the combinations in tolerances.
-    """
+    """Return combinations with the motion of the robot that each of them stands for."""
     if not combinations:
         return combinations
     poses = probe_workspace(free)
@@ -130,11 +126,24 @@ def interpret_combinations(
     frames = {"platform": platform, "base": base}
     limit = NO_MOTION * float(np.linalg.norm(motions))
     interpreted = []
-    for combination, n in zip(combinations, directions, strict=True):
+    for combination in combinations:
+        n = combination.direction
         moved = motions @ (n / np.linalg.norm(n))
         motion = _describe_motion(moved, frames, limit, free.robot.size)
         interpreted.append(replace(combination, meaning="" if motion is None else motion))
     return tuple(interpreted)
+
+
+def interpret_fit(fit: Identification) -> Identification:
+    """Return a fit whose unidentifiable combinations, and the findings on them, name the motion of
+    the robot that each of them stands for.
+    """
+    free = replace(fit.free_parameters, robot=fit.robot)
+    combinations = interpret_combinations(free, fit.unidentifiable)
+    named = iter(combination.finding for combination in combinations)
+    codes = {combination.finding.code for combination in fit.unidentifiable}
+    findings = tuple(next(named) if f.code in codes else f for f in fit.findings)
+    return replace(fit, unidentifiable=combinations, findings=findings)
 
 
 def _gauge_projector(gauge: FloatArray, infinite: BoolArray) -> FloatArray:

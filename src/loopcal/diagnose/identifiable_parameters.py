@@ -20,8 +20,8 @@ from loopcal.estimate.inference.null_space import (
     Combination,
     describe_direction,
     describe_null_space,
-    sparsify_basis,
 )
+from loopcal.estimate.inference.posterior import Posterior, compute_posterior
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
@@ -207,7 +207,11 @@ class Identifiability:
         p, rank, s = self.n_parameters, self.rank, self.singular_values
         findings = [
             report_finding(
-                "identifiability.rank", rank=rank, parameters=p, equations=self.n_equations
+                "identifiability.rank",
+                rank=rank,
+                parameters=p,
+                equations=self.n_equations,
+                tolerance=self.tolerance,
             ),
             report_finding(
                 "identifiability.spectrum",
@@ -229,6 +233,13 @@ class Identifiability:
         if (more := rank - self.improved - len(self.weak)) > 0:
             findings.append(report_finding("identifiability.more-weak-directions", count=more))
         return (*findings, *self.free_parameters.findings())
+
+    @property
+    def posterior(self) -> Posterior:
+        """What is known of the parameters with the tolerances as a prior."""
+        free, d = self.free_parameters, self.decomposition
+        penalty = np.ones_like(d.singular_values)
+        return compute_posterior(free.robot, free.places, free.tolerance, d, penalty)
 
     def null_space(self) -> FloatArray:
         """Return (p, d) orthonormal deviations in tolerances that change no measured value."""
@@ -344,7 +355,7 @@ def _summarize(
         free,
         factor,
         decomposition,
-        unidentifiable=interpret_combinations(free, combinations, sparsify_basis(null)),
+        unidentifiable=interpret_combinations(free, combinations),
         weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
         indices=compute_observability(s, rank, equations),
         parameters=_judge_parameters(free, null, compute_remaining_sd(factor)),

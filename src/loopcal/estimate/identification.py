@@ -30,6 +30,7 @@ from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
+from loopcal.estimate.methods.regularization import describe_regularization
 from loopcal.estimate.minimization.closure_start import descend_from_closure, report_unused_closure
 from loopcal.estimate.minimization.descent import Descent, descend
 from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
@@ -265,6 +266,7 @@ def _assemble(
         fit.cost_history[:, 0],
         free.nominal + free.tolerance * fit.deviation_history[:, 0],
     )
+    regularization = describe_regularization(_method(options), fit.decomposition, fit.penalty)
     findings = [
         *([] if converged else [history.finding]),
         report_noise(data, robot, test),
@@ -274,6 +276,7 @@ def _assemble(
         *nuisance.report_unobservable(),
         *free.findings(),
         *_report_closure(problem, options),
+        *([] if regularization is None else [regularization.finding]),
         *report_equations(int(problem.equations[0]), problem.parameters, _method(options)),
         *report_weights(data, weights, options.loss),
         *_report_excluded(excluded),
@@ -291,6 +294,7 @@ def _assemble(
         spectrum=Spectrum(
             int(plain.rank[0]), float(plain.condition[0]), plain.singular_values[0], d.tolerance
         ),
+        regularization=regularization,
         unidentifiable=unidentifiable,
         residual_test=test,
         prior_conflict=conflict,

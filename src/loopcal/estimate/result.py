@@ -17,6 +17,7 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
+from loopcal.estimate.methods.regularization import Regularization
 from loopcal.estimate.nuisance.estimate import NuisanceEstimate
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
@@ -109,7 +110,8 @@ class Identification:
     free_parameters : names, nominal values and tolerances.
     covariance : (p, p), infinite and NaN where the data do not determine a parameter.
     posterior : the same uncertainty by directions; accuracy of poses and a later prior use it.
-    spectrum : singular values and rank. unidentifiable : combinations that change no measured
+    spectrum : singular values and rank. regularization : ridge parameter or truncation, with rule
+        and score; None for other methods. unidentifiable : combinations that change no measured
         value.
     residual_test : the residuals against the noise.
     prior_conflict : the stated tolerances against the data, where the method uses them; else None.
@@ -127,6 +129,7 @@ class Identification:
     covariance: FloatArray
     posterior: Posterior
     spectrum: Spectrum
+    regularization: Regularization | None
     unidentifiable: tuple[Combination, ...]
     residual_test: ResidualTest
     prior_conflict: PriorConflict | None
@@ -305,6 +308,7 @@ class Identification:
             "condition": self.spectrum.condition if self.converged else None,
             "singular_values": self.spectrum.singular_values,
             "rank_tolerance": self.spectrum.tolerance,
+            "regularization": self.regularization,
             "unidentifiable": self.unidentifiable,
             "dof": test.dof,
             "chi_square": test.chi_square,

@@ -52,6 +52,8 @@ def view_calibration(
     blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in selected])]
     if more := len(report.findings) - len(selected):
         blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
+    if fit.converged and not verbose and fit.regularization is not None:
+        blocks.append(f"  {fit.regularization.finding}")
     blocks += ["", f"Next: {report.next_step}"]
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")

@@ -16,15 +16,30 @@ SD_MEANING = (
 )
 
 
-def view_identifiability(report: IdentifiabilityReport) -> list[Block]:
-    """Return the page of an identifiability analysis."""
-    analysis = report.analysis
-    blocks: list[Block] = [str(finding) for finding in analysis.findings]
-    blocks += [str(suggestion) for suggestion in report.suggestions]
+def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -> list[Block]:
+    """Return the page of an identifiability analysis.
+
+    Rank, what is undetermined, and what to measure. With `verbose` also every combination, the
+    singular values, a statement on each parameter and the observability indices.
+    """
+    blocks: list[Block] = [str(finding) for finding in report.summary]
     if report.suggestions:
         blocks.append(str(report_finding("identifiability.known-frames-assumed")))
+    if verbose:
+        blocks += ["", *_view_details(report)]
+    if report.subset is not None:
+        blocks += ["", str(report.subset)]
+    return blocks
+
+
+def _view_details(report: IdentifiabilityReport) -> list[Block]:
+    """Return everything that the summary leaves out."""
+    analysis, said = report.analysis, {finding.code for finding in report.summary}
+    blocks: list[Block] = [str(f) for f in analysis.findings if f.code not in said]
+    blocks += [str(suggestion) for suggestion in report.suggestions]
     states = {"determined": "yes", "not at all": "no"}
-    blocks += [
+    return [
+        *blocks,
         build_table(
             "Parameters",
             analysis.parameters,
@@ -44,6 +59,3 @@ def view_identifiability(report: IdentifiabilityReport) -> list[Block]:
             (Column("value"), lambda row: format_number(row[1], 3)),
         ),
     ]
-    if report.subset is not None:
-        blocks += ["", str(report.subset)]
-    return blocks

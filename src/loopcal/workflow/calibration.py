@@ -19,6 +19,7 @@ from loopcal.diagnose import (
     examine_fit,
     find_frame_motions,
     identifiability,
+    interpret_fit,
     suggest_measurements,
 )
 from loopcal.errors import DataError
@@ -151,7 +152,7 @@ def _report(
     count: StepCounter,
 ) -> CalibrationReport:
     """Validate and examine a fit, and return the report."""
-    fit, fitted, held_out = result.fit, split.fitted, split.held_out
+    fit, fitted, held_out = interpret_fit(result.fit), split.fitted, split.held_out
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count.begin("examining the residuals")
     examination = examine_fit(fit, fitted, count.progress, options.frame) if fit.converged else None
@@ -268,7 +269,8 @@ def _report_freedoms(fit: Identification) -> list[Finding]:
             )
         )
     if count > motions.count:
-        names = dict.fromkeys(name for c in fit.unidentifiable for name in c.names)
+        changing = [c for c in fit.unidentifiable if not c.meaning] or fit.unidentifiable
+        names = dict.fromkeys(name for c in changing for name in c.names)
         findings.append(
             report_finding(
                 "workflow.undetermined-combinations",

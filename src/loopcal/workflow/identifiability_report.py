@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from loopcal.diagnose import (
@@ -11,12 +13,18 @@ from loopcal.diagnose import (
     IdentifiableSubset,
     MeasurementSuggestion,
     choose_identifiable_subset,
+    find_frame_motions,
     identifiability,
     suggest_measurements,
 )
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.serialization import json_fields
+
+FEW = 3
+"""Combinations that change poses and that a summary lists one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +42,73 @@ class IdentifiabilityReport:
     suggestions: tuple[MeasurementSuggestion, ...]
     subset: IdentifiableSubset | None
 
+    @cached_property
+    def summary(self) -> tuple[Finding, ...]:
+        """Rank, what is undetermined in words, what is known poorly, and what to measure."""
+        by_code = {finding.code: finding for finding in self.analysis.findings}
+        return (
+            by_code["identifiability.rank"],
+            *self._report_undetermined(),
+            by_code["identifiability.improved"],
+            *self._report_measurement(),
+        )
+
+    def _report_undetermined(self) -> list[Finding]:
+        """Return how many undetermined combinations move frames, and how many change poses."""
+        analysis = self.analysis
+        if not analysis.unidentifiable:
+            return []
+        motions = find_frame_motions(analysis.posterior)
+        findings = []
+        if motions.count:
+            findings.append(
+                report_finding(
+                    "identifiability.frames-only", count=motions.count, frames=motions.frames
+                )
+            )
+        if (count := analysis.n_parameters - analysis.rank - motions.count) > 0:
+            changing = [c for c in analysis.unidentifiable if not c.meaning]
+            names = dict.fromkeys(n for c in changing or analysis.unidentifiable for n in c.names)
+            findings.append(
+                report_finding("identifiability.changes-poses", count=count, names=tuple(names))
+            )
+            findings += [c.finding for c in changing] if len(changing) <= FEW else []
+        return findings
+
+    def _report_measurement(self) -> list[Finding]:
+        """Return the further measurement that determines most combinations, the simplest of them;
+        or that none does.
+        """
+        solved = Counter(m.words for s in self.suggestions for m in s.measurements)
+        if not solved:
+            return [s.finding for s in self.suggestions]
+        words, count = max(solved.items(), key=lambda item: item[1])
+        total = len(self.suggestions)
+        return [
+            report_finding(
+                "identifiability.measure-for-all",
+                words=words,
+                count=count,
+                total=total,
+                left=total - count,
+            )
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the report by name for JSON."""
-        document = {**json_fields(self.analysis), "remedies": self.suggestions}
+        document = {
+            **json_fields(self.analysis),
+            "summary": self.summary,
+            "remedies": self.suggestions,
+        }
         return document if self.subset is None else {**document, "reduction": self.subset}
 
 
 def analyze_identifiability(
-    robot: Mechanism, data: Measurements, choose_subset: bool = False
+    robot: Mechanism,
+    data: Measurements,
+    choose_subset: bool = False,
+    rank_tolerance: float = RANK_TOLERANCE,
 ) -> IdentifiabilityReport:
     """Return what measurements determine of a robot's free parameters.
 
@@ -49,7 +116,8 @@ def analyze_identifiability(
     ----------
     data : measurements, or simulated ones without noise for an instrument that is considered.
     choose_subset : also choose a smallest set of parameters that says the same.
+    rank_tolerance : share of the largest singular value below which one counts as zero.
     """
-    analysis = identifiability(robot, data)
+    analysis = identifiability(robot, data, rank_tolerance)
     subset = choose_identifiable_subset(analysis) if choose_subset else None
     return IdentifiabilityReport(analysis, suggest_measurements(analysis), subset)

@@ -37,6 +37,7 @@ class Combination:
         deviations of the noise; 0 for a null direction.
     meaning : what the robot does with such a change; empty where it is no rigid motion.
     nuisance : frames, targets and surfaces of the measurements that change with it.
+    direction : (p,) all parameters, in tolerances, with the parts that are left out.
     """
 
     names: tuple[str, ...]
@@ -46,6 +47,7 @@ class Combination:
     singular_value: float = 0.0
     meaning: str = ""
     nuisance: tuple[str, ...] = ()
+    direction: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def finding(self) -> Finding:
@@ -56,6 +58,7 @@ class Combination:
             names=self.names,
             changes=tuple(self.changes.tolist()),
             units=self.units,
+            weights=tuple(self.weights.tolist()),
             singular_value=self.singular_value,
             meaning=str(self.meaning),
             nuisance=self.nuisance,
@@ -101,6 +104,7 @@ def describe_direction(
         units=tuple(symbols[i] for i in order),
         weights=sign * direction[order] / np.linalg.norm(direction),
         singular_value=singular_value,
+        direction=direction,
     )
 
 

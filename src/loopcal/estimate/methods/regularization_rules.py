@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 PER_DECADE = 16
 """Grid points per factor of ten; around their minimum the criteria are flat over much more."""
@@ -35,12 +35,16 @@ class GCV:
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return lam (t,)."""
+        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
 
-        def criterion(lam: FloatArray) -> FloatArray:
-            penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
-            return _gcv(decomposition, penalty)
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return RSS / (m - sum f)^2 (t,) at lam (t,)."""
+        penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
+        return _gcv(decomposition, penalty)
 
-        return _minimize(criterion, decomposition)
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are ends of the range."""
+        return _is_end_of_range(decomposition, lam)
 
 
 @dataclass(frozen=True)
@@ -49,17 +53,21 @@ class MarginalLikelihood:
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return lam (t,)."""
+        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
+
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are ends of the range."""
+        return _is_end_of_range(decomposition, lam)
+
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return minus twice the log density of the data at lam (t,), up to a constant."""
         # directions of unpenalized parameters contain no information on lam
         unpenalized = decomposition.unpenalized
         counted = np.ones(1) if unpenalized is None else ~unpenalized
         square = decomposition.singular_values**2 * counted
         projected = decomposition.projections**2 * counted
-
-        def criterion(lam: FloatArray) -> FloatArray:
-            variance = 1.0 + square / lam[:, None]
-            return (np.log(variance) + projected / variance).sum(axis=1)
-
-        return _minimize(criterion, decomposition)
+        variance = 1.0 + square / lam[:, None]
+        return (np.log(variance) + projected / variance).sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -68,13 +76,24 @@ class TruncationGCV:
 
     def __call__(self, decomposition: Decomposition) -> IntArray:
         """Return k (t,)."""
+        count = decomposition.singular_values.shape[1] + 1
+        trials = np.ones(len(decomposition.singular_values))
+        return np.argmin(
+            np.stack([self.score(decomposition, k * trials) for k in range(count)]), axis=0
+        )
+
+    def score(self, decomposition: Decomposition, k: FloatArray) -> FloatArray:
+        """Return RSS / (m - k)^2 (t,) at k (t,)."""
         order = np.arange(decomposition.singular_values.shape[1])
-        used = decomposition.used
-        values = [
-            _gcv(decomposition, np.where((order < k) & used, 0.0, np.inf))
-            for k in range(len(order) + 1)
-        ]
-        return np.argmin(np.stack(values), axis=0)
+        kept = (order < k[:, None]) & decomposition.used
+        return _gcv(decomposition, np.where(kept, 0.0, np.inf))
+
+
+def _is_end_of_range(decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+    """Return which lam (t,) are within one grid point of an end of the grid."""
+    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
+    point = 10.0 ** (1.0 / PER_DECADE)
+    return (lam <= LOWEST * reference * point) | (lam >= HIGHEST * reference / point)
 
 
 def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:

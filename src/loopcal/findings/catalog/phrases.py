@@ -20,6 +20,9 @@ MACHINE = "the machine"
 MOST_PARTS, MOST_WEAK_PARTS = 8, 4
 """Parameters of a combination that a sentence lists, and of one that is only hardly observable."""
 
+MINOR_PART = 0.05
+"""Part of a combination, in tolerances and relative to its largest, that a sentence only counts."""
+
 MOST_ALTERNATIVES = 4
 """Alternative measurements that a sentence lists."""
 
@@ -83,7 +86,15 @@ def changes(data: Data, most: int = MOST_PARTS) -> str:
         pairs = zip(data["names"], data["changes"], strict=True)
         signed = [name if change > 0.0 else f"minus {name}" for name, change in pairs]
         return f"{list_names(signed, most)}, in equal parts"
-    return _list_changes(data["names"], data, most)
+    return _list_changes(data["names"], data, _count_large(data, most))
+
+
+def _count_large(data: Data, most: int) -> int:
+    """Return how many parts, largest first, are not minor; at most `most`, and all without
+    `weights`.
+    """
+    sizes = [abs(weight) for weight in data.get("weights", ())]
+    return min(most, sum(size >= MINOR_PART * max(sizes) for size in sizes) or most)
 
 
 def largest_changes(data: Data) -> str:
@@ -103,6 +114,29 @@ def effect(data: Data, most: int = MOST_PARTS) -> str:
 def _list_changes(names: Sequence[str], data: Data, most: int) -> str:
     zipped = zip(names, data["changes"], data["units"], strict=True)
     return list_names([f"{name} {change:+.4g} {unit}" for name, change, unit in zipped], most)
+
+
+RULES = {
+    "GCV": "generalized cross-validation",
+    "TruncationGCV": "generalized cross-validation",
+    "MarginalLikelihood": "marginal likelihood",
+}
+"""Rule that chooses a regularization -> words."""
+
+
+def regularization(data: Data) -> str:
+    """Return the ridge parameter or truncation, its rule and the score that the rule minimizes."""
+    value = data["value"]
+    if data["parameter"] == "k":
+        what = (
+            f"Truncated SVD: {value:.0f} of the {data['rank']} directions that the data determine"
+        )
+    else:
+        what = f"Ridge regression: lam = {value:.4g} (sigma per tolerance, squared)"
+    if data["rule"] == "fixed":
+        return f"{what}, as given"
+    score = "" if data["score"] is None else f", score {data['score']:.6g}"
+    return f"{what}, chosen by {RULES.get(data['rule'], data['rule'])}{score}"
 
 
 def contradicted_tolerances(data: Data) -> str:
