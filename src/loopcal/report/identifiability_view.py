@@ -6,7 +6,7 @@ from __future__ import annotations
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names
 from loopcal.report.numbers import format_number
-from loopcal.report.tables import Column, build_table, word_column
+from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block
 from loopcal.workflow.identifiability_report import IdentifiabilityReport
 
@@ -16,46 +16,60 @@ SD_MEANING = (
 )
 
 
+FEW_PARAMETERS = 12
+"""Parameters that a summary lists one by one."""
+
+
 def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -> list[Block]:
     """Return the page of an identifiability analysis.
 
-    Rank, what is undetermined, and what to measure. With `verbose` also every combination, the
-    singular values, a statement on each parameter and the observability indices.
+    Rank, what is undetermined, what to measure, and a table of the parameters of small robots. With
+    `verbose` also every combination, the singular values, the table of every robot and the
+    observability indices.
     """
     blocks: list[Block] = [str(finding) for finding in report.summary]
     if report.suggestions:
         blocks.append(str(report_finding("identifiability.known-frames-assumed")))
     if verbose:
-        blocks += ["", *_view_details(report)]
+        blocks += ["", *_view_findings(report)]
+    if verbose or report.analysis.n_parameters <= FEW_PARAMETERS:
+        blocks += _view_parameters(report)
+    if verbose:
+        blocks.append(_view_indices(report))
     if report.subset is not None:
         blocks += ["", str(report.subset)]
     return blocks
 
 
-def _view_details(report: IdentifiabilityReport) -> list[Block]:
-    """Return everything that the summary leaves out."""
-    analysis, said = report.analysis, {finding.code for finding in report.summary}
-    blocks: list[Block] = [str(f) for f in analysis.findings if f.code not in said]
-    blocks += [str(suggestion) for suggestion in report.suggestions]
+def _view_findings(report: IdentifiabilityReport) -> list[Block]:
+    """Return the findings that the summary leaves out, and the measurement for each combination."""
+    said = {finding.code for finding in report.summary}
+    findings = [str(f) for f in report.analysis.findings if f.code not in said]
+    return [*findings, *(str(suggestion) for suggestion in report.suggestions)]
+
+
+def _view_parameters(report: IdentifiabilityReport) -> list[Block]:
+    """Return what the data determine of each parameter."""
     states = {"determined": "yes", "not at all": "no"}
-    return [
-        *blocks,
-        build_table(
-            "Parameters",
-            analysis.parameters,
-            (word_column("name"), lambda row: row.name),
-            (
-                word_column("determined", wraps=True),
-                lambda row: states.get(row.state) or f"only with {list_names(row.others)}",
-            ),
-            (Column("sd / tolerance"), lambda row: f"{row.left:.2f}"),
+    table = build_table(
+        "Parameters",
+        report.analysis.parameters,
+        (word_column("name"), lambda row: row.name),
+        (
+            word_column("determined", wraps=True),
+            lambda row: states.get(row.state) or f"only with {list_names(row.others)}",
         ),
-        SD_MEANING,
-        build_table(
-            "Observability",
-            analysis.indices.rows(),
-            (word_column("index"), lambda row: row[0]),
-            (word_column("meaning", wraps=True), lambda row: row[2]),
-            (Column("value"), lambda row: format_number(row[1], 3)),
-        ),
-    ]
+        (Column("sd / tolerance"), lambda row: f"{row.left:.2f}"),
+    )
+    return [table, SD_MEANING]
+
+
+def _view_indices(report: IdentifiabilityReport) -> Table:
+    """Return the observability indices."""
+    return build_table(
+        "Observability",
+        report.analysis.indices.rows(),
+        (word_column("index"), lambda row: row[0]),
+        (word_column("meaning", wraps=True), lambda row: row[2]),
+        (Column("value"), lambda row: format_number(row[1], 3)),
+    )
