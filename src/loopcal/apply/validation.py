@@ -17,12 +17,13 @@ contains no error of the setup, and before and after differ by the geometry only
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
+from loopcal.apply.held_out_blunders import find_blunders, report_blunders
 from loopcal.apply.validation_findings import (
     ErrorChange,
     check_limit,
@@ -36,15 +37,18 @@ from loopcal.apply.validation_findings import (
     report_setup,
 )
 from loopcal.diagnose import (
+    Blunder,
     KindErrors,
     NoiseFloor,
     PoseErrors,
+    PredictionComparison,
     compare_predictions,
     compute_noise_floor,
     compute_row_errors,
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_input import check_argument
+from loopcal.estimate.inference.fit_uncertainty import FitUncertainty, collect_uncertainty
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements, check_actuators
@@ -75,6 +79,8 @@ class Validation:
     setup_count : number of setup parameters that were fitted to these rows.
     absorbed : number of residuals that estimated poses take up, where a reading is missing.
     judged : number of poses whose rows or redundant readings are compared.
+    blunders : poses that neither the calibration nor the others explain. They are part of all
+        statistics; `without_blunders` are the statistics without them, None where there are none.
     """
 
     poses: tuple[str, ...]
@@ -96,6 +102,8 @@ class Validation:
     setup_count: int = 0
     absorbed: int = 0
     judged: int = 0
+    blunders: tuple[Blunder, ...] = ()
+    without_blunders: Validation | None = None
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -206,10 +214,18 @@ class Validation:
             "reasons": [str(finding) for finding in self.failures],
             "notes": [str(f) for f in self.findings if f.severity is not Severity.FAILURE],
             "findings": self.findings,
+            "blunders": self.blunders,
+            "without_blunders": self._without_blunders(),
             "frame": self.frame,
             "alignment": self.alignment,
             "kinds": [vars(kind) for kind in self.kinds],
         }
+
+    def _without_blunders(self) -> dict[str, Any] | None:
+        """Return the errors without blunders for JSON; None without any."""
+        rest = self.without_blunders
+        names = ("poses", "before", "after", "noise_floor", "kinds")
+        return None if rest is None else {name: getattr(rest, name) for name in names}
 
 
 def validate(
@@ -221,6 +237,7 @@ def validate(
     nuisance_values: Mapping[str, float] | None = None,
     refit: Sequence[str] = (),
     nuisance_values_before: Mapping[str, float] | None = None,
+    uncertainty: FitUncertainty | None = None,
 ) -> Validation:
     """Compare a calibrated robot with measurements, best with some that were not fitted.
 
@@ -235,6 +252,8 @@ def validate(
     refit : names of some of them, such as `tracker*`, to fit to these rows instead.
     nuisance_values_before : the same for the geometry before calibration; default: the values with
         which `fit` began.
+    uncertainty : of the calibration, with which poses that do not fit are recognized; default: that
+        of `fit`; of a robot, none.
 
     Raises
     ------
@@ -252,14 +271,42 @@ def validate(
     _check_refit(refit, data)
     kept_before, kept = _keep_setup(values_before, refit), _keep_setup(values, refit)
     compared = compare_predictions(old, robot, data, kept_before, kept)
+    limits = {"position": limit_position, "orientation": limit_angle}
+    result = _summarize(robot, compared, limits)
+    if uncertainty is None and isinstance(fit, Identification):
+        uncertainty = collect_uncertainty(fit)
+    blunders = find_blunders(robot, compared, uncertainty)
+    rest = None
+    if blunders:
+        named = {label for blunder in blunders for label in blunder.poses}
+        wrong = np.array([label in named for label in data.labels])
+        rest = _summarize(robot, compared.without(wrong), limits)
+    left_out = ~compared.usable & compared.predictable
+    return replace(
+        result,
+        unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
+        findings=(
+            *check_limits(result.after, compared.rows, limits, result.units),
+            *report_blunders(blunders, result, rest),
+            *report_moved_setup(robot, compared, kept),
+            *report_left_out(data, compared),
+            *report_few_rows(result.after),
+            *report_setup(compared.before, compared.after),
+        ),
+        blunders=blunders,
+        without_blunders=rest,
+    )
+
+
+def _summarize(
+    robot: Mechanism, compared: PredictionComparison, limits: Mapping[str, float | None]
+) -> Validation:
+    """Return the errors of a comparison, without findings."""
     rows = compared.data.observations
     errors_before = compared.before.residuals(rows)
     errors_after = compared.after.residuals(rows)
     missed = compared.before.differences(rows, compared.reached)
-    after, usable = compute_row_errors(rows, errors_after), compared.usable
-    limits = {"position": limit_position, "orientation": limit_angle}
-    units = {name: robot.get_unit(errors.dimension) for name, errors in after.quantities.items()}
-    left_out = ~usable & compared.predictable
+    after = compute_row_errors(rows, errors_after)
     return Validation(
         poses=compared.rows,
         before=compute_row_errors(rows, errors_before),
@@ -270,17 +317,10 @@ def validate(
         ),
         not_compensable=compute_row_errors(rows, missed),
         noise_floor=compute_noise_floor(rows),
-        unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
-        limit_position=limit_position,
-        limit_angle=limit_angle,
-        units=units,
-        findings=(
-            *check_limits(after, compared.rows, limits, units),
-            *report_moved_setup(robot, compared, kept),
-            *report_left_out(data, compared),
-            *report_few_rows(after),
-            *report_setup(compared.before, compared.after),
-        ),
+        unreachable=(),
+        limit_position=limits["position"],
+        limit_angle=limits["orientation"],
+        units={name: robot.get_unit(e.dimension) for name, e in after.quantities.items()},
         alignment=group_setup(compared.after),
         kinds=compared.kind_errors(),
         setup_count=compared.after.fitted_count,

@@ -97,7 +97,7 @@ def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
         orientations are those in the stated frame of the instrument.
     """
     if setup:
-        return f"after the best fit of {list_names(setup, 3)}"
+        return f"after the best fit of {list_names(setup, 6)}"
     if {"position", "orientation"} & errors.quantities.keys():
         return "absolute (stated frame)"
     return "without any frame"

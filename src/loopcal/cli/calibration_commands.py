@@ -220,6 +220,7 @@ def validate(
         nuisance_values=calibrated.nuisance_values,
         nuisance_values_before=calibrated.initial_nuisance_values,
         refit=refit,
+        uncertainty=calibrated.load_uncertainty(),
     )
     if as_json:
         terminal.print_json(validation.to_dict())

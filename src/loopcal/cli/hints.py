@@ -89,6 +89,7 @@ HINTS = {
     "workflow.next-measure-more": "use --choose-model to free fewer parameters, or loopcal plan",
     "workflow.next-resolve-warnings": "use --verbose for all findings, loopcal validate for other "
     "data",
+    "workflow.next-check-held-out": "exclude a pose with --drop POSE",
     "compensation.not-converged": "use more --steps, or --mode readings",
     "validation.rows-reused": "use --allow-fitted-data to accept them",
     "validation.file-reused": "use --allow-fitted-data to accept it",

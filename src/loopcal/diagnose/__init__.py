@@ -14,6 +14,8 @@ from loopcal.diagnose.error_frames import ErrorFrame as ErrorFrame
 from loopcal.diagnose.error_frames import choose_error_frame as choose_error_frame
 from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
 from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
+from loopcal.diagnose.fit_checks.blunders import Blunder as Blunder
+from loopcal.diagnose.fit_checks.blunders import name_blunders as name_blunders
 from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck as ClusterCheck
 from loopcal.diagnose.fit_checks.cluster_covariance import check_clusters as check_clusters
 from loopcal.diagnose.fit_checks.correlations import (
@@ -22,6 +24,7 @@ from loopcal.diagnose.fit_checks.correlations import (
 from loopcal.diagnose.fit_checks.expected_errors import (
     estimate_calibration_gain as estimate_calibration_gain,
 )
+from loopcal.diagnose.fit_checks.held_out_rows import check_held_out_rows as check_held_out_rows
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck as OutlierCheck
 from loopcal.diagnose.fit_checks.outliers import find_outliers as find_outliers
 from loopcal.diagnose.fit_checks.reading_errors import ReadingError as ReadingError

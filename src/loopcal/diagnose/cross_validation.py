@@ -221,7 +221,11 @@ def score_leave_one_out(
     y = weight * (s * d.projections[0])
     blocks, member = np.unique(linked_blocks(data), return_inverse=True)
     square = np.zeros(len(penalty))
-    for _, A, r in iterate_blocks(problem, linearization, member, len(blocks)):
+    total, rows = (
+        problem.count_leverage_rows(member, len(blocks)),
+        problem.leverage_rows(linearization),
+    )
+    for _, A, r in iterate_blocks(rows, member, total):
         B = A @ d.directions[0]  # (blocks, m, p)
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))

@@ -55,6 +55,15 @@ class PosePredictions:
         """Number of setup parameters that were fitted to the measurements."""
         return sum(p.free and p.name not in self.kept for p in self.setup.table.entries)
 
+    def regrouped(self, data: Measurements) -> PosePredictions:
+        """Return the same prediction for fewer rows of the same poses."""
+        setup, place = (
+            data.nuisance_parameters,
+            {n: i for i, n in enumerate(self.setup.table.names)},
+        )
+        values = self.values[:, [place[name] for name in setup.table.names]]
+        return replace(self, setup=setup, values=values)
+
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [
@@ -94,7 +103,8 @@ class PredictionComparison:
     absorbed : (n,) number of residuals that each of these takes up.
     solution : poses of the geometry after. before, after : predictions of the two geometries.
     reached : poses that the geometry after reaches when it is commanded to those of `before`.
-    readings : errors of the readings of redundant actuators; None where there are none.
+    reading_fits : of the two geometries, the fits of redundant readings alone; None where there are
+        none.
     """
 
     data: Measurements
@@ -107,7 +117,7 @@ class PredictionComparison:
     before: PosePredictions
     after: PosePredictions
     reached: PosePredictions
-    readings: KindErrors | None
+    reading_fits: tuple[PoseFit | None, PoseFit | None]
 
     def count_judged(self) -> int:
         """Return the number of poses that rows or redundant readings check."""
@@ -115,6 +125,26 @@ class PredictionComparison:
         for o in self.data.observations:
             judged[o.rows] = True
         return int((self.usable if self.readings is not None else judged & self.usable).sum())
+
+    def without(self, poses: BoolArray) -> PredictionComparison:
+        """Return the comparison without some poses (n,), with the same setup parameters."""
+        data, usable = _take_rows(self.data, ~poses), self.usable & ~poses
+        predictions = {
+            name: getattr(self, name).regrouped(data) for name in ("before", "after", "reached")
+        }
+        return replace(
+            self,
+            data=data,
+            rows=label_rows(data),
+            usable=usable,
+            absorbed=np.where(usable, self.absorbed, 0),
+            **predictions,
+        )
+
+    @property
+    def readings(self) -> KindErrors | None:
+        """Errors of the readings of redundant actuators; None where there are none."""
+        return _compare_readings(*self.reading_fits, self.usable)
 
     def kind_errors(self) -> tuple[KindErrors, ...]:
         """Return the errors of each kind, readings among them, and last of all kinds."""
@@ -148,8 +178,8 @@ def compare_predictions(
     DataError
         No row counts, or no pose is reached by both geometries.
     """
-    rows = tuple(o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
-    data = replace(data, observations=rows)
+    counted = (o.take((o.weight > 0.0) & o.present.any(axis=1)) for o in data.observations)
+    data = _take_rows(replace(data, observations=tuple(counted)), np.ones(data.n_poses, dtype=bool))
     if not data.n_rows and after.program.sigma is None:
         raise DataError(report_finding("residuals.no-rows-to-predict"))
     first, last = (
@@ -163,16 +193,10 @@ def compare_predictions(
     if not usable.any():
         solutions = (first.solution.converged, last.solution.converged)
         raise DataError(_explain_unreached(after, predictable, *solutions))
-    rows = tuple(o.take(usable[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows)
-    labels = tuple(
-        "/".join(data.labels[i] for i in poses)
-        for o in rows
-        for poses in o.rows.reshape(len(o), -1)
-    )
-    data = replace(data, observations=rows)
+    data = _take_rows(data, usable)
     return PredictionComparison(
         data,
-        labels,
+        label_rows(data),
         usable,
         predictable,
         last.estimated,
@@ -181,7 +205,7 @@ def compare_predictions(
         predict_poses(before, data, first.solution, usable, setup_before or {}),
         predict_poses(after, data, last.solution, usable, setup_after or {}),
         predict_poses(before, data, commanded, usable, None),
-        _compare_readings(first.readings, last.readings, usable),
+        (first.readings, last.readings),
     )
 
 
@@ -220,6 +244,23 @@ def _locate_poses(
     q = np.where(estimated[:, None], fitted.solution.q, solution.q)
     mixed = make_solution(robot, state, q)
     return _LocatedPoses(mixed, known | estimated, estimated, fitted.absorbed, readings)
+
+
+def _take_rows(data: Measurements, poses: BoolArray) -> Measurements:
+    """Return the measurements with the rows of some poses (n,) only, without kinds of no row."""
+    kept = (
+        o.take(poses[o.rows].reshape(len(o), -1).all(axis=1)) for o in data.observations if len(o)
+    )
+    return replace(data, observations=tuple(o for o in kept if len(o)))
+
+
+def label_rows(data: Measurements) -> tuple[str, ...]:
+    """Return the label of the pose of each row, or of the poses that it compares."""
+    return tuple(
+        "/".join(data.labels[i] for i in poses)
+        for o in data.observations
+        for poses in o.rows.reshape(len(o), -1)
+    )
 
 
 def predict_poses(

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -40,6 +40,9 @@ from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray
+
+AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
+"""From nodes (k,) of nuisance parameters to their paths (k, w), roots and slopes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,9 +228,31 @@ class Problem:
         parameters and their elimination are taken from it. Uncertain poses are where the rows of
         this problem put them at these nuisance parameters.
         """
-        p, z = self.parameters, linearization.deviation
+        z = linearization.deviation
         fixed = None if linearization.nuisance is None else linearization.nuisance.values
         solution = self.poses.solve(z, self.trials, linearization.next_start, self.control, fixed)
+        estimate = linearization.nuisance
+        yield from self._spread_rows(
+            solution, z, None if estimate is None else estimate.elimination.at_nodes
+        )
+
+    def rows_at(self, deviation: FloatArray, nuisance: FloatArray) -> Iterator[list[LeverageRows]]:
+        """Give the rows like `leverage_rows`, but with nuisance parameters that are not eliminated:
+        their columns [1 / SI] are derivatives at given values (1, U).
+        """
+        start = self.start(deviation, seek=False).with_nuisance(nuisance)
+        solution = self.poses.solve(deviation, self.trials, start, self.control, nuisance)
+        unknowns, p = self.nuisance, self.parameters
+        apart = None if unknowns is None else partial(unknowns.keep_apart, p)
+        yield from self._spread_rows(solution, deviation, apart)
+
+    def _spread_rows(
+        self, solution: PoseSolution, z: FloatArray, at_nodes: AtNodes | None
+    ) -> Iterator[list[LeverageRows]]:
+        """Give the rows with columns for all nuisance parameters, by paths, roots and slopes of nodes
+        (`TreeElimination.at_nodes`).
+        """
+        p = self.parameters
         wide = 0 if self.nuisance is None else len(self.nuisance)
         rows_of_blocks = self.poses.iterate_rows(solution, z, self.trials)
         for block, (parts, _) in zip(self.poses.blocks, rows_of_blocks, strict=True):
@@ -237,8 +262,8 @@ class Problem:
                 w = whitened.shape[-1] - p - 1
                 rows = np.zeros((*whitened.shape[:2], wide + p + 1))
                 rows[..., -p - 1 :] = whitened[..., w:]
-                if linearization.nuisance is not None and part.structure >= 0:
-                    path, root, slope = linearization.nuisance.elimination.at_nodes(part.nodes)
+                if at_nodes is not None and part.structure >= 0:
+                    path, root, slope = at_nodes(part.nodes)
                     rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
                     k, m = (
                         np.arange(len(whitened))[:, None, None],

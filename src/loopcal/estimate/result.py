@@ -340,6 +340,8 @@ class Identification:
             "local_estimate": self.nuisance.estimate,
             "local_sd": self.nuisance.sd,
             "local_start": self.nuisance.start,
+            "local_slope": self.nuisance.slope / self.tolerance,
+            "local_root": np.nan_to_num(self.nuisance.root, posinf=0.0),
             **self.posterior.arrays(),
             **({} if self.poses is None else self.poses.arrays()),
         }

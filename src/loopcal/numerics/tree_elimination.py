@@ -153,6 +153,18 @@ class TreeElimination(TrialBatch):
         path = self.tree.structures[structure].path[places]
         return path, self.roots[structure][0][places], self.slope[0][path]
 
+    def joint_root(self) -> FloatArray:
+        """Return a square root (a, U, U) of the covariance of all unknowns at a known machine.
+
+        Its columns belong to independent standard normal variables; see `roots`.
+        """
+        joint = np.zeros((*self.shift.shape, self.shift.shape[1]))
+        for structure, root in zip(self.tree.structures, self.roots, strict=True):
+            u = structure.unknowns.shape[1]
+            rows, columns = structure.unknowns[:, :, None], structure.path[:, None, :]
+            joint[:, rows, columns] = root[:, :, :u]
+        return joint
+
     def variances(self) -> FloatArray:
         """Return the variance (a, U) of each unknown at a known machine, for unit noise.
 

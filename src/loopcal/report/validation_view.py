@@ -30,7 +30,9 @@ def build_error_summary(validation: Validation, caption: str, with_before: bool 
     return _drop_before(_build(caption, "quantity", tuple(rows)), with_before)
 
 
-def build_kind_summary(validation: Validation, with_before: bool = True) -> list[Table]:
+def build_kind_summary(
+    validation: Validation, caption: str, with_before: bool = True
+) -> list[Table]:
     """Return the errors of each kind divided by sigma; no table where one quantity says it all."""
     if not validation.has_several_kinds and validation.quantities:
         return []
@@ -43,8 +45,9 @@ def build_kind_summary(validation: Validation, with_before: bool = True) -> list
             "sigma",
         )
         for kind in validation.kinds
+        if kind.kind != "all" or validation.has_several_kinds
     )
-    return [_drop_before(_build("Errors divided by sigma", "kind", rows), with_before)]
+    return [_drop_before(_build(caption, "kind", rows), with_before)]
 
 
 def name_quantity(validation: Validation, quantity: str) -> str:
@@ -118,7 +121,7 @@ def describe_improvements(validation: Validation) -> list[str]:
     if validation.judged < FEW_ROWS:
         return []
     lines = []
-    for quantity, change in validation.changes().items():
+    for quantity, change in (validation.without_blunders or validation).changes().items():
         name = "error divided by sigma" if quantity == "weighted" else f"{quantity} error"
         lines.append(f"{name[0].upper()}{name[1:]} (rms): {_compare(change)}.")
     return lines
@@ -135,10 +138,20 @@ def view_errors(validation: Validation, what: str, with_before: bool = True) -> 
     n = validation.judged
     poses = f"{n} {what} {'pose' if n == 1 else 'poses'}"
     blocks: list[Block] = []
+    divided = f"Errors at {poses}, divided by sigma"
     if validation.quantities:
         caption = f"Errors at {poses}, {validation.frame}"
         blocks.append(build_error_summary(validation, caption, with_before))
-    return [*blocks, *build_kind_summary(validation, with_before)]
+        divided = "The same divided by sigma"
+    blocks += build_kind_summary(validation, divided, with_before)
+    if (rest := validation.without_blunders) is not None and rest.judged:
+        names = ", ".join(label for blunder in validation.blunders for label in blunder.poses)
+        caption = f"The same without {names}"
+        if rest.quantities:
+            blocks.append(build_error_summary(rest, caption, with_before))
+        else:
+            blocks += build_kind_summary(rest, caption, with_before)
+    return blocks
 
 
 def view_validation(validation: Validation, with_before: bool, verbose: bool) -> list[Block]:

@@ -36,6 +36,12 @@ from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import DataSplit, split_data
 
+OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
+"""Codes of data that a geometry cannot reach."""
+
+NOTHING_TO_COMPARE = ("residuals.readings-missing", "residuals.no-rows-to-predict")
+"""Codes of data that are needed to locate the poses, so that nothing is left to compare."""
+
 STEPS = 5
 """Steps that the progress callback counts: conventions, model, fit, examination, suggestions."""
 
@@ -87,9 +93,10 @@ def calibrate(
         allow_still=options.allow_still,
         allow_implausible=not options.check_conventions,
     )
-    if not split.fitted.n_rows:
+    redundant = robot.program.sigma is not None  # then readings are measurements, too
+    if not split.fitted.n_rows and not redundant:
         raise DataError("the data hold no measured value; fill in what the instrument showed")
-    if split.held_out is not None and not split.held_out.n_rows:
+    if split.held_out is not None and not split.held_out.n_rows and not redundant:
         raise DataError(
             "the held-out poses have no measured value, or are excluded; hold out other poses"
         )
@@ -191,15 +198,21 @@ def _report(
 def _validate(
     fit: Identification, data: Measurements, options: CalibrationOptions
 ) -> tuple[Validation | None, list[Finding]]:
-    """Return errors on poses, or why there are none: a wrong geometry may reach no pose. Values of
-    a fit that did not converge are no estimate, and have none.
+    """Return errors on poses, or why there are none.
+
+    A geometry that reaches no pose is a failure. Held-out data without anything to compare leave
+    the verdict open. Values of a fit that did not converge are no estimate, and have no errors.
     """
     if not fit.converged:
         return None, []
     try:
         return validate(fit, data, options.limit_position, options.limit_angle), []
     except DataError as error:
-        return None, [report_finding("gates.poses-unreachable", reason=str(error))]
+        if error.code in OUT_OF_REACH:
+            return None, [report_finding("gates.poses-unreachable", reason=str(error))]
+        if error.code in NOTHING_TO_COMPARE:
+            return None, [report_finding("workflow.nothing-to-validate", reason=str(error))]
+        raise
 
 
 def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSuggestion, ...] | None:
@@ -238,18 +251,19 @@ def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Fin
         return [report_finding("workflow.no-held-out-poses"), *unreachable]
     if errors is None:
         return []
-    if errors.judged < FEW_ROWS:
-        few = report_finding("workflow.few-held-out-poses", count=errors.judged, needed=FEW_ROWS)
+    checked = errors.without_blunders or errors  # a wrong measurement says nothing of the geometry
+    if checked.judged < FEW_ROWS:
+        few = report_finding("workflow.few-held-out-poses", count=checked.judged, needed=FEW_ROWS)
         return [*errors.findings, few]
-    if errors.values_left < FEW_ROWS:
-        values, setup = errors.kinds[-1].count, errors.setup_count
+    if checked.values_left < FEW_ROWS:
+        values, setup = checked.kinds[-1].count, checked.setup_count
         held_out_setup = report_finding("workflow.held-out-setup", values=values, setup=setup)
         return [*errors.findings, held_out_setup]
     return [
         *errors.findings,
         *(
             report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
-            for quantity, change in errors.changes().items()
+            for quantity, change in checked.changes().items()
             if change.has_grown
         ),
     ]

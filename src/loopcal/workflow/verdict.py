@@ -8,10 +8,17 @@ from enum import Enum
 
 from loopcal.findings import Finding, Severity, report_finding
 
-TOO_FEW_HELD_OUT = ("workflow.few-held-out-poses", "workflow.held-out-setup")
+TOO_FEW_HELD_OUT = (
+    "workflow.few-held-out-poses",
+    "workflow.held-out-setup",
+    "workflow.nothing-to-validate",
+)
 """Findings that ask for more or other held-out poses."""
 
-TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT)
+BLUNDERS = ("validation.blunder", "validation.blunders-dominate")
+"""Findings on held-out poses that do not fit; the second leaves the verdict open."""
+
+TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDERS[1])
 """Findings that leave the verdict open."""
 
 
@@ -34,9 +41,11 @@ def decide_verdict(findings: Iterable[Finding]) -> Verdict:
 
     1. Not calibrated: any failure. Failures are a fit that did not converge, a geometry that
        reaches no held-out pose, residuals that contradict the stated noise, errors on held-out
-       poses that grew by more than 10 %, and a limit that is exceeded.
+       poses that grew by more than 10 % and beyond noise (without poses that do not fit), and a
+       limit that is exceeded at any held-out pose.
     2. Undecided: no pose was held out, or too few to judge an error, or the setup parameters that
-       were fitted to them leave no measured value to check.
+       were fitted to them leave no measured value to check, or poses that do not fit dominate the
+       errors.
     3. Calibrated with reservations: any warning, such as outliers, a prior that the data
        contradict, or undetermined parameter combinations that change poses.
     4. Calibrated: everything else.
@@ -64,6 +73,12 @@ def choose_next_step(
     """
     if verdict is Verdict.CALIBRATED:
         return report_finding("workflow.next-use-result")
+    wrong = [f.data["poses"] for f in findings if f.code == BLUNDERS[0]]
+    if wrong and verdict is not Verdict.RESERVATIONS:
+        labels = tuple(dict.fromkeys(label for poses in wrong for label in poses))
+        return report_finding(
+            "workflow.next-check-held-out", poses=tuple(f"pose {label}" for label in labels)
+        )
     if verdict is Verdict.UNDECIDED:
         if any(finding.code in TOO_FEW_HELD_OUT for finding in findings):
             return report_finding("workflow.next-hold-out-more")

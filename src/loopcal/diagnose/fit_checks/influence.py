@@ -15,19 +15,24 @@ The leverage is the trace of w G. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.linearization import LeverageRows, Linearization
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 TESTABLE = 1e-6
 """Remaining part 1 - w g of a direction below which only this block determines it, so that its
 residual tests nothing.
+"""
+
+UNPREDICTABLE = 1e10
+"""Variance of a predicted residual outside the fit, in units of the noise, above which the fit does
+not predict it.
 """
 
 UNDETERMINED = 1e6
@@ -81,38 +86,58 @@ def compute_influence(
     u, p = len(weight), len(sd)
     leverage, distance, deleted = np.zeros(u), np.zeros(u), np.zeros(u)
     residuals, degrees = np.zeros(u, np.int64), np.zeros(u, np.int64)
-    for blocks, columns, r in iterate_blocks(problem, linearization, member, u):
+    total = problem.count_leverage_rows(member, u)
+    rows = problem.leverage_rows(linearization)
+    for blocks, columns, r in iterate_blocks(rows, member, total):
         # nuisance parameters come first, in units of their standard deviation
         A, nuisance = columns[..., -p:], columns[..., :-p]
         residual = r + A @ change
         present = np.any(A != 0.0, axis=2) | np.any(nuisance != 0.0, axis=2) | (r != 0.0)
         half = np.concatenate([nuisance, A @ covariance_factor], axis=2)
-        g, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
-        w = weight[blocks][:, None]
-        remaining = 1.0 - w * g
-        # absent rows are zero: eigenvectors of value zero and residual zero, subtracted below
-        tested = remaining > TESTABLE
-        square = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
-        safe = np.where(tested, remaining, 1.0)
-        leverage[blocks] = (w * g).sum(axis=1)
-        residuals[blocks] = present.sum(axis=1)
-        normed = square / (safe * (1.0 + (1.0 - w) * g))
-        distance[blocks] = np.where(tested, normed, 0.0).sum(axis=1)
-        degrees[blocks] = tested.sum(axis=1) - (~present).sum(axis=1)
-        deleted[blocks] = np.where(tested, square / safe**2, 0.0).sum(axis=1)
+        tested = compute_block_influence(half, residual, present, weight[blocks])
+        leverage[blocks], residuals[blocks] = tested.leverage, tested.residuals
+        distance[blocks], degrees[blocks] = tested.distance, tested.degrees
+        deleted[blocks] = tested.deleted
     return Influence(leverage, residuals, distance, degrees, deleted)
 
 
+def compute_block_influence(
+    half: FloatArray, residual: FloatArray, present: BoolArray, weight: FloatArray
+) -> Influence:
+    """Return the influence of b blocks of equal size.
+
+    Parameters
+    ----------
+    half : (b, m, k) square root of G. residual : (b, m). present : (b, m) rows that exist; the
+        others are zero. weight : (b,) of the blocks in the fit.
+    """
+    g, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
+    w = weight[:, None]
+    remaining = 1.0 - w * g
+    # absent rows are zero: eigenvectors of value zero and residual zero, subtracted below
+    tested = (remaining > TESTABLE) & ((1.0 - w) * g < UNPREDICTABLE)
+    square = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
+    safe = np.where(tested, remaining, 1.0)
+    normed = square / (safe * (1.0 + (1.0 - w) * g))
+    return Influence(
+        (w * g).sum(axis=1),
+        present.sum(axis=1),
+        np.where(tested, normed, 0.0).sum(axis=1),
+        tested.sum(axis=1) - (~present).sum(axis=1),
+        np.where(tested, square / safe**2, 0.0).sum(axis=1),
+    )
+
+
 def iterate_blocks(
-    problem: Problem, linearization: Linearization, member: IntArray, count: int
+    rows_of_problem: Iterable[list[LeverageRows]], member: IntArray, total: IntArray
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
 
-    A block whose rows come with several chunks of poses waits until the last of them.
+    A block whose rows come with several chunks of poses waits until the last of them. `total` (u,)
+    is the number of rows of each block, see `Problem.count_leverage_rows`.
     """
-    total = problem.count_leverage_rows(member, count)
     waiting: list[tuple[IntArray, FloatArray]] = []
-    for rows_of_block in problem.leverage_rows(linearization):
+    for rows_of_block in rows_of_problem:
         for rows in rows_of_block:
             blocks = np.repeat(member[rows.poses], rows.rows.shape[1])
             waiting.append((blocks, rows.rows.reshape(-1, rows.rows.shape[2])))

@@ -163,6 +163,16 @@ class NuisanceElimination:
         part = replace(data, observations=tuple(rows for rows, _ in chosen))
         values[used] = guess_nuisance_values(part, T, NuisanceParameters(table, places), joints)
 
+    def keep_apart(
+        self, parameters: int, nodes: IntArray
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return paths (k, w) of nodes (k,), with roots and slopes of parameters that are not
+        eliminated: 1 and 0. See `TreeElimination.at_nodes`.
+        """
+        structure = self.tree.structures[int(self.tree.structure[nodes[0]])]
+        w = structure.width
+        return structure.path[self.tree.place[nodes]], np.eye(w), np.zeros((1, w, parameters))
+
     def prior_cost(self, values: FloatArray) -> FloatArray:
         """Return the sum of squares (a,) of the priors at values (a, U)."""
         table, known = self.local.table, self.has_prior

@@ -42,6 +42,7 @@ class NuisanceEstimate:
     sd : standard deviations; infinite where the data do not determine the parameter, 0 where it is
         fixed, NaN without an interval.
     slope : (U, p) change of the best values by the machine's deviations in tolerances.
+    root : (U, U) square root of their covariance at a known machine; NaN without intervals.
     is_unobservable : (U,) parameters with a part in a direction that no row determines, whatever
         the machine.
     display : factor to SI and symbol of the unit in which each is shown.
@@ -52,6 +53,7 @@ class NuisanceEstimate:
     estimate: FloatArray
     sd: FloatArray
     slope: FloatArray
+    root: FloatArray
     is_unobservable: BoolArray
     display: tuple[tuple[float, str], ...]
 
@@ -111,8 +113,9 @@ class NuisanceEstimate:
 def empty_nuisance_estimate(parameters: int) -> NuisanceEstimate:
     """Return the estimate of no nuisance parameters at all, for p parameters."""
     nothing, slope = np.zeros(0), np.zeros((0, parameters))
+    root, is_unobservable = np.zeros((0, 0)), np.zeros(0, dtype=bool)
     return NuisanceEstimate(
-        ParameterTable(()), nothing, nothing, nothing, slope, np.zeros(0, dtype=bool), ()
+        ParameterTable(()), nothing, nothing, nothing, slope, root, is_unobservable, ()
     )
 
 
@@ -141,9 +144,8 @@ def estimate_nuisance(
     if linearization.nuisance is None or not np.isfinite(linearization.cost[0]):
         estimate, nothing = linearization.next_start.nuisance[0].copy(), np.zeros(U)
         unobservable = np.zeros(U, dtype=bool)
-        return NuisanceEstimate(
-            table, begin, estimate, nothing, np.zeros((U, p)), unobservable, shown
-        )
+        slope, root = np.zeros((U, p)), np.full((U, U), np.nan)
+        return NuisanceEstimate(table, begin, estimate, nothing, slope, root, unobservable, shown)
     done, is_free = linearization.nuisance.elimination, nuisance.is_free
     known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
@@ -165,6 +167,7 @@ def estimate_nuisance(
         linearization.nuisance.best[0],
         np.sqrt(variance),
         slope,
+        done.joint_root()[0] * np.sqrt(noise),
         is_unobservable,
         shown,
     )

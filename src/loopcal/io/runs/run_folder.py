@@ -39,6 +39,7 @@ from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
     from loopcal.estimate import Posterior
+    from loopcal.estimate.inference.fit_uncertainty import FitUncertainty
     from loopcal.measure import Measurements
     from loopcal.workflow import CalibrationReport
 
@@ -217,6 +218,18 @@ class Run:
         from loopcal.estimate.inference.posterior import posterior_from_arrays
 
         return posterior_from_arrays(self.robot, self.arrays)
+
+    def load_uncertainty(self) -> FitUncertainty | None:
+        """Return what the fit knows of machine and setup parameters together, to check other
+        measurements; None for a robot file, or a run that does not contain it.
+        """
+        from loopcal.estimate.inference.fit_uncertainty import uncertainty_from_arrays
+
+        fit = self.result.get("fit", {})
+        scale = fit.get("sigma_scale")
+        return uncertainty_from_arrays(
+            self.robot, tuple(self.nuisance_values), self.arrays, 1.0 if scale is None else scale
+        )
 
     def load_measurements(self, **allowed: bool) -> tuple[Measurements, Measurements | None]:
         """Return the fitted and the held-out measurements, from the unchanged input files.
