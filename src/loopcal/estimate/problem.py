@@ -32,6 +32,7 @@ from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
 from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
+from loopcal.estimate.poses.leverage import spread_rows
 from loopcal.estimate.poses.linearization import evaluate_rows, whiten
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
@@ -40,9 +41,6 @@ from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray
-
-AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
-"""From nodes (k,) of nuisance parameters to their paths (k, w), roots and slopes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,9 +230,9 @@ class Problem:
         fixed = None if linearization.nuisance is None else linearization.nuisance.values
         solution = self.poses.solve(z, self.trials, linearization.next_start, self.control, fixed)
         estimate = linearization.nuisance
-        yield from self._spread_rows(
-            solution, z, None if estimate is None else estimate.elimination.at_nodes
-        )
+        at_nodes = None if estimate is None else estimate.elimination.at_nodes
+        rows = self.poses.iterate_rows(solution, z, self.trials)
+        yield from spread_rows(self.poses, rows, self.parameters, self.nuisance, at_nodes)
 
     def rows_at(self, deviation: FloatArray, nuisance: FloatArray) -> Iterator[list[LeverageRows]]:
         """Give the rows like `leverage_rows`, but with nuisance parameters that are not eliminated:
@@ -244,35 +242,8 @@ class Problem:
         solution = self.poses.solve(deviation, self.trials, start, self.control, nuisance)
         unknowns, p = self.nuisance, self.parameters
         apart = None if unknowns is None else partial(unknowns.keep_apart, p)
-        yield from self._spread_rows(solution, deviation, apart)
-
-    def _spread_rows(
-        self, solution: PoseSolution, z: FloatArray, at_nodes: AtNodes | None
-    ) -> Iterator[list[LeverageRows]]:
-        """Give the rows with columns for all nuisance parameters, by paths, roots and slopes of nodes
-        (`TreeElimination.at_nodes`).
-        """
-        p = self.parameters
-        wide = 0 if self.nuisance is None else len(self.nuisance)
-        rows_of_blocks = self.poses.iterate_rows(solution, z, self.trials)
-        for block, (parts, _) in zip(self.poses.blocks, rows_of_blocks, strict=True):
-            of_block = []
-            for part in parts:
-                whitened = part.rows[0]
-                w = whitened.shape[-1] - p - 1
-                rows = np.zeros((*whitened.shape[:2], wide + p + 1))
-                rows[..., -p - 1 :] = whitened[..., w:]
-                if at_nodes is not None and part.structure >= 0:
-                    path, root, slope = at_nodes(part.nodes)
-                    rows[..., -p - 1 : -1] += whitened[..., :w] @ slope
-                    k, m = (
-                        np.arange(len(whitened))[:, None, None],
-                        np.arange(whitened.shape[1])[:, None],
-                    )
-                    rows[k, m, path[:, None, :]] = whitened[..., :w] @ root
-                poses = self.poses.poses_of(block, part)
-                of_block.append(LeverageRows(poses, rows, part.kind, part.numbers))
-            yield of_block
+        rows = self.poses.iterate_rows(solution, deviation, self.trials)
+        yield from spread_rows(self.poses, rows, p, unknowns, apart)
 
     def count_leverage_rows(self, member: IntArray, count: int) -> IntArray:
         """Return how many rows `leverage_rows` gives of each of `count` blocks of poses.
