@@ -58,7 +58,7 @@ TAKEN_OPTIONS = (
 @flag_option(
     "--choose-model",
     help="Free only as many parameters as held-out predictions justify: offsets, then lengths, "
-    "ideal, complete.",
+    "ideal, complete, and what the controller stores; prints their condition numbers.",
 )
 @file_option(
     "--prior",

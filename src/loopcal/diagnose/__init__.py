@@ -45,13 +45,14 @@ from loopcal.diagnose.frame_motions import interpret_fit as interpret_fit
 from loopcal.diagnose.frame_motions import twist_weights as twist_weights
 from loopcal.diagnose.identifiable_parameters import Identifiability as Identifiability
 from loopcal.diagnose.identifiable_parameters import identifiability as identifiability
+from loopcal.diagnose.model_choice import ModelChoice as ModelChoice
+from loopcal.diagnose.model_choice import choose_model as choose_model
+from loopcal.diagnose.model_choice import list_parameter_sets as list_parameter_sets
+from loopcal.diagnose.model_choice import nest_parameter_sets as nest_parameter_sets
 from loopcal.diagnose.parameter_subset import IdentifiableSubset as IdentifiableSubset
-from loopcal.diagnose.parameter_subset import ModelChoice as ModelChoice
 from loopcal.diagnose.parameter_subset import (
     choose_identifiable_subset as choose_identifiable_subset,
 )
-from loopcal.diagnose.parameter_subset import choose_model as choose_model
-from loopcal.diagnose.parameter_subset import nest_parameter_sets as nest_parameter_sets
 from loopcal.diagnose.prediction_errors import PosePredictions as PosePredictions
 from loopcal.diagnose.prediction_errors import PredictionComparison as PredictionComparison
 from loopcal.diagnose.prediction_errors import compare_predictions as compare_predictions

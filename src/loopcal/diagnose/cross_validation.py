@@ -109,12 +109,14 @@ class LeaveOneOut:
 def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
     """Draw the poses held out in each of `count` folds: whole blocks, folds of nearly equal size.
 
+    Poses that a row compares, such as a distance, are in one block: otherwise no fold has the row.
+
     Raises
     ------
     DataError
         There are fewer than two folds, or more folds than blocks.
     """
-    names, member = np.unique(data.block, return_inverse=True)
+    names, member = np.unique(linked_blocks(data), return_inverse=True)
     if count < 2 or len(names) < count:
         raise DataError(
             f"{count} folds of {len(names)} blocks of poses: give at least 2 folds and no more "

@@ -7,7 +7,8 @@ of the result. Where no tolerance is stated, a default one scales the parameter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -104,3 +105,8 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     fallback = np.array([default.get(dimensions[i], DEFAULT_TOLERANCE) for i in places])
     tolerance = np.where(assumed, fallback, table.tolerance[places])
     return FreeParameters(robot, places, table.nominal[places], tolerance, assumed)
+
+
+def free_only(robot: Mechanism, names: Iterable[str]) -> Mechanism:
+    """Return the robot with only these parameters free."""
+    return replace(robot, parameters=robot.parameters.with_free(names))

@@ -127,12 +127,14 @@ def build_last_value_table(rows: Iterable[Mapping[str, Any]]) -> Table:
 def build_model_table(choice: ModelChoice) -> Table:
     """Return the comparison of parameter sets."""
     return build_table(
-        "Parameter sets, mean square error on held-out poses [sigma^2]",
+        "Parameter sets: mean square error on held-out poses [sigma^2], conditioning",
         choice.candidates,
         (word_column("free"), lambda row: row.name + " (chosen)" * (row is choice.chosen)),
         (Column("parameters"), lambda row: str(len(row.parameters))),
-        (Column("score"), lambda row: format_number(row.validation.score, 4)),
-        (Column("+/-"), lambda row: format_number(row.validation.standard_error, 2)),
+        (Column("rank"), lambda row: str(row.conditioning.rank)),
+        (Column("condition"), lambda row: format_number(row.conditioning.condition, 3)),
+        (Column("score"), lambda row: format_number(row.score, 4)),
+        (Column("+/-"), lambda row: format_number(row.standard_error, 2)),
     )
 
 

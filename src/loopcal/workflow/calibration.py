@@ -135,7 +135,8 @@ def _fit(
     if options.choose_model:
         choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
-            raise DataError(report_finding("workflow.no-parameter-chosen"))
+            left_out = choice.finding.data["not_compared"]
+            raise DataError(report_finding("workflow.no-parameter-chosen", not_compared=left_out))
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
     if fit_options.method is None and available < free:

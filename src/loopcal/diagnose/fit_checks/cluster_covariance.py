@@ -54,6 +54,11 @@ JUDGED = 0.5
 directions that one cluster alone determines.
 """
 
+FEWEST_DEGREES = 4.0
+"""Degrees of freedom below which the distribution of a ratio is not known well (Tipton, 2015), and
+its own standard deviation exceeds 35 %.
+"""
+
 COMMON = 1e-9
 """Share of its own size below which a variance of poses is zero."""
 
@@ -286,12 +291,13 @@ def _fold_clusters(
 
 
 def _compare(fit: Identification, data: Measurements, clusters: Clusters) -> ClusterCheck | None:
-    """Return the comparison for clusters; None where residuals cannot judge enough of the poses."""
+    """Return the comparison for clusters; None where residuals cannot judge the poses."""
     spread = compute_robust_spread(fit, data, clusters)
     effects = _pose_effects(fit, data)
     angle, position = (spread.compare(effect) for effect in effects)
     sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
-    if not sizes or max(ratio.share for ratio in sizes) < JUDGED:
+    sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
+    if not sizes:
         return None
     ratios = spread.parameter_ratios()
     largest = int(np.nanargmax(ratios))

@@ -122,7 +122,13 @@ class OutlierCheck:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """The summary, then every outlier and every conflict."""
+        """The summary, then every outlier and every conflict.
+
+        With one degree of freedom all blocks contradict each other by the same number, which the
+        test of the residuals reports.
+        """
+        if [finding.code for finding in self.summary] == ["outliers.one-degree"]:
+            return self.summary
         details = [result.finding for result in (*self.outliers, *self.ambiguous)]
         return (*self.summary, *details)
 
@@ -245,8 +251,9 @@ def _summarize(
         return (report_finding("outliers.not-testable"),)
     if blocks == 1:
         return (report_finding("outliers.single-block"),)
-    if fit.residual_test.noise != "given" and round(fit.residual_test.dof) <= 1:
-        return (report_finding("outliers.unknown-noise"),)
+    if round(fit.residual_test.dof) <= 1:
+        is_given = fit.residual_test.noise == "given"
+        return (report_finding("outliers.one-degree" if is_given else "outliers.unknown-noise"),)
     findings = []
     if count := counts["outliers"]:
         findings.append(report_finding("outliers.some", count=count, level=level, **shared))

@@ -29,6 +29,9 @@ SIGNIFICANCE = 1e-3
 that do not agree with the data.
 """
 
+DOUBT = 1e-2
+"""Probability below which a test does not accept either."""
+
 
 @dataclass(frozen=True)
 class ResidualTest:
@@ -77,6 +80,8 @@ class ResidualTest:
         code = "noise.consistent"
         if self.p_value < SIGNIFICANCE:
             code = "noise.residuals-too-large"
+        elif self.p_value < DOUBT:
+            code = "noise.doubtful"
         elif self.p_value > 1.0 - SIGNIFICANCE:
             code = "noise.residuals-too-small"
         ratio = float(np.sqrt(self.chi_square / self.degrees))

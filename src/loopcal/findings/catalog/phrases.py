@@ -164,6 +164,17 @@ def best_or_near(data: Data) -> str:
     )
 
 
+def sets_not_compared(data: Data) -> str:
+    """Return the sentence, if any, about sets of parameters that folds cannot determine."""
+    if not data["not_compared"]:
+        return ""
+    return fill_template(
+        " Without a fold of the poses too few equations remain to compare {not_compared:list}; "
+        "measure more poses.",
+        **data,
+    )
+
+
 # measurements
 
 

@@ -180,11 +180,14 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
 
 
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
-    """Return the assembly of a record; an unknown name under `fixed` is refused at its line."""
-    names = [parameter.name for parameter in record.expand().parameters] if record.fixed else []
-    for i, pattern in enumerate(record.fixed):
-        try:
-            match_parameter_names(pattern, names)
-        except MechanismError as error:
-            raise file.error(str(error), ("fixed", i)) from None
+    """Return the assembly of a record; an unknown name under `fixed` or `controller` is refused at
+    its line.
+    """
+    names = [parameter.name for parameter in record.expand().parameters]
+    for key in ("fixed", "controller"):
+        for i, pattern in enumerate(getattr(record, key)):
+            try:
+                match_parameter_names(pattern, names, key)
+            except MechanismError as error:
+                raise file.error(str(error), (key, i)) from None
     return record.assembly()

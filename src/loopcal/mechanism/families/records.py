@@ -133,6 +133,7 @@ class RobotRecord:
     home : platform pose in the base at which the loops are closed first; zero by default.
     tool : tool pose on the platform. workspace : where the machine works; poses are drawn from it.
     fixed : parameters that are not identified, by name or pattern, such as `arm*.length`.
+    controller : parameters that the controller of the machine stores, by name or pattern.
     """
 
     family: ClassVar[str] = ""
@@ -144,6 +145,7 @@ class RobotRecord:
     tool: PoseRecord = field(default_factory=PoseRecord)
     workspace: Workspace = field(default_factory=Workspace)
     fixed: tuple[str, ...] = ()
+    controller: tuple[str, ...] = ()
 
     def expand(self) -> Assembly:
         """Return the generic description of this robot."""
@@ -175,7 +177,8 @@ class RobotRecord:
         )
 
     def assembly(self) -> Assembly:
-        """Return the expanded robot, with the parameters of `fixed` kept at their nominal values.
+        """Return the expanded robot, with the parameters of `fixed` kept at their nominal values,
+        and the names of those that the controller stores.
 
         Raises
         ------
@@ -184,20 +187,27 @@ class RobotRecord:
         """
         expanded = self.expand()
         names = [parameter.name for parameter in expanded.parameters]
-        fixed = {name for pattern in self.fixed for name in match_parameter_names(pattern, names)}
+        fixed = _match_all(self.fixed, names, "fixed")
+        stored = _match_all(self.controller, names, "controller")
         parameters = tuple(
             replace(p, free=False) if p.name in fixed else p for p in expanded.parameters
         )
-        return replace(expanded, parameters=parameters)
+        controller = tuple(name for name in names if name in stored)
+        return replace(expanded, parameters=parameters, controller=controller)
 
 
-def match_parameter_names(pattern: str, names: Sequence[str]) -> list[str]:
+def _match_all(patterns: Iterable[str], names: Sequence[str], key: str) -> set[str]:
+    """Return the parameters that match any of these names or patterns."""
+    return {n for pattern in patterns for n in match_parameter_names(pattern, names, key)}
+
+
+def match_parameter_names(pattern: str, names: Sequence[str], key: str = "fixed") -> list[str]:
     """Return the parameters that match a name or pattern; raises MechanismError if none does."""
     matching = fnmatch.filter(names, pattern)
     if not matching:
         hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
         raise MechanismError(
-            f"{pattern!r} under `fixed` matches no parameter of this robot{hint}; correct it"
+            f"{pattern!r} under `{key}` matches no parameter of this robot{hint}; correct it"
         )
     return matching
 
