@@ -2,9 +2,9 @@
 """Errors that sessions or poses share: the cluster-robust uncertainty over the stated one.
 
 The 42-parameter hexapod, drawn from its tolerances, with 30 poses. Either full poses in a known
-frame (10 um, 50 urad), or three targets in an unknown frame (10 um). Independent noise tests the
-false alarms. A common error, of the size of three standard deviations, is one displacement of all
-targets of a pose or of all poses of a session.
+frame (10 um, 50 urad), or three or eight targets in an unknown frame (10 um). Independent noise
+tests the false alarms. A common error, of the size of three standard deviations, is one
+displacement of all targets of a pose or of all poses of a session.
 """
 
 from dataclasses import dataclass, replace
@@ -25,14 +25,20 @@ from loopcal.measure import (
     simulate,
 )
 
-CLEAN, COMMON, POSES = 600, 150, 30
+CLEAN, COMMON, POSES = 400, 100, 30
 SIGMA, ANGLE = 10e-6, 50e-6
-PLACES = np.array([[0.03, -0.02, 0.05], [-0.04, 0.02, 0.05], [0.0, 0.05, 0.06]])
+PLACES = 0.05 * np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (0.5, 1.5)])
 POSE = Sensor(Pose(), Gaussian(np.array([ANGLE] * 3 + [SIGMA] * 3)))
-TARGETS = Sensor(
-    Position(targets=("a", "b", "c"), places=PLACES, unknown=("frame",)),
-    Gaussian(np.full(9, SIGMA)),
-)
+
+
+def make_targets(chosen: tuple[int, ...]) -> Sensor:
+    """Return a tracker in an unknown frame that measures some of the targets."""
+    names = tuple(f"target{i}" for i in chosen)
+    kind = Position(targets=names, places=PLACES[list(chosen)], unknown=("frame",))
+    return Sensor(kind, Gaussian(np.full(3 * len(chosen), SIGMA)))
+
+
+THREE, EIGHT = make_targets((0, 3, 5)), make_targets(tuple(range(8)))
 ROBOT = load_robot("hexapod-42")
 
 
@@ -50,9 +56,10 @@ CASES = (
     Case("full poses", POSE),
     Case("full poses, 8 sessions", POSE, 8),
     Case("full poses, 5 sessions", POSE, 5),
-    Case("three targets", TARGETS),
-    Case("three targets, 5 sessions with a frame each", TARGETS, 5),
-    Case("three targets that share an error", TARGETS, 0, 3.0),
+    Case("three targets", THREE),
+    Case("three targets, 5 sessions with a frame each", THREE, 5),
+    Case("three targets that share an error", THREE, 0, 3.0),
+    Case("eight targets that share an error", EIGHT, 0, 3.0),
     Case("full poses, 8 sessions that share an error", POSE, 8, 3.0),
 )
 

@@ -58,7 +58,7 @@ IMPORTANCE = (
     "residuals.start-not-calibrated",
     "residuals.start-within-noise",
     "residuals.start-is-best",
-    "residuals.independent-errors",
+    "residuals.common-errors-small",
 )
 """Codes of findings, most important first. Codes that are absent here come after these."""
 

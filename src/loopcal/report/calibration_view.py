@@ -42,12 +42,13 @@ def view_calibration(
 ) -> list[Block]:
     """Return the page of a calibration.
 
-    Verdict, errors with the noise floor, the most important findings, the next step, and the
-    parameters. With `verbose` also every finding and table.
+    Verdict, expected error and its sources, errors with the noise floor, the most important
+    findings, the next step, and the parameters. With `verbose` also every finding and table.
     """
     fit = report.identification
     rows = fit.to_dict()
-    blocks: list[Block] = [report.headline, *_view_errors(report)]
+    task = [] if report.budget is None else ["", str(report.budget)]
+    blocks: list[Block] = [report.headline, *task, *_view_errors(report)]
     selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in selected])]
     if more := len(report.findings) - len(selected):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from loopcal.apply import Validation, validate
+from loopcal.apply import Validation, compute_error_budget, validate
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
     ConventionCheck,
@@ -164,6 +164,7 @@ def _report(
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count.begin("examining the residuals")
     examination = examine_fit(fit, fitted, count.progress, options.frame) if fit.converged else None
+    budget = compute_error_budget(fit, fitted, options.frame) if fit.converged else None
     count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
@@ -187,6 +188,7 @@ def _report(
         validation=None if held_out is None else errors,
         fitted_errors=errors if held_out is None else None,
         findings=sort_by_importance(findings),
+        budget=budget,
         examination=examination,
         suggestions=suggestions,
         reading_errors=compute_reading_errors(fit, fitted) if fit.converged else None,

@@ -10,7 +10,7 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
-from loopcal.apply import Validation, collect_fitted_rows
+from loopcal.apply import ErrorBudget, Validation, collect_fitted_rows
 from loopcal.diagnose import (
     ConventionCheck,
     FitExamination,
@@ -74,6 +74,7 @@ class CalibrationReport:
     fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic. None
         where the fit did not converge.
     findings : everything noticed, the most important first.
+    budget : expected errors over the workspace and their sources; None where they cannot be stated.
     examination : outliers, lack of fit, correlations and expected gain; None where the fit did not
         converge.
     suggestions : further measurements that determine open parameter combinations.
@@ -91,6 +92,7 @@ class CalibrationReport:
     validation: Validation | None
     fitted_errors: Validation | None
     findings: tuple[Finding, ...]
+    budget: ErrorBudget | None
     examination: FitExamination | None
     suggestions: tuple[MeasurementSuggestion, ...] | None
     reading_errors: tuple[ReadingError, ...] | None
@@ -141,9 +143,9 @@ class CalibrationReport:
         )
 
     def __str__(self) -> str:
-        """Return verdict, errors, the most important findings and the next step."""
+        """Return verdict, expected and validated errors, important findings and the next step."""
         errors = self.validation or self.fitted_errors
-        lines = [self.headline]
+        lines = [self.headline, *([] if self.budget is None else [str(self.budget)])]
         if errors is not None:
             lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]
             lines += errors.describe_rms()
@@ -171,6 +173,7 @@ class CalibrationReport:
         """Return the results by name, as objects; `to_dict` turns them into JSON values."""
         optional = {
             "change": self.change,
+            "expected_error": self.budget,
             "model_choice": self.model_choice,
             "examination": self.examination,
             "remedies": self.suggestions,

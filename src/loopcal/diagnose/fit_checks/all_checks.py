@@ -78,7 +78,7 @@ def examine_fit(
     return FitExamination(
         find_outliers(fit, data, progress=progress),
         check_lack_of_fit(fit, data),
-        check_clusters(fit, data),
+        check_clusters(fit, data, frame),
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data, frame),
     )

@@ -21,6 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from loopcal import geometry
+from loopcal.diagnose.error_frames import FITTED, choose_error_frame, solve_home
 from loopcal.diagnose.fit_checks.independent_units import (
     FEWEST_CLUSTERS,
     Clusters,
@@ -28,16 +30,14 @@ from loopcal.diagnose.fit_checks.independent_units import (
 )
 from loopcal.diagnose.fit_checks.influence import TESTABLE
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.inference.posterior import scale_variances
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.mechanism import Status, differentiate_pose, forward_trials
+from loopcal.mechanism import differentiate_pose, forward
 from loopcal.numerics.chi_square import compute_chi_square_tail
-from loopcal.numerics.decomposition import decompose
 from loopcal.numerics.tree_elimination import fold_at
 from loopcal.typing import BoolArray, FloatArray
 
@@ -117,7 +117,7 @@ class ClusterCheck:
         }
 
 
-def check_clusters(fit: Identification, data: Measurements) -> ClusterCheck:
+def check_clusters(fit: Identification, data: Measurements, frame: str = FITTED) -> ClusterCheck:
     """Compare the stated uncertainty with one that allows common errors within clusters of poses.
 
     The clusters are the largest independent units of which there are enough, see
@@ -126,6 +126,8 @@ def check_clusters(fit: Identification, data: Measurements) -> ClusterCheck:
     Parameters
     ----------
     fit : an identification. data : the measurements it was made from.
+    frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means
+        relative to the home pose.
     """
     check_fitted_data(fit, data)
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
@@ -134,7 +136,7 @@ def check_clusters(fit: Identification, data: Measurements) -> ClusterCheck:
         return _not_compared("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
     if not fit.residual_test.intervals:
         return _not_compared("residuals.clusters-without-intervals")
-    checks = (_compare(fit, data, clusters) for clusters in units)
+    checks = (_compare(fit, data, clusters, frame) for clusters in units)
     judged = (check for check in checks if check is not None)
     return next(judged, _not_compared("residuals.clusters-not-judged"))
 
@@ -230,30 +232,15 @@ def compute_robust_spread(
     fit : with intervals. data : its measurements, with the sigma of their readings, without
         excluded poses. clusters : the cluster of each pose.
     """
-    problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
-    problem = problem.weighted(fit.pose_weights)
-    z = fit.free_parameters.deviation(fit.robot.values[None])
-    prior = fit.options.prior
-    whole = problem if prior is None else prior.added(problem)
-    linearization = whole.linearize(z, problem.start(z))
-    method, p = fit.method, problem.parameters
-    d = decompose(
-        linearization.factor,
-        linearization.equations,
-        z,
-        method.scale(p),
-        fit.spectrum.tolerance,
-        method.unpenalized(p),
-    )
-    penalty = np.array(method.penalty(d), dtype=np.float64)
-    scaled = scale_variances(d, penalty, fit.residual_test, method)
-    variance = scaled.decomposition.variances(scaled.penalty, scaled.noise)[0]
-    used = np.isfinite(variance) & (d.singular_values[0] > 0.0) & d.used[0]
+    linear = linearize_fit(fit, data)
+    problem, d, p = linear.problem, linear.decomposition, len(fit.names)
+    used = linear.is_estimated
     V = d.scale[:, None] * d.directions[0][:, used]
-    total, sd = (d.singular_values[0] ** 2 + penalty[0])[used], np.sqrt(variance[used])
+    total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
+    sd = np.sqrt(linear.variance[used])
     sigma = fit.residual_test.sigma_scale
     rows = (
-        _fold_clusters(problem, linearization, clusters)
+        _fold_clusters(problem, linear.linearization, clusters)
         / np.r_[np.ones(_width(problem)), np.ones(p), sigma]
     )
     nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
@@ -290,10 +277,12 @@ def _fold_clusters(
     return factor[0]
 
 
-def _compare(fit: Identification, data: Measurements, clusters: Clusters) -> ClusterCheck | None:
+def _compare(
+    fit: Identification, data: Measurements, clusters: Clusters, frame: str
+) -> ClusterCheck | None:
     """Return the comparison for clusters; None where residuals cannot judge the poses."""
     spread = compute_robust_spread(fit, data, clusters)
-    effects = _pose_effects(fit, data)
+    effects = _pose_effects(fit, data, frame)
     angle, position = (spread.compare(effect) for effect in effects)
     sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
     sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
@@ -304,7 +293,7 @@ def _compare(fit: Identification, data: Measurements, clusters: Clusters) -> Clu
     parameter = (fit.names[largest], float(ratios[largest]))
     beyond = [r for r in sizes if r.ratio > LIMIT and r.p_value < SIGNIFICANCE]
     finding = report_finding(
-        "residuals.common-errors" if beyond else "residuals.independent-errors",
+        "residuals.common-errors" if beyond else "residuals.common-errors-small",
         unit=clusters.unit,
         count=clusters.count,
         ratio=max(r.ratio for r in beyond or sizes),
@@ -314,15 +303,21 @@ def _compare(fit: Identification, data: Measurements, clusters: Clusters) -> Clu
     return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
 
 
-def _pose_effects(fit: Identification, data: Measurements) -> tuple[FloatArray, FloatArray]:
-    """Return changes of orientation (3 n, p) and position (3 n, p) of the measured poses."""
+def _pose_effects(
+    fit: Identification, data: Measurements, frame: str
+) -> tuple[FloatArray, FloatArray]:
+    """Return changes of orientation (3 n, p) and of the tool's position (3 n, p) of the measured
+    poses, in a frame, by deviations in tolerances.
+    """
+    robot, posterior = fit.robot, fit.posterior
     readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
-    values, readings = fit.robot.values[None], readings[None]
-    state = forward_trials(fit.robot, values, readings)
-    is_reached = np.asarray(state.status == Status.CONVERGED)[0]
-    D = differentiate_pose(fit.robot, values, readings, state).parameters[0, is_reached]
-    D = D[..., fit.free_parameters.places] * fit.tolerance
-    p = D.shape[-1]
+    solution = forward(robot, readings)
+    solution = solution.take(np.flatnonzero(solution.converged))
+    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
+    chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")
+    H = geometry.transport_matrix(solution.T[:, :3, :3] @ robot.tool[:3, 3])
+    D = H @ chosen.relate(S.parameters[0][..., posterior.places] * posterior.unit, solution.T)
+    D, p = D * (fit.tolerance / posterior.unit), len(posterior.unit)
     return D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
 
 

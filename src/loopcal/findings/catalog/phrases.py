@@ -175,6 +175,38 @@ def sets_not_compared(data: Data) -> str:
     )
 
 
+SOURCES = {
+    "instrument": "instrument",
+    "setup": "set-up",
+    "tolerances": "undetermined tolerances",
+    "repeatability": "repeatability",
+}
+"""Source of an expected error -> words."""
+
+
+def error_sources(data: Data) -> str:
+    """Return expected errors of position and orientation, each with its sources."""
+    words = dict(SOURCES)
+    if data["tolerances_assumed"]:
+        words["tolerances"] += " (assumed)"
+    sentences = []
+    for name in ("position", "orientation"):
+        if not data[name]:
+            continue
+        total, sources = data[name]
+        parts = [f"{words[key]} {_quantity(sources[key])}" for key in words if key in sources]
+        sentences.append(f"{name} {_quantity(total)}, from {list_names(parts)}")
+    if not sentences:
+        return "none"
+    missing = "" if data["repeatability_stated"] else " (repeatability of the actuators not stated)"
+    return "; ".join(sentences) + missing
+
+
+def _quantity(value: Any) -> str:
+    """Return a quantity as the templates write it."""
+    return fill_template("{value}", value=value)
+
+
 # measurements
 
 

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rows of a fit, linearized once more at its estimate: what its statistics are read from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.estimate.inference.posterior import ScaledNoise, scale_variances
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of
+from loopcal.estimate.result import Identification
+from loopcal.measure import Measurements
+from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.typing import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class FitLinearization:
+    """The problem of a fit at its estimate, weighted as in the fit (t = 1).
+
+    Attributes
+    ----------
+    problem : without the rows of an earlier calibration. linearization : with them.
+    decomposition, penalty : of the fit. scaled : from which variances are read.
+    """
+
+    problem: Problem
+    linearization: Linearization
+    decomposition: Decomposition
+    penalty: FloatArray
+    scaled: ScaledNoise
+
+    @property
+    def variance(self) -> FloatArray:
+        """(p,) variance of each direction; infinite where it is not estimated."""
+        return self.scaled.decomposition.variances(self.scaled.penalty, self.scaled.noise)[0]
+
+    @property
+    def is_estimated(self) -> BoolArray:
+        """(p,) directions that the rows determine and the fit estimates."""
+        return np.isfinite(self.variance) & self.decomposition.used[0]
+
+
+def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
+    """Linearize the rows of a fit at its estimate.
+
+    Parameters
+    ----------
+    fit : a fit that converged. data : its measurements, with the sigma of their readings, without
+        excluded poses.
+    """
+    problem, linearization = _linearize(fit, data, is_setup_known=False)
+    method, p = fit.method, problem.parameters
+    d = decompose(
+        linearization.factor,
+        linearization.equations,
+        linearization.deviation,
+        method.scale(p),
+        fit.spectrum.tolerance,
+        method.unpenalized(p),
+    )
+    penalty = np.array(method.penalty(d), dtype=np.float64)
+    scaled = scale_variances(d, penalty, fit.residual_test, method)
+    return FitLinearization(problem, linearization, d, penalty, scaled)
+
+
+def factor_known_setup(fit: Identification, data: Measurements) -> FloatArray:
+    """Return the triangular factor (p, p) of the whitened rows of a fit by the parameters in
+    tolerances, as if its frames, targets, surfaces and offsets were known.
+    """
+    return _linearize(fit, data, is_setup_known=True)[1].factor[0, :-1, :-1]
+
+
+def _linearize(
+    fit: Identification, data: Measurements, *, is_setup_known: bool
+) -> tuple[Problem, Linearization]:
+    """Return the weighted problem of a fit, and its linearization with an earlier calibration."""
+    setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
+    values = fit.nuisance.estimate
+    if is_setup_known and len(setup):
+        setup = setup.with_nominal(values).with_fixed("*")
+    problem = problem_of(fit.free_parameters, data, setup).weighted(fit.pose_weights)
+    z = fit.free_parameters.deviation(fit.robot.values[None])
+    start = problem.start(z, seek=False)
+    start = start.with_nuisance(values[None]) if len(setup) else start
+    prior = fit.options.prior
+    with_prior = problem if prior is None else prior.added(problem)
+    return problem, with_prior.linearize(z, start)
