@@ -118,7 +118,11 @@ class Comparison:
     @cached_property
     def within(self) -> BoolArray:
         """(r, c) which numbers agree."""
-        return np.abs(self.difference) <= self.step * (1.0 + ROUNDING)
+        return self.agrees_with(self.computed)
+
+    def agrees_with(self, numbers: FloatArray) -> BoolArray:
+        """Return which of other computed numbers (r, c) agree with the published ones."""
+        return np.abs(numbers - self.published.values) <= self.step * (1.0 + ROUNDING)
 
     @property
     def count(self) -> int:

@@ -26,6 +26,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -203,6 +204,7 @@ def _evaluate(term: str, data: Mapping[str, Any]) -> Any:
         return Formatter().get_field(term, (), data)[0]
 
 
+@cache
 def read_wording(module: str) -> Wording:
     """Return the content of the text.yaml beside a module (its `__file__`)."""
     from loopcal.io.core.yaml_file import read_yaml

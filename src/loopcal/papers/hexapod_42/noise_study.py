@@ -19,18 +19,20 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import forward_trials
-from loopcal.papers.hexapod_42.leg_form import identify_per_leg
-from loopcal.papers.hexapod_42.published import MM, Published
+from loopcal.papers.hexapod_42.leg_form import LegForm, identify_per_leg
+from loopcal.papers.hexapod_42.published import MM, TO_PRINTED, Published, to_values
 from loopcal.papers.hexapod_42.steps import (
     Study,
     compute_actual_poses,
     draw_measured_poses,
     integrate_errors,
     iterate,
+    name_orientation,
     to_transforms,
+    to_twists,
 )
 from loopcal.papers.printed import Cell
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 STATED = (1e-3, 1e-6)
 """Limits [mm, rad] of the stated noise. The paper gives none for angles: the same number in the
@@ -48,6 +50,7 @@ RANGES = {
     WIDE: ((-40.0, -40.0, 170.0, -14.0, -14.0, -14.0), (40.0, 40.0, 230.0, 14.0, 14.0, 14.0)),
 }
 """Of drawn poses: low and high x, y, z [mm], alpha, beta, gamma [deg]."""
+PAPERS_TEN = "the paper's ten"
 UNMEASURED = 100
 """Poses that are not measured, on which methods are compared."""
 DRAWN_POSES = 3  # purpose of a random stream
@@ -73,10 +76,10 @@ class Level:
         """(4,) medians of the sizes."""
         return np.median(self.sizes, axis=0)
 
-    def contains(self, sizes: FloatArray) -> bool:
-        """Return whether sizes (4,) lie between the smallest and the largest drawn ones."""
+    def contains(self, sizes: FloatArray) -> BoolArray:
+        """Return which sizes (4,) lie between the smallest and the largest drawn ones."""
         low, high = self.sizes.min(axis=0), self.sizes.max(axis=0)
-        return bool(np.all((sizes >= low) & (sizes <= high)))
+        return (sizes >= low) & (sizes <= high)
 
 
 @dataclass(frozen=True)
@@ -129,8 +132,13 @@ def list_levels(levels: tuple[Level, ...], published: FloatArray) -> list[tuple[
     for level in levels:
         met = f"{int(np.isfinite(level.needed).sum())} of {len(level.needed)}"
         sizes = (*level.limits, *map(float, level.median))
-        rows.append(("computed, median", *sizes, met, level.contains(published)))
+        rows.append(("computed, median", *sizes, met, bool(level.contains(published).all())))
     return rows
+
+
+def find_level(levels: tuple[Level, ...], limits: tuple[float, float]) -> Level:
+    """Return the results with one of LEVELS."""
+    return levels[LEVELS.index(limits)]
 
 
 def compare_methods(study: Study, seed: int, trials: int) -> tuple[MethodResult, ...]:
@@ -162,7 +170,7 @@ def compare_methods(study: Study, seed: int, trials: int) -> tuple[MethodResult,
 def compare_poses(study: Study, threshold: float, seed: int, trials: int) -> list[tuple[Cell, ...]]:
     """Return table rows for other numbers and ranges of poses."""
     sets = [("first of the paper", study.poses[:n]) for n in (7, 8, 9)]
-    sets.append(("the paper's ten", study.poses))
+    sets.append((PAPERS_TEN, study.poses))
     for name, counts in ((NARROW, (20, 40)), (WIDE, (10, 20, 40))):
         sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
     rows: list[tuple[Cell, ...]] = []
@@ -176,8 +184,29 @@ def compare_poses(study: Study, threshold: float, seed: int, trials: int) -> lis
             for values in (_identify_per_leg(other, simulated), together)
         ]
         needed, condition = exact.count_needed(threshold), float(exact.conditions.max())
-        rows.append((name, len(poses), needed, condition, *errors))
+        left = _compute_rms(exact.compute_parameter_errors(study.truth)[-1] / MM)
+        rows.append((name, len(poses), needed, left, condition, *errors))
     return rows
+
+
+def recover_noise(study: Study, printed: Published) -> FloatArray:
+    """Return the noise (n, 6) [m, rad] that Tables 5 and 6 together imply.
+
+    residual = noise + D (true - corrected parameters), with D the change of the coordinates.
+    """
+    actual = compute_actual_poses(study)
+    D = LegForm.at(study.truth, study.solve_truth()).D
+    rates = name_orientation(study.order).rates_inverse(actual[:, 3:])
+    by_coordinates = np.concatenate([D[:, 3:], rates @ D[:, :3]], axis=1)
+    errors = to_values(study.robot, printed.parameter_errors_after.values * 1e-3 * MM)
+    return printed.pose_errors_after.values / TO_PRINTED - by_coordinates @ errors
+
+
+def compute_explained_share(study: Study, printed: Published) -> FloatArray:
+    """Return the share (6,) of each leg's residuals of Table 6 that parameters could explain."""
+    residuals = printed.pose_errors_after.values / TO_PRINTED
+    legs = LegForm.at(study.truth, study.solve_truth())
+    return legs.explain(to_twists(residuals, compute_actual_poses(study), study.order))
 
 
 def compute_initial_error(study: Study) -> float:

@@ -23,6 +23,8 @@ ODD_POSE = "A2"
 """The row of Table 4 that belongs to another machine. The outlier search of table_4_study.py
 finds it without being told.
 """
+TO_PRINTED = np.array([1.0 / MM] * 3 + [1.0] * 3)
+"""From [m, rad] to the units of Tables 4 and 6."""
 
 
 @dataclass(frozen=True)

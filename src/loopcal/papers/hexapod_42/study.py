@@ -16,6 +16,7 @@ from loopcal.papers.hexapod_42.published import (
     MM,
     ODD_POSE,
     PARAMETERS,
+    TO_PRINTED,
     Published,
     load_nominal_machine,
     make_true_machine,
@@ -31,7 +32,7 @@ from loopcal.papers.hexapod_42.steps import (
     iterate,
 )
 from loopcal.papers.hexapod_42.table_4_study import Order, Outliers, write_rotation
-from loopcal.papers.hexapod_42.verdicts import TO_PRINTED, judge_claims
+from loopcal.papers.hexapod_42.verdicts import judge_claims
 from loopcal.papers.printed import Cell, Comparison, Printed, Table
 from loopcal.papers.reproduction import Content, Figure, Series
 from loopcal.papers.wording import read_wording
@@ -51,7 +52,8 @@ class Results:
     exact, frozen, presumed, stated : the ten steps without noise, the same with one matrix
         throughout, and with two levels of noise.
     levels, methods, poses : see noise_study.py. orders, outliers, rounding : see table_4_study.py.
-    comparisons : by name of the table.
+    comparisons : by name of the table. explained : (6,) and noise : (n, 6) [m, rad], what Tables 5
+        and 6 imply, see noise_study.py.
     """
 
     printed: Published
@@ -68,6 +70,8 @@ class Results:
     outliers: Outliers
     rounding: list[tuple[Cell, ...]]
     comparisons: Mapping[str, Comparison]
+    explained: FloatArray
+    noise: FloatArray
 
 
 def present(results: Results, seed: int) -> Content:
@@ -122,6 +126,8 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
         outliers=outliers,
         rounding=rounding,
         comparisons={c.name: c for c in compare_tables(printed, study, odd, exact, presumed)},
+        explained=noise_study.compute_explained_share(study, printed),
+        noise=noise_study.recover_noise(study, printed),
     )
 
 

@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.papers.hexapod_42.leg_form import LegForm
-from loopcal.papers.hexapod_42.noise_study import PRESUMED, STATED, Level, compute_published_sizes
-from loopcal.papers.hexapod_42.published import MM, ODD_POSE, to_values
-from loopcal.papers.hexapod_42.steps import compute_actual_poses, name_orientation, to_twists
+from loopcal.papers.hexapod_42.noise_study import (
+    PAPERS_TEN,
+    PRESUMED,
+    STATED,
+    compute_published_sizes,
+    find_level,
+)
+from loopcal.papers.hexapod_42.published import MM, ODD_POSE, TO_PRINTED
 from loopcal.papers.hexapod_42.table_4_study import write_rotation
 from loopcal.papers.reproduction import Verdict
 from loopcal.papers.wording import Wording, read_wording
-from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
     from loopcal.papers.hexapod_42.study import Results
-
-TO_PRINTED = np.array([1.0 / MM] * 3 + [1.0] * 3)
-"""From [m, rad] to the units of Tables 4 and 6."""
 
 ROUNDED = ("before", "as printed", "row corrected", "without row", "in full", "weighted", "prior")
 """Short names of the rows of the table `rounding`."""
@@ -71,7 +71,7 @@ def _judge_table_4(words: Wording, results: Results) -> tuple[Verdict, ...]:
 
 
 def _judge_iteration(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    printed, stated = results.printed, _find_level(results, STATED)
+    printed, stated = results.printed, find_level(results.levels, STATED)
     needed = [run.count_needed(printed.threshold) for run in (results.exact, results.frozen)]
     return (
         words.judge(
@@ -86,27 +86,35 @@ def _judge_iteration(words: Wording, results: Results) -> tuple[Verdict, ...]:
 
 
 def _judge_residuals(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    stated, sizes = _find_level(results, STATED), compute_published_sizes(results.printed)
-    holding = [level for level in results.levels if level.contains(sizes)]
+    stated, sizes = find_level(results.levels, STATED), compute_published_sizes(results.printed)
+    holding = [level for level in results.levels if level.contains(sizes).all()]
     names = [f"+-{lv.limits[0]:g} mm with +-{lv.limits[1]:g} rad" for lv in holding]
-    explained = 100.0 * _compute_explained_share(results)
+    explained = 100.0 * results.explained
     before = results.comparisons["table_6_before"]
     is_good = np.array([label != ODD_POSE for label in before.published.labels])
-    noise = recover_noise(results) * TO_PRINTED
+    as_rad, as_mrad = (
+        int(before.agrees_with(factor * before.computed)[is_good, 3:].sum())
+        for factor in (1.0, 1e3)
+    )
+    noise = results.noise * TO_PRINTED
     mean, scatter = noise.mean(axis=0), noise.std(axis=0, ddof=1)
     lengths, angles = (", ".join(f"{x:.1e}" for x in part) for part in (mean[:3], mean[3:]))
     limit = PRESUMED[0]
     return (
         words.judge(
-            "noise_size", "" if holding else "none", agrees=stated in holding, printed=sizes,
-            noise=results.printed.noise / MM, holding=names, stated=stated.median,
+            "noise_size", "" if holding else "none", inside=int(stated.contains(sizes).sum()),
+            sizes=len(sizes), printed=sizes, noise=results.printed.noise / MM, holding=names,
+            stated=stated.median,
         ),
         words.judge(
             "residuals", least=explained.min(), most=explained.max(), random=100.0 * np.sqrt(0.7)
         ),
-        words.judge("milliradians", agrees=not before.within[is_good, 3:].all(), row=ODD_POSE),
         words.judge(
-            "mean_noise", agrees=(np.abs(mean) < 4.0 * scatter / np.sqrt(len(noise))).all(),
+            "milliradians", as_rad=as_rad, as_mrad=as_mrad, count=3 * int(is_good.sum()),
+            row=ODD_POSE,
+        ),
+        words.judge(
+            "mean_noise", offset=(np.abs(mean) * np.sqrt(len(noise)) / scatter).max(),
             lengths=lengths, angles=angles, scatter_mm=scatter[:3].max(),
             scatter_rad=scatter[3:].max(), limit=limit, limit_sd=limit / np.sqrt(3.0),
         ),
@@ -115,7 +123,7 @@ def _judge_residuals(words: Wording, results: Results) -> tuple[Verdict, ...]:
 
 def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
     before, alone, together, prior = results.methods
-    seven, ten = (next(row for row in results.poses if row[1] == n) for n in (7, 10))
+    seven, ten = results.poses[0], next(row for row in results.poses if row[0] == PAPERS_TEN)
     methods: dict[str, Any] = {
         "before": before,
         "alone": alone,
@@ -124,7 +132,6 @@ def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
     }
     ratio, ratio_of_methods = (alone.parameters / m.parameters for m in (before, together))
     smaller = {limits: _count_smaller(results, limits) for limits in (STATED, PRESUMED)}
-    agrees = np.isfinite(float(str(seven[3]))) and seven[2] is not None
     return (
         words.judge(
             "parameters_improve", ratio=ratio, smaller_stated=smaller[STATED],
@@ -132,30 +139,10 @@ def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
         ),
         words.judge("positions_improve", **methods),
         words.judge("leg_by_leg", ratio=ratio_of_methods, **methods),
-        words.judge("seven_poses", agrees=agrees, iterations=seven[2], seven=seven[3], ten=ten[3]),
+        words.judge(
+            "seven_poses", iterations=seven[2], error=seven[3], seven=seven[4], ten=ten[4]
+        ),
     )  # fmt: skip
-
-
-def recover_noise(results: Results) -> FloatArray:
-    """Return the noise (n, 6) [m, rad] that Tables 5 and 6 together imply.
-
-    residual = noise + D (true - corrected parameters), with D the change of the coordinates.
-    """
-    study, printed = results.study, results.printed
-    actual = compute_actual_poses(study)
-    D = LegForm.at(study.truth, study.solve_truth()).D
-    rates = name_orientation(study.order).rates_inverse(actual[:, 3:])
-    by_coordinates = np.concatenate([D[:, 3:], rates @ D[:, :3]], axis=1)
-    errors = to_values(study.robot, printed.parameter_errors_after.values * 1e-3 * MM)
-    return printed.pose_errors_after.values / TO_PRINTED - by_coordinates @ errors
-
-
-def _compute_explained_share(results: Results) -> FloatArray:
-    """Return the share (6,) of each leg's residuals of Table 6 that parameters could explain."""
-    study = results.study
-    residuals = results.printed.pose_errors_after.values / TO_PRINTED
-    legs = LegForm.at(study.truth, study.solve_truth())
-    return legs.explain(to_twists(residuals, compute_actual_poses(study), study.order))
 
 
 def _count_smaller(results: Results, limits: tuple[float, float]) -> int:
@@ -163,7 +150,3 @@ def _count_smaller(results: Results, limits: tuple[float, float]) -> int:
     run = results.presumed if limits == PRESUMED else results.stated
     errors = np.abs(run.compute_parameter_errors(results.study.truth))
     return int((errors[results.printed.iterations] < errors[0]).sum())
-
-
-def _find_level(results: Results, limits: tuple[float, float]) -> Level:
-    return next(level for level in results.levels if level.limits == limits)
