@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 from loopcal.mechanism import Mechanism
+from loopcal.papers.cmm_constraint_2011 import layouts
 from loopcal.papers.cmm_constraint_2011.calibrations import (
     BEFORE,
     LINES,
@@ -16,15 +17,12 @@ from loopcal.papers.cmm_constraint_2011.calibrations import (
     METHODS,
     PRIOR,
     Cell,
-    calibrate_cell,
     calibrate_fifty,
     calibrate_grid,
     compute_rank_correlation,
 )
 from loopcal.papers.cmm_constraint_2011.layouts import (
-    NOISE,
     ONE,
-    SET,
     TEN,
     evaluate_arrangement,
     list_printed,
@@ -43,8 +41,6 @@ from loopcal.papers.cmm_constraint_2011.machines import (
     load_machine,
     plan_points,
 )
-from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.steps import WEIGHTS
 from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 
@@ -104,12 +100,7 @@ def compare_weights(study: Study, full: Cell) -> list[list[Any]]:
     """Return errors by LS and MAP for each weighting of the rows, and the ratio of LS to that as
     printed.
     """
-    cells = {
-        w: full
-        if w == "full"
-        else calibrate_cell(study, SET * MM, NOISE * MM, SEED, DRAWS, weights=w)
-        for w in WEIGHTS
-    }
+    cells = layouts.compare_weights(study, SEED, DRAWS, full)
     position, parameters = (
         MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]")
     )
@@ -174,7 +165,7 @@ def collect() -> dict[str, Any]:
             ONE, plan_points(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW_DRAWS
         ),
     )
-    layouts = [
+    placed = [
         ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
         ["one plane, one line", one.drawn, one.optimized, *_pair(one.cell), FEW_DRAWS],
     ]
@@ -225,7 +216,7 @@ def collect() -> dict[str, Any]:
                     "draws",
                 ],
                 ["", ".3g", ".3g", ".3g", ".3g", "d"],
-                layouts,
+                placed,
             ),
             "weights": make_table(
                 [

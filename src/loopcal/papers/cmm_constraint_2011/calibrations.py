@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method
+from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
     FRAMES,
@@ -42,8 +43,8 @@ class Cell:
     ----------
     sd, noise : standard deviations [m]. is_gauge_free : whether the true errors have no part
         that plane and line cannot determine.
-    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. failed : descents
-        that did not converge.
+    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. converged : by LS,
+        MAP, (t,).
     """
 
     sd: float
@@ -51,11 +52,16 @@ class Cell:
     is_gauge_free: bool
     errors: Mapping[str, FloatArray]
     iterations: IntArray
-    failed: int
+    converged: Mapping[str, BoolArray]
+
+    @property
+    def failed(self) -> int:
+        """Number of descents that did not converge."""
+        return sum(int((~converged).sum()) for converged in self.converged.values())
 
     def compute_median(self, method: str) -> FloatArray:
-        """Return medians (7,) over the draws."""
-        return np.median(self.errors[method], axis=0)
+        """Return medians (7,) over the machines on which the method converged."""
+        return compute_median(self.errors[method], self.converged.get(method))
 
     def compute_reduction(self, method: str) -> FloatArray:
         """Return percentages (7,) by which the medians fall."""
@@ -67,8 +73,9 @@ class Cell:
         return float(f"{self.noise / self.sd:.6g}")
 
     def count_worse(self, method: str, measure: int) -> int:
-        """Return how many machines a method makes worse."""
-        return int((self.errors[method][:, measure] > self.errors[BEFORE][:, measure]).sum())
+        """Return how many machines a method makes worse, of those on which it converged."""
+        is_worse = self.errors[method][:, measure] > self.errors[BEFORE][:, measure]
+        return int((is_worse & self.converged[method]).sum())
 
 
 def calibrate_cell(
@@ -95,13 +102,13 @@ def calibrate_cell(
     errors = {
         BEFORE: study.held_out.compute_errors(study.robot.parameters.nominal[None], truth, true)
     }
-    failed, iterations = 0, np.zeros(trials, dtype=np.int64)
+    converged, iterations = {}, np.zeros(trials, dtype=np.int64)
     for name, method in METHODS.items():
         descent = identify_from_rows(problem, method)
         errors[name] = study.held_out.compute_errors(problem.values(descent.deviation), truth, true)
-        failed += int((descent.status != 0).sum())
+        converged[name] = descent.status == DescentStatus.CONVERGED
         iterations = descent.iterations if name == LS else iterations
-    return Cell(sd, noise, gauge_free, errors, iterations, failed)
+    return Cell(sd, noise, gauge_free, errors, iterations, converged)
 
 
 def calibrate_grid(
@@ -138,20 +145,21 @@ class FiftyPoints:
 
     Attributes
     ----------
-    groups : planes. iterations : (t,) of least squares. converged : (t,). rank : (t,).
+    groups : planes. iterations : (t,) of least squares. converged : by LS, MAP, (t,).
+    rank : (t,) of least squares.
     statistics : by method and frame (see FRAMES), (t, 4) see STATISTICS, over held-out poses.
     """
 
     groups: int
     iterations: IntArray
-    converged: BoolArray
+    converged: Mapping[str, BoolArray]
     rank: IntArray
     statistics: dict[tuple[str, str], FloatArray]
 
     @property
     def within_five(self) -> float:
         """Percentage of the machines on which least squares converges within 5 iterations."""
-        return 100.0 * float(np.mean((self.iterations <= 5) & self.converged))
+        return 100.0 * float(np.mean((self.iterations <= 5) & self.converged[LS]))
 
     @property
     def most_iterations(self) -> int:
@@ -159,8 +167,8 @@ class FiftyPoints:
         return int(self.iterations.max())
 
     def compute_median(self, method: str, frame: str) -> FloatArray:
-        """Return medians (4,) over the machines."""
-        return np.median(self.statistics[method, frame], axis=0)
+        """Return medians (4,) over the machines on which the method converged."""
+        return compute_median(self.statistics[method, frame], self.converged.get(method))
 
     def compute_factors(self, method: str, frame: str) -> FloatArray:
         """Return the factors (4,) by which calibration reduces the medians."""
@@ -188,8 +196,15 @@ def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyP
         for name, values in machines.items()
         for frame in FRAMES
     }
-    ls = descents["LS"]
-    return FiftyPoints(groups, ls.iterations, ls.status == 0, ls.decomposition.rank, statistics)
+    ls = descents[LS]
+    converged = {name: d.status == DescentStatus.CONVERGED for name, d in descents.items()}
+    return FiftyPoints(groups, ls.iterations, converged, ls.decomposition.rank, statistics)
+
+
+def compute_median(errors: FloatArray, converged: BoolArray | None = None) -> FloatArray:
+    """Return medians (k,) of errors (t, k) of the converged machines (t,); NaN without any."""
+    kept = errors if converged is None else errors[converged]
+    return np.median(kept, axis=0) if len(kept) else np.full(errors.shape[1], np.nan)
 
 
 def _compute_statistics(twists: FloatArray) -> FloatArray:

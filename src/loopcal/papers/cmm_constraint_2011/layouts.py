@@ -141,10 +141,14 @@ def rank_candidates(
     return tuple(sorted(rows, key=lambda row: row.distance))
 
 
-def compare_weights(study: Study, seed: int, trials: int) -> dict[str, Cell]:
-    """Return the cell of figure 5 with every weighting of the rows."""
+def compare_weights(study: Study, seed: int, trials: int, full: Cell) -> dict[str, Cell]:
+    """Return the cell of figure 5 with every weighting of the rows; `full` is that with covariance
+    of Table 3.
+    """
     return {
-        weights: calibrate_cell(study, SET * MM, NOISE * MM, seed, trials, weights=weights)
+        weights: full
+        if weights == "full"
+        else calibrate_cell(study, SET * MM, NOISE * MM, seed, trials, weights=weights)
         for weights in WEIGHTS
     }
 

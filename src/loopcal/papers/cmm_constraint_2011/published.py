@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from math import hypot
 
 from loopcal.papers.printed import last_digit, read_content
 
@@ -48,9 +49,12 @@ class Stated:
     @property
     def follows(self) -> bool:
         """Whether the stated factor, itself rounded, is possible."""
-        low, high = self.possible
-        half = 0.5 * last_digit(self.stated)
-        return low - half <= float(self.stated) <= high + half
+        return self.excess == 0.0
+
+    @property
+    def excess(self) -> float:
+        """By how much the stated factor is outside of the possible ones."""
+        return compute_excess(self.stated, self.possible)
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,32 @@ class Published:
     accuracy: float
     figure_5: Mapping[str, Stated]
     table_4: Mapping[str, Stated]
+    conclusion: Mapping[str, str]
+
+    def compute_rms_factors(self, name: str) -> tuple[float, float]:
+        """Return the least and the largest factor of root mean squares, rms^2 = mean^2 + sd^2, of
+        means and standard deviations that round to those of Table 4.
+        """
+        mean, sd = (self.table_4[f"{name}, {what}"] for what in ("mean", "standard deviation"))
+        before = _bound_rms(mean.before, sd.before)
+        after = _bound_rms(mean.after, sd.after)
+        return before[0] / after[1], before[1] / after[0]
+
+
+def compute_excess(stated: str, possible: tuple[float, float]) -> float:
+    """Return by how much a stated number, itself rounded, is outside of what is possible."""
+    half = 0.5 * last_digit(stated)
+    low, high = possible
+    return max(low - half - float(stated), float(stated) - high - half, 0.0)
+
+
+def _bound_rms(mean: str, sd: str) -> tuple[float, float]:
+    """Return the least and the largest root mean square of a rounded mean and sd."""
+    halves = 0.5 * last_digit(mean), 0.5 * last_digit(sd)
+    low, high = (
+        hypot(float(mean) + sign * halves[0], float(sd) + sign * halves[1]) for sign in (-1, 1)
+    )
+    return low, high
 
 
 @cache
@@ -91,4 +121,5 @@ def read_published() -> Published:
         accuracy=float(content["accuracy"]["accuracy"]) * MM,
         figure_5={name: Stated(**given) for name, given in content["figure_5"].items()},
         table_4={name: Stated(**given) for name, given in content["table_4"].items()},
+        conclusion=content["conclusion"],
     )

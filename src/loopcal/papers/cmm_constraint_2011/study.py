@@ -7,14 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.calibrations import LINES, calibrate_fifty, calibrate_grid
+from loopcal.papers.cmm_constraint_2011.draws import DRAWS, SEED_STEP, compute_draw
 from loopcal.papers.cmm_constraint_2011.figures import make_figures
 from loopcal.papers.cmm_constraint_2011.forms import compare_forms
-from loopcal.papers.cmm_constraint_2011.layouts import (
-    compare_arrangements,
-    compare_weights,
-    rank_candidates,
-)
+from loopcal.papers.cmm_constraint_2011.layouts import compare_arrangements, rank_candidates
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
     GROUPS,
@@ -24,7 +20,13 @@ from loopcal.papers.cmm_constraint_2011.machines import (
     plan_points,
 )
 from loopcal.papers.cmm_constraint_2011.published import read_published
-from loopcal.papers.cmm_constraint_2011.tables import Results, compute_ranks, make_tables
+from loopcal.papers.cmm_constraint_2011.tables import (
+    Results,
+    compute_gauge_effects,
+    compute_pair_rank,
+    compute_ranks,
+    make_tables,
+)
 from loopcal.papers.cmm_constraint_2011.verdicts import judge_claims
 from loopcal.papers.printed import Comparison, Printed
 from loopcal.papers.reproduction import Content
@@ -41,24 +43,32 @@ def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
     """Compute everything."""
     progress("coordinate exchange, ten planes")
     study = plan_points(load_machine(), GROUPS, POINTS, AXES, seed, SWEEPS)
-    cells = calibrate_grid(study, seed, trials, progress)
+    draws = [compute_draw(study, seed, trials, progress)]
     arrangements = compare_arrangements(study, seed, trials, progress)
     progress("interpretations of figure 5")
     candidates = rank_candidates(arrangements, seed, trials)
-    progress("weights of the rows")
-    weights = compare_weights(study, seed, trials)
-    progress("fifty points, and both forms")
+    progress("both forms")
+    forms = compare_forms(study, seed, trials)
+    for i in range(1, DRAWS):
+        other = seed + SEED_STEP * i
+        drawn = plan_points(study.robot, GROUPS, POINTS, AXES, other, SWEEPS)
+        draws.append(compute_draw(drawn, other, trials, _number_steps(progress, i + 1)))
     return Results(
         printed=read_published(),
         study=study,
-        cells=cells,
+        draws=tuple(draws),
         arrangements=arrangements,
         candidates=candidates,
-        weights=weights,
-        fifties=tuple(calibrate_fifty(study, groups, seed, trials) for groups in LINES),
-        forms=compare_forms(study, seed),
+        forms=forms,
         ranks=compute_ranks(study, seed),
+        pair=compute_pair_rank(study),
+        gauge_effects=compute_gauge_effects(study),
     )
+
+
+def _number_steps(progress: Callable[[str], None], draw: int) -> Callable[[str], None]:
+    """Return a callback that names the draw, too."""
+    return lambda text: progress(f"draw {draw} of {DRAWS}: {text}")
 
 
 def _compare_counts(results: Results) -> Comparison:

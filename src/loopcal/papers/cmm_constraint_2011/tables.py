@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.papers.cmm_constraint_2011.calibrations import BEFORE, LS, PRIOR, Cell, FiftyPoints
-from loopcal.papers.cmm_constraint_2011.forms import ERRORS, Forms
+from loopcal.papers.cmm_constraint_2011.draws import Draw
+from loopcal.papers.cmm_constraint_2011.forms import ERRORS, RANK, FormRow, Forms
 from loopcal.papers.cmm_constraint_2011.layouts import Arrangement, Candidate, list_printed
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
@@ -59,6 +60,12 @@ class GroupRank:
     rank: int
     singular_values: FloatArray
 
+    @property
+    def unused(self) -> float:
+        """Largest singular value that does not count, relative to the largest; 0 without one."""
+        s = self.singular_values
+        return float(s[self.rank] / s[0]) if self.rank < len(s) else 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class Results:
@@ -66,20 +73,31 @@ class Results:
 
     Attributes
     ----------
-    study : the ten groups. cells : Table 3, by (set, noise) as printed.
-    arrangements, candidates, weights : see layouts.py. fifties : see calibrations.py.
-    forms : see forms.py.
+    study : the ten groups. draws : see draws.py; tables and figures show the first.
+    arrangements, candidates : see layouts.py. forms : see forms.py.
+    ranks : of random groups. pair : points of a group and rank of the equations of all its pairs.
+    gauge_effects : (9,) of the directions of GAUGE_NAMES on the rows.
     """
 
     printed: Published
     study: Study
-    cells: Mapping[tuple[str, str], Cell]
+    draws: tuple[Draw, ...]
     arrangements: tuple[Arrangement, ...]
     candidates: tuple[Candidate, ...]
-    weights: Mapping[str, Cell]
-    fifties: tuple[FiftyPoints, ...]
     forms: Forms
     ranks: tuple[GroupRank, ...]
+    pair: tuple[int, int]
+    gauge_effects: FloatArray
+
+    @property
+    def cells(self) -> Mapping[tuple[str, str], Cell]:
+        """Table 3 of the first draw."""
+        return self.draws[0].cells
+
+    @property
+    def fifties(self) -> tuple[FiftyPoints, ...]:
+        """Calibrations from fifty points of the first draw."""
+        return self.draws[0].fifties
 
 
 def make_tables(results: Results) -> tuple[Table, ...]:
@@ -95,16 +113,24 @@ def make_tables(results: Results) -> tuple[Table, ...]:
     return (
         _list_given(words, results.study),
         _list_ranks(words, results),
-        _list_gauge(words, results.study),
+        _list_gauge(words, results.gauge_effects),
         _list_table_3(words, results, "table_3", ALIGNED),
         _list_table_3(words, results, "table_3_absolute", ABSOLUTE),
         words.table("figure_5_readings", [printed, *candidates]),
         words.table(
             "arrangements", map(_list_arrangement, results.arrangements), "", trials=trials
         ),
-        _list_weights(words, results.weights),
+        _list_weights(words, results.draws[0].weights),
         _list_fifty(words, results),
-        words.table("forms", forms.rows, "", errors=ERRORS / MM, covariance=forms.covariance),
+        words.table(
+            "forms",
+            map(_list_form, forms.rows),
+            "",
+            errors=ERRORS / MM,
+            covariance=forms.covariance,
+            machines=forms.machines,
+            tolerance=RANK,
+        ),
         _list_arithmetic(words, results.printed),
     )
 
@@ -119,6 +145,17 @@ def compute_ranks(study: Study, seed: int) -> tuple[GroupRank, ...]:
         s: FloatArray = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
         ranks.append(GroupRank(groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
     return tuple(ranks)
+
+
+def compute_gauge_effects(study: Study) -> FloatArray:
+    """Return the effects (9,) of the directions of GAUGE_NAMES on the rows, relative to the largest
+    singular value.
+    """
+    rows = study.optimized.rows.reshape(-1, len(study.robot.parameters))
+    largest = np.linalg.svd(rows, compute_uv=False)[0]
+    g = list_gauge_directions(study.robot)
+    effects = np.linalg.norm(rows @ g.T, axis=0) / np.linalg.norm(g, axis=1) / largest
+    return np.asarray(effects, dtype=np.float64)
 
 
 def compute_pair_rank(study: Study) -> tuple[int, int]:
@@ -163,13 +200,14 @@ def _list_ranks(words: Wording, results: Results) -> Table:
     return words.table("ranks", rows)
 
 
-def _list_gauge(words: Wording, study: Study) -> Table:
-    rows = study.optimized.rows.reshape(-1, 42)
-    largest = np.linalg.svd(rows, compute_uv=False)[0]
-    g = list_gauge_directions(study.robot)
-    effect = np.linalg.norm(rows @ g.T, axis=0) / np.linalg.norm(g, axis=1) / largest
-    table = [(name, MOTIONS[i // 3], float(effect[i])) for i, name in enumerate(GAUGE_NAMES)]
+def _list_gauge(words: Wording, effects: FloatArray) -> Table:
+    table = [(name, MOTIONS[i // 3], float(effects[i])) for i, name in enumerate(GAUGE_NAMES)]
     return words.table("gauge", table)
+
+
+def _list_form(row: FormRow) -> tuple[Entry, ...]:
+    return (row.noise / MM, row.method, f"{row.converged} of {row.machines}", row.iterations,
+            ", ".join(map(str, row.ranks)), row.median, row.largest)  # fmt: skip
 
 
 def _list_table_3(words: Wording, results: Results, name: str, measures: tuple[str, ...]) -> Table:
@@ -180,7 +218,8 @@ def _list_table_3(words: Wording, results: Results, name: str, measures: tuple[s
         worse = [c.count_worse(m, places[0]) for m in (LS, PRIOR)]
         rows.append((given, noise, *medians, *worse))
     trials = len(next(iter(results.cells.values())).iterations)
-    table = words.table(name, rows, "", trials=trials)
+    failed = sum(c.failed for c in results.cells.values())
+    table = words.table(name, rows, "", trials=trials, failed=failed)
     columns = [f"{measure}, {m}" for measure in measures for m in methods]
     return replace(
         table,
@@ -213,7 +252,8 @@ def _list_fifty(words: Wording, results: Results) -> Table:
             median = map(float, fifty.compute_median(method, frame))
             rows.append((f"{fifty.groups} {plural}", frame, method, *median))
     noise, trials = results.printed.accuracy / MM, len(results.fifties[0].iterations)
-    return words.table("table_4", rows, "", trials=trials, noise=noise)
+    failed = sum(int((~c).sum()) for fifty in results.fifties for c in fifty.converged.values())
+    return words.table("table_4", rows, "", trials=trials, noise=noise, failed=failed)
 
 
 def _list_arithmetic(words: Wording, printed: Published) -> Table:

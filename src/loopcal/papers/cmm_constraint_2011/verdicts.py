@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from loopcal.papers.cmm_constraint_2011.calibrations import (
@@ -14,16 +16,18 @@ from loopcal.papers.cmm_constraint_2011.calibrations import (
     FiftyPoints,
     compute_rank_correlation,
 )
-from loopcal.papers.cmm_constraint_2011.layouts import ANY, NOISE, ONE, SET, TEN, VARIANCE
+from loopcal.papers.cmm_constraint_2011.draws import Draw
+from loopcal.papers.cmm_constraint_2011.forms import RANK
+from loopcal.papers.cmm_constraint_2011.layouts import ANY, NOISE, ONE, SD, SET, TEN, VARIANCE
 from loopcal.papers.cmm_constraint_2011.machines import (
     ABSOLUTE,
     ALIGNED,
     AT_NOMINAL,
+    FRAMES,
     MEASURES,
-    list_gauge_directions,
 )
-from loopcal.papers.cmm_constraint_2011.published import MM, read_published
-from loopcal.papers.cmm_constraint_2011.tables import Results, compute_pair_rank
+from loopcal.papers.cmm_constraint_2011.published import MM, Published, compute_excess
+from loopcal.papers.cmm_constraint_2011.tables import Results
 from loopcal.papers.reproduction import Verdict
 from loopcal.papers.wording import Wording, read_wording
 
@@ -43,24 +47,21 @@ def judge_claims(results: Results) -> tuple[Verdict, ...]:
         *_judge_figure_5(words, results),
         *_judge_points(words, results),
         *_judge_fifty(words, results),
-        *_judge_arithmetic(words),
+        *_judge_arithmetic(words, results.printed),
         *_judge_methods(words, results),
     )
 
 
 def _judge_equations(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    rows = results.study.optimized.rows.reshape(-1, 42)
-    moved = rows @ list_gauge_directions(results.study.robot)[:6].T
-    points, rank = compute_pair_rank(results.study)
+    points, rank = results.pair
     ranks, groups = sorted({r.rank for r in results.ranks}), [r.groups for r in results.ranks]
-    unused = [r.singular_values[r.rank] / r.singular_values[0] for r in results.ranks]
-    counted = None if rank == points - 2 else rank == points - 1
+    unused = [r.unused for r in results.ranks]
     return (
-        words.judge("independent", effect=np.abs(moved).max() / np.abs(rows).max()),
-        words.judge("counted", agrees=counted, points=points, rank=rank),
+        words.judge("independent", effect=results.gauge_effects[:6].max()),
+        words.judge("counted", points=points, rank=rank, missing=points - rank),
         words.judge(
-            "least_squares", agrees=ranks == [42], ranks=ranks, fewest=min(groups),
-            most=max(groups), largest=max(unused),
+            "least_squares", least=ranks[0], parameters=results.printed.parameters, ranks=ranks,
+            fewest=min(groups), most=max(groups), largest=max(unused),
         ),
     )  # fmt: skip
 
@@ -68,45 +69,62 @@ def _judge_equations(words: Wording, results: Results) -> tuple[Verdict, ...]:
 def _judge_table_3(words: Wording, results: Results) -> tuple[Verdict, ...]:
     from scipy.stats import beta
 
-    quiet, cells = results.cells["1", "0.0001"], results.cells
-    share = quiet.errors[LS][:, PARAMETERS] / quiet.errors[BEFORE][:, PARAMETERS]
-    medians = {
-        m: {k: c.compute_median(m)[POSITION_ALIGNED] for k, c in cells.items()}
-        for m in (BEFORE, LS)
-    }
-    worse = [key for key in cells if medians[LS][key] > medians[BEFORE][key]]
-    ratios = [medians[LS][key] * MM / c.noise for key, c in cells.items()]
-    ranks = {method: compute_rank_correlation(cells.values(), method) for method in METHODS}
+    draws, cells = results.draws, results.cells
+    shares = [_list_shares(draw) for draw in draws]
+    better = [_compare_with_before(draw) for draw in draws]
+    ranks = [{m: compute_rank_correlation(d.cells.values(), m) for m in METHODS} for d in draws]
     reduction = cells["1", "0.01"].compute_reduction(LS)
     return (
         words.judge(
-            "three_quarters", agrees=np.mean(share) <= 0.25, noise=quiet.noise / MM,
-            chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)), mean=100.0 * (1.0 - share.mean()),
-            reached=int((share <= 0.25).sum()), count=len(share),
+            "three_quarters", draws=shares, noise=cells["1", "0.0001"].noise / MM,
+            chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)), **shares[0],
         ),
+        words.judge("better", draws=better, count=len(cells), **better[0]),
         words.judge(
-            "better", ratio=np.median(ratios), better=len(cells) - len(worse), count=len(cells),
-            worse=", ".join(f"errors {s} mm with noise {n} mm" for s, n in worse) or "none",
-        ),
-        words.judge(
-            "correlation", count=len(cells), ratios=len({c.ratio for c in cells.values()}),
-            ranks=ranks, parameters=reduction[PARAMETERS], position=reduction[POSITION],
+            "correlation", draws=[{"ranks": r} for r in ranks], count=len(cells),
+            ratios=len({c.ratio for c in cells.values()}), ranks=ranks[0],
+            least={m: min(r[m] for r in ranks) for m in METHODS},
+            parameters=reduction[PARAMETERS], position=reduction[POSITION],
             aligned=reduction[POSITION_ALIGNED],
         ),
     )  # fmt: skip
 
 
+def _list_shares(draw: Draw) -> dict[str, Any]:
+    """Return by how much the norm of the parameter errors decreases with the least noise."""
+    quiet = draw.cells["1", "0.0001"]
+    left = (quiet.errors[LS] / quiet.errors[BEFORE])[quiet.converged[LS], PARAMETERS]
+    reached = int((left <= 0.25).sum())
+    mean = 100.0 * (1.0 - left.mean()) if len(left) else np.nan
+    return {"mean": mean, "reached": reached, "count": len(left)}
+
+
+def _compare_with_before(draw: Draw) -> dict[str, Any]:
+    """Return in which cells least squares reduces the median position error."""
+    after, before = (
+        {k: c.compute_median(m)[POSITION_ALIGNED] for k, c in draw.cells.items()}
+        for m in (LS, BEFORE)
+    )
+    worse = [k for k in after if not after[k] <= before[k]]
+    texts = [f"errors {s} mm with noise {n} mm" for s, n in worse]
+    ratio = np.median([after[k] * MM / c.noise for k, c in draw.cells.items()])
+    return {"better": len(after) - len(worse), "worse": texts or ["none"], "ratio": ratio}
+
+
 def _judge_figure_5(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    nearest = results.candidates[0]
-    other = next(c for c in results.candidates if c.reading == VARIANCE)
-    literal = next(c for c in results.candidates if c.truth == "all 42" and c.frame == "absolute")
-    texts = [[f"{a:.0f} %" for a in c.reductions] for c in (nearest, other, literal)]
+    ranked = sorted(results.candidates, key=lambda candidate: candidate.distance)
+    nearest = ranked[0]
+    deviation, variance = (
+        next(c for c in ranked if c.reading == reading) for reading in (SD, VARIANCE)
+    )
+    literal = next(c for c in ranked if c.truth == "all 42" and c.frame == "absolute")
+    texts = [[f"{a:.0f} %" for a in c.reductions] for c in (deviation, variance, literal)]
     return (
         words.judge(
-            "variances", agrees=None if nearest.reading == VARIANCE else False, nearest=nearest,
-            deviations=texts[0], variances=texts[1], given=NOISE, root=np.sqrt(NOISE),
+            "variances", deviation=deviation, variance=variance, deviations=texts[0],
+            variances=texts[1], given=NOISE, root=np.sqrt(NOISE),
         ),
-        words.judge("figure_5", literal=literal, reductions=texts[2], distance=nearest.distance),
+        words.judge("figure_5", literal=literal, reductions=texts[2], nearest=nearest),
     )  # fmt: skip
 
 
@@ -116,7 +134,11 @@ def _judge_points(words: Wording, results: Results) -> tuple[Verdict, ...]:
     )
     cost_ten, cost_one = (a.cell.compute_median(LS)[POSITION_ALIGNED] for a in (ten, one))
     return (
-        words.judge("exchange", ten=ten, one=one),
+        words.judge(
+            "exchange", draws=[{"gain": draw.gain} for draw in results.draws],
+            gain=results.draws[0].gain, least=min(draw.gain for draw in results.draws), ten=ten,
+            one=one,
+        ),
         words.judge(
             "one_plane", one=one, ten=ten, free=free, noise=NOISE, cost_one=cost_one,
             cost_ten=cost_ten, limit=1.5 * cost_ten,
@@ -136,56 +158,92 @@ def _judge_fifty(words: Wording, results: Results) -> tuple[Verdict, ...]:
     changes = {
         name: [_format_change(fifty, *how) for fifty in (one, five)] for name, how in frames.items()
     }
+    falls = [
+        bool((fifty.compute_factors(method, frame) > 1.0).all())
+        for fifty in (one, five) for frame in FRAMES for method in METHODS
+    ]  # fmt: skip
+    within = [draw.fifties[0].within_five for draw in results.draws]
     return (
-        words.judge("iterations", one=one, five=five),
         words.judge(
-            "full_poses", agrees=None, factors=", ".join(f"{f:.1f}" for f in factors),
+            "iterations", draws=[{"within": share} for share in within], within=within[0], one=one,
+            five=five, least=min(within), most=max(within),
+        ),
+        words.judge(
+            "full_poses", falling=sum(falls), ways=len(falls),
+            factors=", ".join(f"{f:.1f}" for f in factors),
             stated=", ".join(given.stated for given in results.printed.table_4.values()), **changes,
         ),
     )  # fmt: skip
 
 
-def _judge_arithmetic(words: Wording) -> tuple[Verdict, ...]:
-    table = read_published().table_4
+def _judge_arithmetic(words: Wording, printed: Published) -> tuple[Verdict, ...]:
     factors = [
-        words.judge("factor", agrees=given.follows, name=name, given=given)
-        for name, given in table.items()
+        words.judge("factor", name=name, given=given) for name, given in printed.table_4.items()
     ]
-    return (*factors, words.judge("conclusion", agrees=False))
+    possible = {name: printed.compute_rms_factors(name) for name in printed.conclusion}
+    excess = [compute_excess(printed.conclusion[name], possible[name]) for name in possible]
+    conclusion = words.judge(
+        "conclusion", stated=printed.conclusion, possible=possible, excess=max(excess)
+    )
+    return (*factors, conclusion)
 
 
 def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
     """Judge the prior, the weights of the rows, and the two forms of the equations."""
-    medians = {
-        key: [c.compute_median(m)[POSITION_ALIGNED] for m in (BEFORE, LS, PRIOR)]
-        for key, c in results.cells.items()
-    }
-    better = [key for key, (_, ls, prior) in medians.items() if prior <= (1.0 + SURE) * ls]
-    harmed = [key for key, (before, _, prior) in medians.items() if prior > before]
-    hardest = results.cells["0.01", "0.1"]
-    position = {n: c.compute_median(LS)[POSITION_ALIGNED] for n, c in results.weights.items()}
+    priors = [_compare_prior(draw) for draw in results.draws]
+    hardest, forms = results.cells["0.01", "0.1"], results.forms
+    weights = [_compare_weights(draw) for draw in results.draws]
     parameters = {
-        n: c.compute_median(PRIOR)[PARAMETERS_WITHOUT_GAUGE] for n, c in results.weights.items()
+        n: c.compute_median(PRIOR)[PARAMETERS_WITHOUT_GAUGE]
+        for n, c in results.draws[0].weights.items()
     }
-    forms = results.forms
-    largest, noises = [row[3] for row in forms.rows], [row[0] for row in forms.rows]
+    noises = [row.noise / MM for row in forms.rows]
     return (
         words.judge(
-            "prior", sure=100 * SURE, better=len(better), harmed=len(harmed), count=len(medians),
-            medians=medians["0.01", "0.1"], worse=hardest.count_worse(PRIOR, POSITION_ALIGNED),
-            trials=len(hardest.iterations),
+            "prior", draws=priors, sure=100 * SURE, count=len(results.cells),
+            worse=hardest.count_worse(PRIOR, POSITION_ALIGNED), trials=len(hardest.iterations),
+            **priors[0],
         ),
         words.judge(
-            "weights", position=position, parameters=parameters, set=SET, noise=NOISE,
-            limit=1.1 * position["full"],
-            less={name: 100.0 * (1.0 - position["full"] / p) for name, p in position.items()},
-            nearer=100.0 * (1.0 - position["distance"] / position["printed"]),
+            "weights", draws=weights, parameters=parameters, set=SET, noise=NOISE,
+            lowest=min(w["less"]["printed"] for w in weights),
+            highest=max(w["less"]["printed"] for w in weights), **weights[0],
         ),
         words.judge(
-            "forms", largest=max(largest), noise=max(noises), covariance=forms.covariance,
-            small=max(row[3] for row in forms.rows if row[0] == min(noises)),
+            "forms", covariance=forms.covariance, compared=sum(row.converged for row in forms.rows),
+            largest=max((row.largest for row in forms.rows if row.converged), default=np.nan),
+            fits=sum(row.machines for row in forms.rows), noise=max(noises), least=min(noises),
+            **{name: max(row.median for row in forms.rows if row.noise / MM == noise)
+               for name, noise in (("loud", max(noises)), ("calm", min(noises)))},
+        ),
+        words.judge(
+            "remedy", converged=min(row.converged for row in forms.rows), machines=forms.machines,
+            tolerance=RANK, most=max(row.iterations for row in forms.rows),
+            noises=[f"{noise:g}" for noise in sorted(set(noises))],
         ),
     )  # fmt: skip
+
+
+def _compare_prior(draw: Draw) -> dict[str, Any]:
+    """Return in how many cells MAP is not worse than least squares, and worse than before."""
+    medians = {
+        key: [c.compute_median(m)[POSITION_ALIGNED] for m in (BEFORE, LS, PRIOR)]
+        for key, c in draw.cells.items()
+    }
+    better = [key for key, (_, ls, prior) in medians.items() if prior <= (1.0 + SURE) * ls]
+    harmed = [key for key, (before, _, prior) in medians.items() if not prior <= before]
+    return {"better": len(better), "harmed": len(harmed), "medians": medians["0.01", "0.1"]}
+
+
+def _compare_weights(draw: Draw) -> dict[str, Any]:
+    """Return the position errors of least squares with each weighting of the rows."""
+    position = {n: c.compute_median(LS)[POSITION_ALIGNED] for n, c in draw.weights.items()}
+    return {
+        "position": position,
+        "limit": (1.0 + SURE) * position["full"],
+        "less": {name: 100.0 * (1.0 - position["full"] / p) for name, p in position.items()},
+        "nearer": 100.0 * (1.0 - position["distance"] / position["printed"]),
+    }
 
 
 def _format_change(fifty: FiftyPoints, frame: str, method: str) -> str:
