@@ -958,6 +958,6 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     q = study.layout.solve_readings(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.build_measurements(study.layout, q[0], noise)
     result = estimate.identify(
-        study.robot, data, estimate.MAP(), options=estimate.FitOptions(rank_tolerance=forms.RANK)
+        study.robot, data, estimate.MAP(), options=estimate.FitOptions(rank_tolerance=1e-5)
     )
     return report_fit(result, parts=False)
