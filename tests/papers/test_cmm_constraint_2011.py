@@ -324,8 +324,8 @@ def test_fits_that_did_not_converge_are_left_out_of_the_medians() -> None:
     assert cell.failed == 4
 
 
-@pytest.mark.slow
-def test_rank_tolerance_of_the_study_converges_on_50_of_50_machines(study) -> None:
+@pytest.mark.slow  # 17 of 50 converged while rotations of the residuals counted as information
+def test_fits_with_surfaces_as_unknowns_converge_on_50_of_50_machines(study) -> None:
     noise = max(NOISES)
     truth = draw_true_machines(study.robot, MM, 50, 0)
     q = study.layout.solve_readings(truth, noise, 0)

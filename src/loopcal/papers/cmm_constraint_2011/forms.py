@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate import FitOptions, identify
+from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.measure import Line, Measurements, Observations, Plane
@@ -27,13 +27,6 @@ from loopcal.typing import FloatArray
 SURFACE = "held"
 ERRORS, NOISES = 1e-3, (1e-6, 1e-5)
 """Standard deviations [m] of parameters and of held coordinates."""
-
-RANK = 1e-4
-"""Relative rank tolerance. A rotation of the base also rotates the distance between points and
-line. Where this is not zero, a first-order row contains the rotation, though the sum of squares
-does not change. Such singular values are some 3e-6 of the largest at the estimate (noise 0.01 mm);
-those of the directions that the data determine are above 5e-4.
-"""
 
 
 @dataclass(frozen=True)
@@ -108,29 +101,26 @@ def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measureme
     return Measurements(layout.robot.name, q, tuple(observations))
 
 
-def compare_forms(study: Study, seed: int, trials: int, tolerance: float = RANK) -> Forms:
+def compare_forms(study: Study, seed: int, trials: int) -> Forms:
     """Identify machines in both forms, at several noises and by both methods."""
     truth = draw_true_machines(study.robot, ERRORS, trials, seed)
     rows = []
     for noise in NOISES:
         q = study.layout.solve_readings(truth, noise, seed)
-        rows += [compare_estimates(study.layout, q, noise, name, tolerance) for name in METHODS]
+        rows += [compare_estimates(study.layout, q, noise, name) for name in METHODS]
     return Forms(tuple(rows), compare_covariances(study.layout, NOISES[0]))
 
 
-def compare_estimates(
-    layout: Layout, q: FloatArray, noise: float, name: str, tolerance: float = RANK
-) -> FormRow:
+def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) -> FormRow:
     """Identify machines with readings (t, n, a) in both forms by one method."""
     sd = select_free_parameters(layout.robot).tolerance[0]
     problem = PaperRows(layout, q, sd, noise)
     paper = identify_from_rows(problem, METHODS[name], 1e-6)
     values = problem.values(paper.deviation)
-    options = FitOptions(rank_tolerance=tolerance)
     iterations, ranks, unlike = 0, set(), []
     for i, readings in enumerate(q):
         data = build_measurements(layout, readings, noise)
-        fit = identify(layout.robot, data, METHODS[name], options=options)
+        fit = identify(layout.robot, data, METHODS[name])
         iterations, ranks = max(iterations, fit.history.iterations), ranks | {fit.rank}
         if fit.history.status == paper.status[i] == DescentStatus.CONVERGED:
             one = PaperRows(layout, q[i : i + 1], sd, noise)

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal.papers.cmm_constraint_2011.calibrations import BEFORE, LS, PRIOR, Cell, FiftyPoints
 from loopcal.papers.cmm_constraint_2011.draws import Draw
-from loopcal.papers.cmm_constraint_2011.forms import ERRORS, RANK, FormRow, Forms
+from loopcal.papers.cmm_constraint_2011.forms import ERRORS, FormRow, Forms
 from loopcal.papers.cmm_constraint_2011.layouts import Arrangement, Candidate, list_printed
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
@@ -129,7 +129,6 @@ def make_tables(results: Results) -> tuple[Table, ...]:
             errors=ERRORS / MM,
             covariance=forms.covariance,
             machines=forms.machines,
-            tolerance=RANK,
         ),
         _list_arithmetic(words, results.printed),
     )

@@ -17,7 +17,6 @@ from loopcal.papers.cmm_constraint_2011.calibrations import (
     compute_rank_correlation,
 )
 from loopcal.papers.cmm_constraint_2011.draws import Draw
-from loopcal.papers.cmm_constraint_2011.forms import RANK
 from loopcal.papers.cmm_constraint_2011.layouts import ANY, NOISE, ONE, SD, SET, TEN, VARIANCE
 from loopcal.papers.cmm_constraint_2011.machines import (
     ABSOLUTE,
@@ -217,8 +216,9 @@ def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
                for name, noise in (("loud", max(noises)), ("calm", min(noises)))},
         ),
         words.judge(
-            "remedy", converged=min(row.converged for row in forms.rows), machines=forms.machines,
-            tolerance=RANK, most=max(row.iterations for row in forms.rows),
+            "converged", converged=min(row.converged for row in forms.rows),
+            machines=forms.machines, most=max(row.iterations for row in forms.rows),
+            ranks=sorted({rank for row in forms.rows for rank in row.ranks}),
             noises=[f"{noise:g}" for noise in sorted(set(noises))],
         ),
     )  # fmt: skip
