@@ -186,8 +186,8 @@ FIRST_CALIBRATIONS = [
 def test_first_calibration_of_a_printer_with_probed_heights_is_not_refused(
     folder_and_run, parameter, error
 ) -> None:
-    """The firmware stops at the bed, so all heights are 0; the geometry given moves the nozzle by up
-    to 8 mm.
+    """The firmware stops at the bed, so all heights are 0; the given geometry moves the nozzle by
+    up to 8 mm.
     """
     folder, run = folder_and_run
     robot = load_robot("linear-delta")

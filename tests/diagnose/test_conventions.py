@@ -21,7 +21,8 @@ from loopcal.diagnose.conventions import (
     list_reading_interpretations,
     misfit,
 )
-from loopcal.diagnose.conventions.selection import ALLOWED, BETTER
+from loopcal.diagnose.conventions.judgement import BETTER
+from loopcal.diagnose.conventions.selection import ALLOWED
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
@@ -390,15 +391,6 @@ def test_random_data_are_not_refused_and_cost_at_most_two_thorough_linearization
     assert len(poses) <= 2  # the data as written, before and after far rows were excluded
 
 
-def test_too_few_rows_give_no_misfit_and_no_refusal() -> None:
-    data = change_values(
-        simulate_data("hexapod-42", Position(unknown=("frame",)), n=4), scaled([0, 1, 2], 1e3)
-    )
-    result = compare_conventions(load_cached_robot("hexapod-42"), data)
-    assert np.isnan(result.misfit)
-    assert not result.is_refused
-
-
 def test_instrument_in_the_wrong_unit_is_named_among_two() -> None:
     robot, at = (
         load_cached_robot("hexapod-42"),
@@ -535,7 +527,6 @@ def test_every_interpretation_changes_the_values_and_keeps_their_shape() -> None
                 assert not np.allclose(
                     rows.measured, data.observations[0].measured, rtol=1e-12, atol=0.0
                 )
-                assert way.shrinks == (way.details.get("factor", 1.0) < 1.0)
             seen.add(kind.name)
     assert seen == set(KINDS)
     data, robot = simulate_data("linear-delta", Position(), n=5), load_cached_robot("linear-delta")
@@ -543,4 +534,5 @@ def test_every_interpretation_changes_the_values_and_keeps_their_shape() -> None
         (way.slip, *way.details.items())
         for way in list_reading_interpretations(data, robot.actuators)
     ]
-    assert len(set(ways)) == len(ways) == 6 + 1 + 3 + 3 + 1 + 2  # units, signs, pairs, order, rows
+    # units, signs of all and each, orders, gear factors of all and each, rows
+    assert len(set(ways)) == len(ways) == 6 + 4 + 5 + 4 * 4 + 2

@@ -156,8 +156,8 @@ def check_targets_move(
     """Refuse a target whose values stay within the noise, although the robot moves it.
 
     A reflector on the floor, a frozen display or the column of another target give such values. Any
-    fit to them is wrong. Values that are constant by design are accepted: by the geometry given, the
-    poses change them by less than `CONSTANT_SHARE` of what the motion of the platform could.
+    fit to them is wrong. Values that are constant by design are accepted: by the given geometry,
+    the poses change them by less than `CONSTANT_SHARE` of what the motion of the platform could.
 
     Parameters
     ----------
@@ -228,8 +228,8 @@ def _find_possible_change(static: _StaticTarget, T: FloatArray, size: float) -> 
 
     With the derivative (a, b) of a column by a rotation and a translation, and the largest rotation
     phi and translation d between the first and another pose, the change is |a| max(phi, d / size) +
-    |b| d. Poses that keep a platform level show no rotation, so d / size is the least. The change is
-    0 for the forms of an orientation whose columns are no residuals: these cannot be constant.
+    |b| d. Poses that keep a platform level show no rotation, so d / size is the least. The change
+    is 0 for the forms of an orientation whose columns are no residuals: these cannot be constant.
     """
     T, kind = T[static.present], static.rows.kind
     if len(kind.columns) != len(kind.noise_columns):

@@ -313,5 +313,5 @@ def _renumber_poses(rows: Observations, place: IntArray) -> Observations:
     poses that are dropped.
     """
     target = place[rows.rows]
-    kept = np.all(target.reshape(len(rows), -1) >= 0, axis=1)
+    kept = np.all(target.reshape(len(rows), rows.kind.poses_per_row) >= 0, axis=1)
     return replace(rows.take(kept), rows=target[kept])

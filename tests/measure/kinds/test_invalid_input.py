@@ -212,8 +212,8 @@ CONSTANT_BY_DESIGN = {
 
 @pytest.mark.parametrize("case", CONSTANT_BY_DESIGN)
 def test_values_that_are_constant_by_design_are_accepted_and_frozen_ones_are_not(case):
-    """The true machine keeps the value at these poses; by the nominal one it changes a little, since
-    the machine is inaccurate.
+    """The true machine keeps the value at these poses; by the nominal one it changes a little,
+    since the machine is inaccurate.
     """
     kind, half = CONSTANT_BY_DESIGN[case]
     kind = kind.with_tool(np.eye(4))

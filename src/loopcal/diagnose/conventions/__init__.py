@@ -6,11 +6,11 @@ from loopcal.diagnose.conventions.convention_check import ConventionCheck as Con
 from loopcal.diagnose.conventions.convention_check import check_conventions as check_conventions
 from loopcal.diagnose.conventions.convention_check import compare_conventions as compare_conventions
 from loopcal.diagnose.conventions.interpretations import Interpretation as Interpretation
-from loopcal.diagnose.conventions.interpretations import (
-    list_interpretations as list_interpretations,
-)
-from loopcal.diagnose.conventions.interpretations import (
+from loopcal.diagnose.conventions.reading_interpretations import (
     list_reading_interpretations as list_reading_interpretations,
 )
 from loopcal.diagnose.conventions.setup_parameters import MovedSetups as MovedSetups
 from loopcal.diagnose.conventions.setup_parameters import find_moved_setups as find_moved_setups
+from loopcal.diagnose.conventions.value_interpretations import (
+    list_interpretations as list_interpretations,
+)

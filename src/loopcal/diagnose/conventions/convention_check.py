@@ -21,25 +21,28 @@ from typing import Any
 import numpy as np
 
 from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.judgement import BETTER
 from loopcal.diagnose.conventions.misfit import (
     Comparison,
     compare_with_robot,
     compute_quick_misfit,
     exclude_far_rows,
-    refine_misfit,
+    is_redundant,
     select_reached,
 )
+from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.diagnose.conventions.selection import (
     ALLOWED,
-    BETTER,
+    Search,
     Selection,
-    select_interpretation,
+    find_equal_orders,
+    search_interpretations,
     shares_poses,
 )
 from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_contradiction
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types
-from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, forward
@@ -49,6 +52,11 @@ from loopcal.units import Dimension
 IMPLAUSIBLE = 10.0
 """Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
 three times too small, give about 3 each.
+"""
+
+FEWEST_TO_REFUSE = 8
+"""Smallest number of equations beyond those of unknown frames by which data are refused. With
+fewer, frames and parameters alone explain nearly anything.
 """
 
 MOST_POSES, RUNS = 120, 4
@@ -184,24 +192,28 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     """
     check_types(robot, data)
     check_actuators(data, robot)
-    free, known = select_free_parameters(robot), _select_known_readings(data)
+    free = select_free_parameters(robot)
+    known = _select_known_readings(data, is_redundant(free))
     if known is None:
         return ConventionCheck(float("nan"))
     misfit = compute_quick_misfit(free, known)
-    if misfit <= IMPLAUSIBLE:
-        return ConventionCheck(misfit)
+    if not misfit > ALLOWED:
+        return ConventionCheck(misfit, finding=_report_orders(free, known))
     thinned = _thin_out(known)
     reach = select_reached(free, thinned, follow=True)
     stated, against, misfit = None, None, np.inf
     if reach.is_enough:
         whole = compare_with_robot(free, reach.data)
-        if not whole.misfit > IMPLAUSIBLE:
-            return ConventionCheck(whole.misfit)
+        if not whole.misfit > ALLOWED:
+            return ConventionCheck(whole.misfit, finding=_report_orders(free, reach.data))
         stated = exclude_far_rows(whole)
         misfit = min(whole.misfit, refine_misfit(stated)[0])
-        if not misfit > IMPLAUSIBLE:
-            return ConventionCheck(misfit, finding=_report_far_rows(stated))
-        against = find_contradiction(stated, misfit, BETTER)
+        if not misfit > ALLOWED:
+            has_far_rows = whole.misfit > IMPLAUSIBLE and bool(stated.excluded)
+            finding = _report_far_rows(stated) if has_far_rows else _report_orders(free, reach.data)
+            return ConventionCheck(misfit, finding=finding)
+        if misfit > IMPLAUSIBLE:
+            against = find_contradiction(stated, misfit, BETTER)
     description = {
         "robot": robot.name,
         "misfit": misfit,
@@ -209,24 +221,69 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
         "reached": reach.n_reached if stated is None else None,
         "poses": reach.n_tested,
     }
-    if against is None or against.misfit > ALLOWED:
-        chosen = select_interpretation(free, thinned, stated, misfit)
-        if chosen is not None:
-            return _refuse(description, misfit, chosen)
+    if against is not None and against.misfit <= ALLOWED:
+        return _contradict(misfit, against)
+    search = search_interpretations(free, thinned, stated, misfit, misfit > IMPLAUSIBLE)
+    equations = _count_equations(stated, search)
+    if search.selection is not None and equations >= FEWEST_TO_REFUSE:
+        return _refuse(description, misfit, search.selection)
     if against is not None:
         return _contradict(misfit, against)
-    sigma = data.reading_sigma
-    if sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0))):
+    if not misfit > IMPLAUSIBLE or (not is_redundant(free) and _has_uncertain_readings(data)):
         return ConventionCheck(misfit)
-    return ConventionCheck(misfit, finding=report_finding("conventions.unexplained", **description))
+    return _report_unexplained(description, misfit, search, equations)
 
 
-def _select_known_readings(data: Measurements) -> Measurements | None:
-    """Return the poses all of whose readings exist and are believed; None where there is none."""
+def _report_unexplained(
+    description: dict[str, Any], misfit: float, search: Search, equations: int
+) -> ConventionCheck:
+    """Report data that no tested interpretation explains, or too few rows to decide which."""
+    if equations < FEWEST_TO_REFUSE:
+        chosen = search.selection
+        listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)
+        finding = report_finding(
+            "conventions.undecided",
+            **description,
+            equations=equations,
+            needed=FEWEST_TO_REFUSE,
+            alternatives=tuple(other.describe() for other in listed),
+        )
+        return ConventionCheck(misfit, finding=finding)
+    finding = report_finding(
+        "conventions.unexplained", **description, tried=search.tried, pairs=search.pairs
+    )
+    return ConventionCheck(misfit, finding=finding)
+
+
+def _count_equations(stated: Comparison | None, search: Search) -> int:
+    """Return the number of equations beyond those of unknown frames: of the data as written, or
+    else of the interpretation.
+    """
+    chosen = None if search.selection is None else search.selection.comparison
+    comparison = chosen if stated is None else stated
+    if comparison is None or comparison.linearization is None:
+        return FEWEST_TO_REFUSE
+    return int(comparison.linearization.equations[0])
+
+
+def _select_known_readings(data: Measurements, redundant: bool) -> Measurements | None:
+    """Return the poses all of whose readings exist and are believed; None where there is none.
+
+    Only redundant readings keep their sigma: those of other robots contradict nothing.
+    """
     if data.reading_sigma is None:
         return data
     known = np.isfinite(data.reading_sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
-    return replace(data.take(known), reading_sigma=None) if known.any() else None
+    if not known.any():
+        return None
+    poses = data.take(known)
+    return poses if redundant else replace(poses, reading_sigma=None)
+
+
+def _has_uncertain_readings(data: Measurements) -> bool:
+    """Return whether readings have errors, which may explain a misfit of exact ones."""
+    sigma = data.reading_sigma
+    return sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
 
 
 def _thin_out(data: Measurements) -> Measurements:
@@ -270,6 +327,18 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
         is_consistent=against.misfit <= ALLOWED,
     )
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
+
+
+def _report_orders(free: FreeParameters, data: Measurements) -> Finding | None:
+    """Report other orders of the actuators that explain data as well; None without any."""
+    orders = find_equal_orders(free, data)
+    if not orders:
+        return None
+    return report_finding(
+        "conventions.orders-undecided",
+        robot=free.robot.name,
+        alternatives=tuple(order.describe() for order in orders),
+    )
 
 
 def _report_far_rows(stated: Comparison) -> Finding:

@@ -23,14 +23,14 @@ from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of
+from loopcal.estimate.problem_construction import make_problem, problem_of
 from loopcal.measure import Measurements, NuisanceParameters
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import find_directly_reachable, forward, forward_trials
-from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
 
-FEWEST = 8
+FEWEST = 3
 """Smallest number of equations beyond those of unknown frames that gives a misfit."""
 
 FAR, MOST_EXCLUDED = 5.0, 0.25
@@ -42,14 +42,6 @@ FOLLOWED = 8
 """Number of poses that Newton's method does not reach from home at once, and that are tried along a
 path before all others.
 """
-
-REFINEMENT = Halving(steps=3, attempts=1)
-"""Gauss-Newton steps by which the stated convention and the best other one are compared finally; a
-step that does not lower the cost ends them.
-"""
-
-LARGEST_STEP = 30.0
-"""Tolerances that a parameter may leave its value in these steps."""
 
 
 class Effort(NamedTuple):
@@ -109,7 +101,7 @@ class Comparison:
         linearization = self.linearization
         if linearization is None:
             return np.full(len(self.problem), np.nan)
-        return _misfit_of_cost(_smallest_cost(linearization.factor), linearization.equations)
+        return compute_misfit(compute_smallest_cost(linearization.factor), linearization.equations)
 
     @property
     def misfit(self) -> float:
@@ -123,6 +115,13 @@ class Comparison:
         values = None if linearization.nuisance is None else linearization.nuisance.values
         solution = self.problem.solve(linearization.deviation, linearization.next_start, values)
         return self.problem.residuals(linearization.deviation, solution)
+
+
+def is_redundant(free: FreeParameters) -> bool:
+    """Return whether readings contradict each other by their errors, since the robot has more
+    actuators than freedoms; the readings of every pose are then rows, too.
+    """
+    return free.robot.program.sigma is not None
 
 
 def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = False) -> Reach:
@@ -162,7 +161,7 @@ def compare_with_robot(
     data : at poses that the robot reaches. interpretations : of their values; default: as written.
     start : (t, U), optional. Nuisance parameters to start from; default: guessed from the data.
     """
-    nuisance, rows = data.nuisance_parameters, []
+    nuisance, rows, count = data.nuisance_parameters, [], max(len(interpretations), 1)
     for i, o in enumerate(data.observations):
         if not len(o):
             continue
@@ -176,15 +175,22 @@ def compare_with_robot(
         whitener = o.whitener * same[..., None, None]
         rows.append(ObservationRows(o.kind, o.rows, measured, whitener, nuisance.indices[i]))
     chosen = NuisanceParameters(nuisance.table, tuple(r.nuisance for r in rows))
-    problem = Problem(
-        free,
-        data.readings[None],
-        tuple(rows),
-        np.arange(max(len(interpretations), 1)),
-        plan_elimination(chosen, rows),
-        lambda _: data,
-        control=effort.control,
-    )
+    if is_redundant(free):
+        recorded = np.repeat(data.readings[None], count, axis=0)
+        problem = make_problem(
+            free, recorded, data.reading_sigma, tuple(rows), count, chosen, lambda _: data
+        )
+        problem = replace(problem, control=effort.control)
+    else:
+        problem = Problem(
+            free,
+            data.readings[None],
+            tuple(rows),
+            np.arange(count),
+            plan_elimination(chosen, rows),
+            lambda _: data,
+            control=effort.control,
+        )
     return Comparison(data, problem, _linearize(problem, data, effort, start), effort)
 
 
@@ -198,7 +204,11 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
         return comparison
     pairs = zip(comparison.residuals(), _expected_sd(problem, linearization), strict=True)
     ratios = [_row_rms(residuals.whitened, sd) for residuals, sd in pairs]
+    if problem.is_uncertain:
+        ratios[-1][:] = np.nan  # readings are no rows of their own: they locate the pose
     together = np.concatenate(ratios, axis=1)
+    if np.isnan(together).all():
+        return comparison
     median = np.nanmedian(together, axis=1)
     limit = np.maximum(FAR * median, np.nanquantile(together, 1.0 - MOST_EXCLUDED, axis=1))
     if not np.any(together > limit[:, None]):
@@ -253,63 +263,8 @@ def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
         if not np.isfinite(linearization.cost[0]):
             return np.inf
         return float(
-            _misfit_of_cost(_smallest_cost(linearization.factor), linearization.equations)[0]
+            compute_misfit(compute_smallest_cost(linearization.factor), linearization.equations)[0]
         )
-
-
-def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
-    """Return the misfit of the first interpretation after Gauss-Newton steps within the tolerances,
-    and its nuisance parameters (U,) there.
-
-    The misfit to first order is returned where it is smaller.
-    """
-    linearization, first = comparison.linearization, np.arange(1)
-    if linearization is None or not np.isfinite(comparison.misfit):
-        return comparison.misfit, comparison.data.nuisance_parameters.values()
-    problem, linearization = comparison.problem.take(first), linearization.take(first)
-    z = linearization.deviation
-
-    def propose(point: _Point) -> _Step:
-        p = problem.parameters
-        prior = np.concatenate([np.eye(p), point.step.T], axis=1)
-        whole = engine.fold(point.linearization.factor, prior[None])[0]
-        direction = -np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
-        largest = np.abs(point.step + direction).max(initial=0.0)
-        share = np.full((1, 1), float(largest <= LARGEST_STEP))
-        return _Step(direction, np.sum(whole[:p, p] ** 2, keepdims=True), share)
-
-    def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
-        if not share.any():
-            return point
-        total = point.step + share * step.direction
-        return _Point(total, problem.linearize(z + total, point.linearization.next_start))
-
-    end, _ = minimize_by_halving(_Point(np.zeros_like(z), linearization), propose, move, REFINEMENT)
-    values = (
-        np.zeros(0) if end.linearization.nuisance is None else end.linearization.nuisance.values[0]
-    )
-    refined = float(_misfit_of_cost(end.cost, end.linearization.equations)[0])
-    return min(comparison.misfit, refined), values
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A step (1, p) from the robot's values in tolerances, and the linearization there."""
-
-    step: FloatArray
-    linearization: Linearization
-
-    @property
-    def cost(self) -> FloatArray:
-        return self.linearization.cost + (self.step**2).sum(axis=1)
-
-
-class _Step(NamedTuple):
-    """A full Gauss-Newton step (1, p); see `FullStep`."""
-
-    direction: FloatArray
-    change: FloatArray
-    share: FloatArray
 
 
 def _linearize(
@@ -335,7 +290,7 @@ def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatA
     robot, t, observations = problem.free.robot, len(problem), list(data.observations)
     measured = [np.broadcast_to(o.measured, (t, *o.measured.shape)) for o in observations]
     used = [i for i, o in enumerate(observations) if len(o)]
-    for i, rows in zip(used, problem.rows, strict=True):
+    for i, rows in zip(used, problem.rows, strict=False):  # readings may follow
         measured[i] = np.broadcast_to(rows.measured, measured[i].shape)
         if t == 1:
             present = np.any(rows.whitener[0] != 0.0, axis=(1, 2))
@@ -351,8 +306,12 @@ def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatA
 
 
 def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatArray]:
-    """Return the standard deviations (r, m) [1] of whitened residuals by tolerances and noise."""
+    """Return the standard deviations (r, m) [1] of whitened residuals by tolerances and noise; by
+    noise alone for estimated poses, whose rows depend on each other.
+    """
     result = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
+    if problem.is_uncertain:
+        return result
     first, p = np.arange(1), problem.parameters
     blocks = problem.take(first).leverage_rows(linearization.take(first))
     for block, rows_of_block in zip(problem.poses.blocks, blocks, strict=True):
@@ -363,14 +322,14 @@ def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatAr
     return result
 
 
-def _smallest_cost(factor: FloatArray) -> FloatArray:
+def compute_smallest_cost(factor: FloatArray) -> FloatArray:
     """Return the smallest |R z + r|^2 + |z|^2 (t,) of factors (t, p + 1, p + 1)."""
     t, p = len(factor), factor.shape[-1] - 1
     prior = np.broadcast_to(np.eye(p, p + 1), (t, p, p + 1))
     return engine.fold(factor, prior)[:, -1, -1] ** 2 if p else factor[:, -1, -1] ** 2
 
 
-def _misfit_of_cost(cost: FloatArray, rows: IntArray) -> FloatArray:
+def compute_misfit(cost: FloatArray, rows: IntArray) -> FloatArray:
     """Return the root mean square (t,) over the equations; NaN with too few."""
     return np.where(rows >= FEWEST, np.sqrt(cost / np.maximum(rows, 1)), np.nan)
 

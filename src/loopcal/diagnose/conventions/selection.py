@@ -1,47 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Select the interpretation of measurements that fits a robot far better than the stated one.
+"""Search for the interpretation of measurements that explains them.
 
-All interpretations of the measured values are compared by a few rows first; the promising ones are
-judged by all rows. Interpretations of the actuator readings are tested only where none of these is
-allowed, because each needs its own poses.
+Interpretations of the values are evaluated together, those of the actuator readings one by one,
+because they have their own poses. Pairs are tested only if no single interpretation explains the
+data: the most promising ones are applied, and all others are tested on the result.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations import (
-    Interpretation,
-    list_interpretations,
-    list_reading_interpretations,
-)
+from loopcal.diagnose.conventions.interpretations import Interpretation, combine
+from loopcal.diagnose.conventions.judgement import BETTER, guess_frames, is_informative, judge_data
 from loopcal.diagnose.conventions.misfit import (
     MOST_EXCLUDED,
     QUICK,
     THOROUGH,
     Comparison,
-    compare_with_robot,
     compute_misfits,
-    exclude_far_rows,
-    refine_misfit,
+    is_redundant,
     select_reached,
 )
+from loopcal.diagnose.conventions.reading_interpretations import list_reading_interpretations
+from loopcal.diagnose.conventions.refinement import refine_misfit
+from loopcal.diagnose.conventions.value_interpretations import list_interpretations
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.measure import Measurements
-from loopcal.measure.initial_values import guess_nuisance_values_batch
-from loopcal.mechanism import find_directly_reachable, forward_trials
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.mechanism import compute_readings, find_directly_reachable
+from loopcal.typing import FloatArray, IntArray
 
-BETTER = 5.0
-"""Factor by which another interpretation must fit better before data are refused: true data of a
-robot far beyond its tolerances fit twice as well in none of them.
+FAR_BETTER = 25.0
+"""Factor by which it must fit better if tolerances and noise do not explain the rest, as of a robot
+far from nominal in data with a wrong unit.
 """
 
 ALLOWED = 4.0
 """Misfit up to which tolerances and noise explain a residual."""
+
+LARGEST = 10.0
+"""Misfit up to which another interpretation is accepted if the robot reaches too few poses of the
+data as written, which then have no misfit to compare.
+"""
 
 FEW_ROWS, FEWEST_POSES = 60, 20
 """Number of rows, and smallest number of poses, by which all interpretations are compared first."""
@@ -51,10 +54,23 @@ PROMISING, MOST_JUDGED = 2.0, 8
 number of interpretations that are judged by all rows.
 """
 
-NEAREST = 8
-"""Number of interpretations of the readings that are judged where frames are unknown: those of the
-smallest misfit before parameters change.
+NEAREST, NEAREST_IN_PAIRS = 12, 4
+"""Number of interpretations of the readings that are judged: those of the smallest misfit before
+parameters change.
 """
+
+LOWERED, MOST_BASES = 0.7, 3
+"""Share of the misfit below which an interpretation is a base of pairs, and largest number of bases
+among the values, and among the readings.
+"""
+
+MEASURED = 12
+"""Number of measured residuals from which the order of a redundant robot's actuators is certain:
+those of four positions, by which no machine of another order agrees with its redundant readings.
+"""
+
+ORDERS = ("swapped-readings", "reversed-readings", "permuted-readings")
+"""Slips in the order of the actuators."""
 
 EQUALLY = 1.2
 """Ratio of misfits up to which two interpretations fit equally well; the first in the list is
@@ -73,45 +89,191 @@ class Selection(NamedTuple):
     alternatives: tuple[Interpretation, ...]
 
 
-def select_interpretation(
-    free: FreeParameters, data: Measurements, stated: Comparison | None, misfit: float
-) -> Selection | None:
-    """Select the interpretation that fits far better than the stated one; None without one.
+class Search(NamedTuple):
+    """A finished search.
+
+    Attributes
+    ----------
+    selection : the interpretation that explains the data; None without one.
+    tried : slip -> number of single interpretations that were tested. pairs : number of pairs.
+    """
+
+    selection: Selection | None
+    tried: dict[str, int]
+    pairs: int
+
+
+class _Test(NamedTuple):
+    """An interpretation, its misfit by a few rows and, if that is promising, by all rows; infinite
+    if it was not computed.
+    """
+
+    interpretation: Interpretation
+    quick: float
+    misfit: float
+
+
+def search_interpretations(
+    free: FreeParameters,
+    data: Measurements,
+    stated: Comparison | None,
+    misfit: float,
+    pairs: bool = True,
+) -> Search:
+    """Search for the interpretation that fits far better than the stated one.
 
     Parameters
     ----------
     data : as written. stated : their comparison at the poses that the robot reaches; None where it
-        reaches too few. misfit : of the data as written.
+        reaches too few. misfit : of the data as written. pairs : test pairs if no single
+        interpretation explains the data.
     """
-    tested = [] if stated is None else _test_values(free, stated.data, misfit)
-    if not any(value <= ALLOWED for _, value in tested):
-        tested += _test_readings(free, data, misfit)
+    written = None if stated is None else stated.data
+    singles = _test_all(free, data, written, misfit)
+    tried = dict(Counter(test.interpretation.slip for test in singles))
+    best = _select_best(free, data, written, singles, misfit, ALLOWED)
+    count = 0
+    if best is None and pairs:
+        tested = list(_test_pairs(free, data, written, singles, misfit))
+        count = len(tested)
+        best = _select_best(free, data, written, tested, misfit, ALLOWED)
+    if best is None:
+        limit = misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST
+        best = _select_best(free, data, written, singles, misfit, limit)
+    return Search(best, tried, count)
 
-    def written(interpretation: Interpretation) -> Measurements:
-        return data if interpretation.observation is None or stated is None else stated.data
 
-    better = [
-        (interpretation, value)
-        for interpretation, value in tested
-        if value * BETTER < misfit
-        and _is_informative(free, written(interpretation), interpretation, value)
-    ]
-    if not better:
-        return None
-    smallest = min(value for _, value in better)
-    best, *others = [
-        interpretation for interpretation, value in better if value <= max(EQUALLY * smallest, 1.0)
-    ]
-    comparison = _judge(free, best.apply(written(best)))
-    if comparison is None:
-        return None
-    least, _ = refine_misfit(comparison)
-    return Selection(best, comparison, least, tuple(others)) if least * BETTER < misfit else None
+def find_equal_orders(free: FreeParameters, data: Measurements) -> tuple[Interpretation, ...]:
+    """Find other orders of the actuators that explain data of a redundant robot as well as the
+    stated one, which explains them.
+
+    Only data whose measured rows are few leave that open: poses are then known from the readings.
+    """
+    measured = sum(o.n_residuals for o in data.observations)
+    if not is_redundant(free) or measured >= MEASURED:
+        return ()
+    few = data.take(_select_measured(data))
+    equal = []
+    for interpretation in list_reading_interpretations(few, free.robot.actuators):
+        if interpretation.slip in ORDERS:
+            comparison = judge_data(free, interpretation.apply(few))
+            if comparison is not None and refine_misfit(comparison)[0] <= ALLOWED:
+                equal.append(interpretation)
+    return tuple(equal)
+
+
+def _select_measured(data: Measurements) -> IntArray:
+    """Return the measured poses, and others spread over the data up to `FEWEST_POSES`."""
+    measured = np.unique(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
+    others = np.setdiff1d(np.arange(data.n_poses), measured)
+    spread = np.linspace(0, max(len(others) - 1, 0), max(FEWEST_POSES - len(measured), 0))
+    return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
 
 
 def shares_poses(data: Measurements) -> bool:
     """Return whether rows share more than their pose: pairs of poses, or groups."""
     return any(o.kind.poses_per_row > 1 or bool((o.group != "").any()) for o in data.observations)
+
+
+def _test_all(
+    free: FreeParameters,
+    data: Measurements,
+    reached: Measurements | None,
+    misfit: float,
+    nearest: int = NEAREST,
+) -> list[_Test]:
+    """Test all single interpretations of data as written, `reached` where the robot reaches them;
+    those of the values only if it reaches enough poses.
+    """
+    values = [] if reached is None else _test_values(free, reached, misfit)
+    return values + _test_readings(free, data, misfit, nearest)
+
+
+def _test_pairs(
+    free: FreeParameters,
+    data: Measurements,
+    reached: Measurements | None,
+    singles: Sequence[_Test],
+    misfit: float,
+) -> Iterator[_Test]:
+    """Yield tests of pairs: the most promising single ones, each with all others after it."""
+    for of_readings in (False, True):
+        bases = sorted(
+            (
+                test
+                for test in singles
+                if (test.interpretation.observation is None) is of_readings
+                and test.quick < LOWERED * misfit
+            ),
+            key=lambda test: test.quick,
+        )
+        for base in bases[:MOST_BASES]:
+            changed = base.interpretation.apply(data)
+            if of_readings:
+                reach = select_reached(free, changed)
+                there = reach.data if reach.is_enough else None
+            else:
+                there = None if reached is None else base.interpretation.apply(reached)
+            bound = min(misfit, base.quick)
+            for test in _test_all(free, changed, there, bound, NEAREST_IN_PAIRS):
+                yield test._replace(
+                    interpretation=combine(base.interpretation, test.interpretation)
+                )
+
+
+def _select_best(
+    free: FreeParameters,
+    data: Measurements,
+    reached: Measurements | None,
+    tested: Sequence[_Test],
+    misfit: float,
+    limit: float,
+) -> Selection | None:
+    """Select the interpretation of the smallest misfit up to `limit` that is far better than
+    `misfit`; None without one.
+    """
+
+    def choose_data(interpretation: Interpretation) -> Measurements:
+        of_values = all(part.observation is not None for part in interpretation.parts)
+        return reached if of_values and reached is not None else data
+
+    better = [
+        test
+        for test in tested
+        if test.misfit <= limit
+        and test.misfit * BETTER < misfit
+        and is_informative(free, choose_data(test.interpretation), test.interpretation, test.misfit)
+    ]
+    if not better:
+        return None
+    smallest = min(test.misfit for test in better)
+    equal = [t.interpretation for t in better if t.misfit <= max(EQUALLY * smallest, 1.0)]
+    best, *others = _drop_same(data, equal)
+    comparison = judge_data(free, best.apply(choose_data(best)))
+    if comparison is None:
+        return None
+    least, _ = refine_misfit(comparison)
+    if not (least * BETTER < misfit and least <= limit):
+        return None
+    return Selection(best, comparison, least, tuple(others))
+
+
+def _drop_same(
+    data: Measurements, interpretations: Sequence[Interpretation]
+) -> list[Interpretation]:
+    """Return the interpretations without those that make the same data as an earlier one."""
+    kept: list[Interpretation] = []
+    tables: list[list[FloatArray]] = []
+    for interpretation in interpretations:
+        changed = interpretation.apply(data)
+        table = [changed.readings, *(o.measured for o in changed.observations)]
+        if not any(
+            all(np.allclose(a, b, equal_nan=True) for a, b in zip(table, other, strict=True))
+            for other in tables
+        ):
+            kept.append(interpretation)
+            tables.append(table)
+    return kept
 
 
 def _select_few(data: Measurements) -> IntArray:
@@ -126,108 +288,52 @@ def _select_few(data: Measurements) -> IntArray:
     return np.unique(np.linspace(0, n - 1, count).astype(np.intp))
 
 
-def _test_values(
-    free: FreeParameters, data: Measurements, misfit: float
-) -> list[tuple[Interpretation, float]]:
-    """Return interpretations of the measured values that promise to fit far better, with their
-    misfits.
-    """
+def _test_values(free: FreeParameters, data: Measurements, misfit: float) -> list[_Test]:
+    """Test all interpretations of the measured values."""
     listed = list(list_interpretations(data))
     screened = compute_misfits(free, data.take(_select_few(data)), listed, QUICK)
-    promising = [listed[i] for i in _select_promising(screened, misfit)]
-    misfits = compute_misfits(free, data, promising, THOROUGH)
-    return list(zip(promising, misfits.tolist(), strict=True))
+    promising = _select_promising(screened, misfit)
+    judged = np.full(len(listed), np.inf)
+    judged[promising] = compute_misfits(free, data, [listed[i] for i in promising], THOROUGH)
+    return _list_tests(listed, screened, judged)
 
 
 def _test_readings(
-    free: FreeParameters, data: Measurements, misfit: float
-) -> list[tuple[Interpretation, float]]:
-    """Return interpretations of the readings that promise to fit far better, with their misfits."""
+    free: FreeParameters, data: Measurements, misfit: float, nearest: int
+) -> list[_Test]:
+    """Test all interpretations of the readings: the reach of all, the residuals before parameters
+    change of those in reach, and the misfit of the `nearest` ones.
+    """
     robot, poses = free.robot, _select_few(data)
-    listed = list(list_reading_interpretations(data, robot.actuators))
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+    listed = list(list_reading_interpretations(data, robot.actuators, home))
     readings = np.stack([interpretation.change(data.readings)[poses] for interpretation in listed])
     reached = find_directly_reachable(
         robot, robot.values[None], readings.reshape(1, -1, readings.shape[-1])
     ).reshape(readings.shape[:2])
     near = np.flatnonzero(reached.mean(axis=1) >= 1.0 - MOST_EXCLUDED)
-    start, size = _guess_frames(free, data.take(poses), readings[near], reached[near])
-    has_frames = len(data.nuisance_parameters) > 0
-    order = np.sort(np.argsort(size)[:NEAREST]) if has_frames else np.arange(len(near))
-    nearest = [listed[i] for i in near[order]]
-    few = [
-        _judge(free, interpretation.apply(data).take(poses), start[[i]])
-        for i, interpretation in zip(order, nearest, strict=True)
-    ]
-    screened = np.array(
-        [np.inf if interpretation is None else interpretation.misfit for interpretation in few]
-    )
-    promising = [nearest[i] for i in _select_promising(screened, misfit)]
-    judged = [
-        (interpretation, _judge(free, interpretation.apply(data))) for interpretation in promising
-    ]
-    return [
-        (interpretation, comparison.misfit)
-        for interpretation, comparison in judged
-        if comparison is not None
-    ]
+    start, size = guess_frames(free, data.take(poses), readings[near], reached[near])
+    screened, judged = np.full(len(listed), np.inf), np.full(len(listed), np.inf)
+    for i in np.sort(np.argsort(size, kind="stable")[:nearest]):
+        changed = listed[near[i]].apply(data)
+        comparison = judge_data(free, changed.take(poses), start[[i]])
+        screened[near[i]] = np.inf if comparison is None else comparison.misfit
+    for i in _select_promising(screened, misfit):
+        comparison = judge_data(free, listed[i].apply(data))
+        judged[i] = np.inf if comparison is None else comparison.misfit
+    return _list_tests(listed, screened, judged)
 
 
-def _guess_frames(
-    free: FreeParameters, data: Measurements, readings: FloatArray, reached: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Guess nuisance parameters (h, U) for h sets of readings (h, n, a), and return the median (h,)
-    of the sizes of whitened residuals with them, the robot as it is.
-
-    Poses that the robot does not reach, by `reached` (h, n), are taken at home.
-    """
-    robot, nuisance, h = free.robot, data.nuisance_parameters, len(readings)
-    T = np.broadcast_to(robot.home_state.T.reshape(-1, 4, 4)[0], (*reached.shape, 4, 4)).copy()
-    T[reached] = forward_trials(robot, robot.values[None], readings[reached][None]).T[0]
-    measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
-    most, steps = QUICK.candidates, QUICK.guess_steps
-    start = guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
-    sizes = [np.zeros((h, 0))]
-    for o, places in zip(data.observations, nuisance.indices, strict=True):
-        if len(o) and not o.kind.sensed_joints:
-            residual = o.evaluate(T, start[:, places]).residual
-            whitened = np.matmul(o.whitener, residual[..., None])[..., 0]
-            sizes.append(np.linalg.norm(whitened, axis=-1))
-    size = np.concatenate(sizes, axis=1)
-    return start, np.median(size, axis=1) if size.shape[1] else np.zeros(h)
-
-
-def _judge(
-    free: FreeParameters, data: Measurements, start: FloatArray | None = None
-) -> Comparison | None:
-    """Compare measurements with the robot without far rows, quickly from a given start; None where
-    it reaches too few poses.
-    """
-    reach = select_reached(free, data)
-    if not reach.is_enough:
-        return None
-    effort = THOROUGH if start is None else QUICK
-    return exclude_far_rows(compare_with_robot(free, reach.data, (), effort, start))
+def _list_tests(
+    listed: Sequence[Interpretation], screened: FloatArray, judged: FloatArray
+) -> list[_Test]:
+    """Return tests; a misfit of too few rows is infinite."""
+    numbers = (np.nan_to_num(misfits, nan=np.inf).tolist() for misfits in (screened, judged))
+    return [_Test(*row) for row in zip(listed, *numbers, strict=True)]
 
 
 def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
     """Return the places of the best misfits that may belong to a far better fit than `misfit`."""
     finite = np.sort(misfits[np.isfinite(misfits)])
     bound = min(PROMISING * misfit / BETTER, *finite[MOST_JUDGED - 1 : MOST_JUDGED], np.inf)
-    return np.flatnonzero(misfits <= bound)
-
-
-def _is_informative(
-    free: FreeParameters, data: Measurements, interpretation: Interpretation, misfit: float
-) -> bool:
-    """Return whether values that shrink fit far better than a constant would: zeros fit every
-    unit.
-    """
-    if not interpretation.shrinks:
-        return True
-
-    def make_constant(values: FloatArray) -> FloatArray:
-        changed = interpretation.change(values)
-        return np.where(changed != values, np.nanmedian(changed, axis=0), changed)
-
-    control = _judge(free, replace(interpretation, change=make_constant).apply(data))
-    return control is None or not control.misfit < BETTER * misfit
+    return np.flatnonzero((misfits <= bound) & np.isfinite(misfits))

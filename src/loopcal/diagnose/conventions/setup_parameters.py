@@ -18,12 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from loopcal.diagnose.conventions.misfit import (
-    Comparison,
-    compare_with_robot,
-    exclude_far_rows,
-    refine_misfit,
-)
+from loopcal.diagnose.conventions.misfit import Comparison, compare_with_robot, exclude_far_rows
+from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
 

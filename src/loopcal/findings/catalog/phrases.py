@@ -41,6 +41,29 @@ MOTIONS = {
     "z": "translation along z",
 }
 
+TRIED: Mapping[str, str] = {
+    "unit": "unit/units",
+    "gear-factor": "gear factor (2, 1.5 or inverse)/gear factors (2, 1.5 and inverses)",
+    "scalar-last": "form of the rotation/forms of the rotation",
+    "orientation-form": "form of the rotation/forms of the rotation",
+    "inverted-rotations": "inversion/inversions",
+    "inverted-poses": "inversion/inversions",
+    "left-handed-frame": "mirrored frame/mirrored frames",
+    "sign": "sign/signs",
+    "angle-signs": "sign/signs",
+    "reading-sign": "sign/signs",
+    "zenith-angles": "zenith angle/zenith angles",
+    "swapped-columns": "order of columns/orders of columns",
+    "permuted-columns": "order of columns/orders of columns",
+    "swapped-targets": "order of targets/orders of targets",
+    "permuted-targets": "order of targets/orders of targets",
+    "swapped-readings": "order of actuators/orders of actuators",
+    "reversed-readings": "order of actuators/orders of actuators",
+    "permuted-readings": "order of actuators/orders of actuators",
+    "shifted-readings": "shift by one row/shifts by one row",
+}
+"""Kind of a slip -> its name for one, and for several."""
+
 CONSTRAINTS = {
     "loops-open": "the loops cannot be closed",
     "limit-exceeded": "{limit} exceeded",
@@ -251,7 +274,27 @@ def equally_good(data: Data) -> str:
 def correction(data: Data) -> str:
     """Return what to correct where the data fit in another interpretation."""
     slip = data["interpretation"]
-    return fill_template(find_entry(slip["code"]).action, **slip)
+    return " ".join(
+        fill_template(find_entry(part["code"]).action, **part)
+        for part in slip.get("parts", (slip,))
+    )
+
+
+def combined_changes(data: Data) -> str:
+    """Return the changes of an interpretation that makes several."""
+    return " and ".join(find_entry(part["code"]).word(part) for part in data["parts"])
+
+
+def tried_changes(data: Data) -> str:
+    """Return the numbers of tested changes, by their kinds, and of pairs of them."""
+    names = list(dict.fromkeys(TRIED[slip] for slip in data["tried"]))
+    counts = [sum(n for slip, n in data["tried"].items() if TRIED[slip] == name) for name in names]
+    words = [
+        fill_template(f"{{n:count {name}}}", n=n) for name, n in zip(names, counts, strict=True)
+    ]
+    if data["pairs"]:
+        words.append(fill_template("{pairs:count pair/pairs} of these", **data))
+    return ", ".join(words)
 
 
 def times_larger(data: Data) -> str:
