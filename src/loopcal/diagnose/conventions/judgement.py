@@ -15,6 +15,7 @@ from loopcal.diagnose.conventions.misfit import (
     Comparison,
     compare_with_robot,
     exclude_far_rows,
+    is_redundant,
     select_reached,
 )
 from loopcal.estimate.free_parameters import FreeParameters
@@ -69,7 +70,12 @@ def guess_frames(
 def is_informative(
     free: FreeParameters, data: Measurements, interpretation: Interpretation, misfit: float
 ) -> bool:
-    """Return whether data fit far better in an interpretation than controls without information."""
+    """Return whether data fit far better in an interpretation than controls without information.
+
+    Redundant readings that agree with each other are information by themselves.
+    """
+    if is_redundant(free) and all(part.observation is None for part in interpretation.parts):
+        return True
     for control in _list_controls(data, interpretation):
         comparison = judge_data(free, control)
         if comparison is not None and comparison.misfit < BETTER * misfit:

@@ -21,6 +21,9 @@ GEAR_FACTORS = (2.0, 0.5, 1.5, 1.0 / 1.5)
 pulley are stated wrongly.
 """
 
+NEGLIGIBLE = 1e-6
+"""Reading of the home pose [m or rad] that counts as 0."""
+
 MOST_PERMUTED = 4
 """Number of actuators up to which all orders are tested."""
 
@@ -107,11 +110,13 @@ def _list_gears(actuators: Sequence[Actuator], home: FloatArray | None) -> Itera
     names = tuple(a.name for a in actuators)
     groups = [tuple(range(len(names))), *((j,) for j in range(len(names)) if len(names) > 1)]
     zeros = [("zero", np.zeros(len(names)))]
-    if home is not None and np.any(home != 0.0):
+    if home is not None:
         zeros.append(("home", np.asarray(home)))
     for origin, zero in zeros:
         for columns in groups:
-            for factor in GEAR_FACTORS if np.any(zero[list(columns)]) or origin == "zero" else ():
+            if origin == "home" and not np.any(np.abs(zero[list(columns)]) > NEGLIGIBLE):
+                continue  # the same as from 0
+            for factor in GEAR_FACTORS:
                 details = {
                     "actuators": tuple(names[j] for j in columns),
                     "factor": factor,
