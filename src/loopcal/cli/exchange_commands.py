@@ -38,6 +38,12 @@ if TYPE_CHECKING:
 
 READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
 WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
+TAPED = (
+    "lengths measured by hand, which become prior knowledge: lines at the origin (hangprinter), "
+    "arms (klipper, marlin, reprap), joint centers (linuxcnc)"
+)
+"""What the option --sigma-tape is for."""
+
 SHOWN = 20
 """Lines that do not match a profile that are listed."""
 
@@ -68,6 +74,8 @@ SHOWN = 20
             ("distance", "distances (klipper)", "0.1mm"),
             ("line", "lines (hangprinter)", "1mm"),
             ("position", "known positions (hangprinter)", "1mm"),
+            ("tape", TAPED, "10mm for lines"),
+            ("anchor", "anchors that FILE states (hangprinter)", "none: they are first guesses"),
         )
     )
 )

@@ -40,6 +40,7 @@ HINTS = {
     "files.saved-block": "use --into printer.cfg",
     "files.probe-noise-assumed": "state other values by --sigma-height and --sigma-distance",
     "files.sample-noise-assumed": "state other values by --sigma-line and --sigma-position",
+    "files.taped-prior": "state another value by --sigma-tape",
     "files.surfaces-in-plan": "use --measure plane-line",
     "fit.beyond-tolerance": "use --method map",
     "fit.low-weights": "exclude a pose with --drop POSE",

@@ -123,13 +123,11 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
         "force_samp": [[1, 2, 3, 4]] * 41,
         "colour": "red",
     }
-    _, imported = read(
-        tmp_path, simulate_example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]}
-    )
+    _, imported = read(tmp_path, simulate_example() | more)
     notes = " | ".join(map(str, imported.findings))
     assert "41 rows of line forces are not read" in notes
     assert "with 45 rows of motor angles" in notes
-    for words in ("stiffness", "weight", "lengths at the origin", "the key 'colour' is unknown"):
+    for words in ("stiffness", "weight", "the key 'colour' is unknown"):
         assert words in notes
     assert "1 mm is used for lines" in notes
 

@@ -218,7 +218,7 @@ class DeltaFirmware:
         offset = self._get_probe_offset(file)
         findings = (report_finding("files.probe-offset", offset=offset),) if offset else ()
         program = f"M665 and M666 of {self.program}"
-        text = format_robot(geometry, options.name, path, program, has_distances=False)
+        text = format_robot(geometry, options, path, program, has_distances=False)
         return Imported(text, None, findings)
 
     def write(self, source: ExportSource, into: Path | None) -> Exported:
@@ -341,6 +341,7 @@ MARLIN = Format(
     (".gcode",),
     MARLIN_FIRMWARE.read,
     MARLIN_FIRMWARE.write,
+    read_options=("sigma_tape",),
 )
 REPRAP = Format(
     "reprap",
@@ -348,4 +349,5 @@ REPRAP = Format(
     (".g",),
     REPRAP_FIRMWARE.read,
     REPRAP_FIRMWARE.write,
+    read_options=("sigma_tape",),
 )

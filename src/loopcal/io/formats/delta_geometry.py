@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
-from loopcal.io.formats.program_format import ExportSource, format_head, get_record
+from loopcal.io.formats.program_format import ExportSource, ImportOptions, format_head, get_record
 from loopcal.mechanism.families.linear_delta import LinearDelta
 
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
@@ -37,20 +37,26 @@ stops: {stops}       # height of the nozzle, in the center, with the carriage at
 readings: drop       # carriage positions count down from the end stops
 home: {{z: 0}}
 workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # assumed; replace by the real workspace
-{fixed}"""
+{arms_sd}{fixed}"""
+ARMS = "tolerances: {{arms: {{sd: {sd:.7g}}}}}     # measured by hand: prior knowledge\n"
 FIXED = "fixed: [arm*.length]     # heights alone do not determine the arms; distances do\n"
 
 
 def format_robot(
-    geometry: DeltaGeometry, name: str, path: Path, program: str, has_distances: bool
+    geometry: DeltaGeometry, options: ImportOptions, path: Path, program: str, has_distances: bool
 ) -> str:
-    """Return the robot file of a delta, with fixed arms unless distances determine them."""
+    """Return the robot file of a delta.
+
+    Its arms are fixed unless distances determine them, or the options state how accurately they
+    were measured by hand.
+    """
     if not min(geometry.arms) > geometry.radius > 0:
         sentence = f"the delta radius is {geometry.radius:g} mm and the shortest arm"
         act = "the radius must be positive and every arm longer than it; correct them"
         raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
     half = round(0.5 * geometry.radius)
-    head = format_head(path, program, "linear-delta", name, ("mm", "deg"))
+    head = format_head(path, program, "linear-delta", options.name, ("mm", "deg"))
+    is_taped = options.sigma_tape is not None
     return head + ROBOT.format(
         radius=geometry.radius,
         angles=list(geometry.angles),
@@ -58,7 +64,8 @@ def format_robot(
         stops=list(geometry.stops),
         side=[-half, half],
         top=half,
-        fixed="" if has_distances else FIXED,
+        arms_sd=ARMS.format(sd=options.choose_noise("tape") * 1e3) if is_taped else "",
+        fixed="" if has_distances or is_taped else FIXED,
     )
 
 

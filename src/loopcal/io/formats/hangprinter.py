@@ -9,7 +9,8 @@ spool and a build-up k (r^2 grows by k for each mm that is wound), motor angle q
 
 which is exact: dr/d(g q) = -k / 2. Spool radius and build-up become named parameters of the robot
 file, the anchors and the lengths at zero its errors. Known poses are measurements of the kind
-`position`; an unknown pose contributes its readings alone, and n - 3 equations. Source of the keys:
+`position`; an unknown pose contributes its readings alone, and n - 3 equations. A taped length at
+zero is prior knowledge: a nominal value whose tolerance is that of the tape. Source of the keys:
 the program auto-calibration-simulation-for-hangprinter.
 """
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -38,15 +39,22 @@ FREEDOMS, MOST_LINES = 3, 26
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 SAMPLES, POSITIONS, ANCHORS = "motor_pos_samp", "xyz_of_samp", "anchors"
+TAPED = "line_lengths_when_at_origin"
 TEETH = ("motor_gear_teeth", "spool_gear_teeth")
 SPOOLS = ("spool_r_in_origin_first_guess", "mechanical_advantage", "lines_per_spool")
-READ = {SAMPLES, POSITIONS, ANCHORS, *TEETH, *SPOOLS}
+READ = {SAMPLES, POSITIONS, ANCHORS, TAPED, *TEETH, *SPOOLS}
 FORCES = "force_samp"
-IGNORED = (FORCES, "springKPerUnitLength", "mover_weight", "line_lengths_when_at_origin")
+IGNORED = (FORCES, "springKPerUnitLength", "mover_weight")
 """Keys that a robot file cannot express."""
 
 SILENT = ("_source", "abc_axis_min_force_limit", "abc_axis_max_force_limit")
 """Keys without effect on the geometry."""
+
+WIDE = 200.0
+"""Tolerance of numbers that are first estimates [mm]: it leaves them to the data."""
+
+FAR_OFF = 10.0
+"""Ratio of a taped length to that of the known poses at which the unit is another one."""
 
 REMARK = "Readings are motor angles, zero at the origin; growing readings pay out line."
 ROBOT = """\
@@ -55,7 +63,7 @@ controlled: [x, y, z]
 # radius: line paid out per radian of the motor; sigma: the motor angle of {sigma:g} mm of line
 actuators:
 {drives}
-# lengths at readings of zero; anchors are first estimates with their tolerances
+# lengths at readings of zero{taped}; anchors are {anchors}
 limbs:
 {limbs}
 parameters:               # of the spools; buildup: growth of radius^2 for each length that is wound
@@ -65,8 +73,8 @@ workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # assumed; replace by t
 """
 LIMB = (
     "  - {{name: {name}, tip: {tip}, ending: distance, length: {length}, actuated: {drive}, "
-    "errors: [{{of: base, shift: [x, y, z], name: anchor, tolerance: {{sd: 200}}}}, "
-    "{{of: rod, shift: [length], tolerance: {{sd: 200}}}}]}}"
+    "errors: [{{of: base, shift: [x, y, z], name: anchor, tolerance: {{sd: {sd_anchor}}}}}, "
+    "{{of: rod, shift: [length], tolerance: {{sd: {sd_length}}}}}]}}"
 )
 PARAMETER = "  - {{name: {name}, length: {nominal}, tolerance: {{sd: {sd}}}, maps: [{maps}]}}"
 MAP = "{{limb: {drive}, element: transmission, axis: {axis}, coefficient: {coefficient}}}"
@@ -81,6 +89,7 @@ class Samples:
     radius, mechanical_advantage, lines_per_spool : (n,). gear : turns of the spool for one of the
         motor.
     motors : (N, n). known : (K, 3). anchors : (n, 3) where the file states them, else None.
+    taped : (n,) lengths at motor zero that were measured by hand, NaN where they were not.
     findings : keys that are not read.
     """
 
@@ -91,7 +100,13 @@ class Samples:
     motors: FloatArray
     known: FloatArray
     anchors: FloatArray | None = None
+    taped: FloatArray = field(default_factory=lambda: np.empty(0))
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def is_taped(self) -> BoolArray:
+        """Which lines were taped (n,)."""
+        return np.isfinite(self.taped) if self.taped.size else np.zeros(len(self.radius), bool)
 
     @property
     def share(self) -> FloatArray:
@@ -129,7 +144,8 @@ def read(path: Path, options: ImportOptions) -> Imported:
         sigma_position=Quantity(options.choose_noise("position") / MM, "mm"),
     )
     text = format_robot(samples, anchors, path, options)
-    return Imported(text, _build_measurements(samples, options), (finding, *samples.findings))
+    findings = (finding, *_report_priors(samples, options), *samples.findings)
+    return Imported(text, _build_measurements(samples, options), findings)
 
 
 def parse(path: Path) -> Samples:
@@ -161,11 +177,32 @@ def parse(path: Path) -> Samples:
             sentence = f"{ANCHORS!r} has {len(anchors)} rows, but there are {lines} lines"
             raise FileError(f"{sentence}; write one row for each", path)
     gear, findings = float(motor_teeth / spool_teeth), tuple(_report_ignored(content))
-    return Samples(radius, advantage, per_spool, gear, motors * DEG, known, anchors, findings)
+    taped = _parse_taped(content, path, lines)
+    return Samples(
+        radius, advantage, per_spool, gear, motors * DEG, known, anchors, taped, findings
+    )
+
+
+def _parse_taped(content: dict[str, Any], path: Path, lines: int) -> FloatArray:
+    """Return the taped lengths (n,), NaN for lines whose length is null or 0."""
+    stated = content.get(TAPED)
+    if stated is None:
+        return np.full(lines, np.nan)
+    cells = stated if isinstance(stated, list) else []
+    is_number = [isinstance(v, int | float) and not isinstance(v, bool) for v in cells]
+    if len(cells) != lines or not all(
+        v is None or (ok and 0.0 <= v < math.inf) for v, ok in zip(cells, is_number, strict=True)
+    ):
+        finding = report_finding("files.taped-lengths", key=TAPED, value=str(stated), lines=lines)
+        raise FileError(finding, path)
+    return np.array([v or np.nan for v in cells], dtype=float)
 
 
 def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     """Return first estimates of the anchors (n, 3) [mm] from the known poses.
+
+    The known poses determine an anchor least along its line. A taped length therefore replaces its
+    distance.
 
     Raises
     ------
@@ -180,13 +217,24 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
         raise FileError(f"no pose is known; {act}", path)
     extensions = samples.motors[: len(samples.known)] * samples.gain
     anchors = []
-    for name, extension in zip(samples.names, extensions.T, strict=True):
+    for i, (name, extension) in enumerate(zip(samples.names, extensions.T, strict=True)):
         anchor, rank, s = solve_line_anchor(samples.known, extension)
         if rank < ANCHOR_RANK:
             sentence = f"the {len(samples.known)} known poses do not determine the anchor of line"
             values = ", ".join(f"{value:.3g}" for value in s)
             reason = f"rank {rank} of {ANCHOR_RANK}, singular values {values}"
             raise FileError(f"{sentence} {name} ({reason}); {act}", path)
+        if samples.is_taped[i]:
+            length = float(np.linalg.norm(anchor))
+            if not 1.0 / FAR_OFF < samples.taped[i] / length < FAR_OFF:
+                finding = report_finding(
+                    "files.taped-length-far-off",
+                    line=name,
+                    taped=Quantity(float(samples.taped[i]), "mm"),
+                    estimate=Quantity(length, "mm"),
+                )
+                raise FileError(finding, path)
+            anchor *= samples.taped[i] / length
         anchors.append(anchor)
     return np.array(anchors)
 
@@ -194,7 +242,11 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
 def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: ImportOptions) -> str:
     """Return the robot file, one limb a line; spools of equal radius share one parameter."""
     sigma = options.choose_noise("line") / MM
-    lengths = np.linalg.norm(anchors, axis=1)
+    is_taped, apart = samples.is_taped, np.linalg.norm(anchors, axis=1)
+    lengths = np.where(is_taped, samples.taped, apart) if is_taped.any() else apart
+    sd_length = np.where(is_taped, options.choose_noise("tape") / MM, WIDE)
+    is_prior = samples.anchors is not None and options.sigma_anchor is not None
+    sd_anchor = options.sigma_anchor / MM if is_prior and options.sigma_anchor else WIDE
     drives = [
         f"  {name.lower()}: {{reads: angle, radius: {_format(gain)}, "
         f"sigma: {_format(sigma / gain / DEG, 7)}}}"
@@ -206,13 +258,17 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
             tip=[float(_format(v)) for v in anchor],
             length=_format(length),
             drive=name.lower(),
+            sd_anchor=_format(sd_anchor, 7),
+            sd_length=_format(sd, 7),
         )
-        for name, anchor, length in zip(samples.names, anchors, lengths, strict=True)
+        for name, anchor, length, sd in zip(samples.names, anchors, lengths, sd_length, strict=True)
     ]
     side = round(0.25 * lengths.min())
     what, units = "samples of a hanging printer", ("mm", "deg")
     return format_head(path, what, "limbs", options.name, units, REMARK) + ROBOT.format(
         sigma=sigma,
+        taped=", measured by hand within their tolerances" if is_taped.any() else "",
+        anchors="prior knowledge" if is_prior else "first estimates with their tolerances",
         drives="\n".join(drives),
         limbs="\n".join(limbs),
         parameters="\n".join(_list_parameters(samples)),
@@ -257,6 +313,17 @@ def _build_measurements(samples: Samples, options: ImportOptions) -> Measurement
     rows = replace(rows, is_noise_assumed=options.is_noise_assumed("line", "position"))
     labels = tuple(f"{'known' if i < k else 'sample'}{i + 1}" for i in range(n))
     return Measurements(options.name, samples.motors, (rows,), labels=labels)
+
+
+def _report_priors(samples: Samples, options: ImportOptions) -> Iterator[Finding]:
+    """Yield which lengths become prior knowledge, and how uncertain they are."""
+    if samples.is_taped.any():
+        yield report_finding(
+            "files.taped-prior",
+            count=int(samples.is_taped.sum()),
+            sigma=Quantity(options.choose_noise("tape") / MM, "mm"),
+            is_assumed=options.is_noise_assumed("tape"),
+        )
 
 
 def _report_ignored(content: dict[str, Any]) -> Iterator[Finding]:
@@ -326,5 +393,5 @@ FORMAT = Format(
     "samples of a hanging printer (JSON)",
     (),
     read,
-    read_options=("sigma_line", "sigma_position"),
+    read_options=("sigma_line", "sigma_position", "sigma_tape", "sigma_anchor"),
 )

@@ -173,7 +173,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
         raise cfg.error(f"{sentence} (kinematics: delta)", "printer", "kinematics")
     probes = _parse_probes(cfg)
     program, has_distances = "a printer.cfg of Klipper", bool(probes.distances)
-    text = format_robot(parse_geometry(cfg), options.name, path, program, has_distances)
+    text = format_robot(parse_geometry(cfg), options, path, program, has_distances)
     if not probes.positions:
         return Imported(text, None, (report_finding("files.no-probed-heights"),))
     steps = [get_step_distance(cfg, section) for section in STEPPERS]
@@ -326,6 +326,6 @@ FORMAT = Format(
     (".cfg",),
     read,
     write,
-    read_options=("sigma_height", "sigma_distance"),
+    read_options=("sigma_height", "sigma_distance", "sigma_tape"),
     stores_fit=True,
 )

@@ -59,7 +59,8 @@ platform:
 {platform}
 lengths: 0
 home: {{z: {home}}}
-{screw}"""
+{tolerances}{screw}"""
+TOLERANCES = "tolerances: {{base: {{sd: {sd}}}, platform: {{sd: {sd}}}}}     # measured by hand\n"
 SCREW = """\
 screw:
   lead: {lead}
@@ -147,9 +148,17 @@ def read(path: Path, options: ImportOptions) -> Imported:
         base=_format_list(base, 2),
         platform=_format_list(platform, 2),
         home=home,
+        tolerances=_format_tolerances(options, unit.factor_to_si),
         screw=screw,
     )
     return Imported(text, None, findings)
+
+
+def _format_tolerances(options: ImportOptions, factor: float) -> str:
+    """Return the tolerances of joint centers that were measured by hand; nothing for others."""
+    if options.sigma_tape is None:
+        return ""
+    return TOLERANCES.format(sd=f"{options.sigma_tape / factor:.7g}")
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
@@ -242,5 +251,5 @@ FORMAT = Format(
     (".hal",),
     read,
     write,
-    read_options=("length_unit", "home_height"),
+    read_options=("length_unit", "home_height", "sigma_tape"),
 )

@@ -23,9 +23,11 @@ ASSUMED_NOISE: Mapping[str, float] = {
     "distance": 0.1e-3,
     "line": 1e-3,
     "position": 1e-3,
+    "tape": 10e-3,
 }
 """Standard deviations [m] that are assumed where nobody states them: of a probed height, of a
-distance on a printed part, of line lengths and of known positions of a cable robot.
+distance on a printed part, of line lengths, of known positions and of taped lengths of a cable
+robot.
 """
 
 
@@ -38,7 +40,9 @@ class ImportOptions:
     name : of the robot.
     sigma_height, sigma_distance : noise of probed heights and distances [m], which no format
         states. sigma_line, sigma_position : noise of lines and known positions of a cable robot
-        [m]. Where one is None it is assumed, see `choose_noise`.
+        [m]. sigma_tape : of lengths that were measured by hand [m], which are prior knowledge.
+        Where one is None it is assumed, see `choose_noise`.
+    sigma_anchor : of anchors that the file states [m]; None leaves them to the data.
     length_unit : symbol of the unit of lengths, for formats that state none.
     home_height : z of the home pose [m].
     closures : file of loop closures, for formats that keep them apart.
@@ -54,9 +58,11 @@ class ImportOptions:
     platform: str | None = None
     sigma_line: float | None = None
     sigma_position: float | None = None
+    sigma_tape: float | None = None
+    sigma_anchor: float | None = None
 
     def choose_noise(self, what: str) -> float:
-        """Return the noise [m] of "height", "distance", "line" or "position": stated or assumed."""
+        """Return the noise [m] of a sort of numbers in `ASSUMED_NOISE`: stated or assumed."""
         stated: float | None = getattr(self, f"sigma_{what}")
         return ASSUMED_NOISE[what] if stated is None else stated
 
