@@ -28,12 +28,13 @@ if TYPE_CHECKING:
     from loopcal.diagnose import Identifiability as Identifiability
     from loopcal.diagnose import ModelChoice as ModelChoice
     from loopcal.diagnose import OutlierCheck as OutlierCheck
-    from loopcal.diagnose import TruthComparison as TruthComparison
+    from loopcal.diagnose import ValueComparison as ValueComparison
     from loopcal.diagnose import check_conventions as check_conventions
     from loopcal.diagnose import choose_identifiable_subset as choose_identifiable_subset
     from loopcal.diagnose import choose_model as choose_model
     from loopcal.diagnose import compare_conventions as compare_conventions
     from loopcal.diagnose import compare_with_truth as compare_with_truth
+    from loopcal.diagnose import compare_with_values as compare_with_values
     from loopcal.diagnose import cross_validate as cross_validate
     from loopcal.diagnose import examine_fit as examine_fit
     from loopcal.diagnose import find_outliers as find_outliers
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from loopcal.io import load_measurements as load_measurements
     from loopcal.io import load_robot as load_robot
     from loopcal.io import load_run as load_run
+    from loopcal.io import load_stored_values as load_stored_values
     from loopcal.io import save_measurements as save_measurements
     from loopcal.io import save_robot as save_robot
     from loopcal.io import save_run as save_run
@@ -138,9 +140,9 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.diagnose": """
             ConventionCheck CrossValidation FitExamination Identifiability ModelChoice
-            OutlierCheck TruthComparison check_conventions choose_identifiable_subset
-            choose_model compare_conventions compare_with_truth cross_validate examine_fit
-            find_outliers identifiability suggest_measurements
+            OutlierCheck ValueComparison check_conventions choose_identifiable_subset
+            choose_model compare_conventions compare_with_truth compare_with_values
+            cross_validate examine_fit find_outliers identifiability suggest_measurements
         """,
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
@@ -153,7 +155,8 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.findings": "Finding Quantity Severity",
         "loopcal.io": """
-            Run load_measurements load_robot load_run save_measurements save_robot save_run
+            Run load_measurements load_robot load_run load_stored_values save_measurements
+            save_robot save_run
         """,
         "loopcal.measure": """
             Autocollimation Bearing Component Direction Distance Gaussian Inclination Instrument

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import (
+    compare_with_values,
     compute_reading_errors,
     examine_fit,
     identifiability,
@@ -124,6 +125,23 @@ def compare_with_published(fit: Identification) -> tuple[np.ndarray, float]:
     off = fit.estimate[at] - np.ravel(PUBLISHED) * 1e-3
     return off / fit.standard_deviations[at], float(
         off @ np.linalg.solve(fit.covariance[np.ix_(at, at)], off)
+    )
+
+
+def test_comparison_states_that_the_published_anchors_do_not_agree(fit):
+    values = {
+        f"{line}.anchor.{axis}": value * 1e-3
+        for line, anchor in zip("ABCD", PUBLISHED, strict=True)
+        for axis, value in zip("xyz", anchor, strict=True)
+    }
+    result = compare_with_values(fit, values)
+    assert result.chi_square == pytest.approx(compare_with_published(fit)[1], rel=1e-6)
+    assert (result.degrees, result.agrees) == (12, False)
+    assert result.p_value == pytest.approx(4e-9, rel=0.5)
+    assert result.sigma == pytest.approx(6.3, abs=0.1)
+    assert {"A.anchor.z", "B.anchor.z", "C.anchor.z"} <= set(result.direction)
+    assert str(result.outcome).startswith(
+        "The stored values do not agree with the estimate: chi-square 64"
     )
 
 

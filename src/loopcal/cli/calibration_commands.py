@@ -65,6 +65,11 @@ TAKEN_OPTIONS = (
     help="Run folder of an earlier calibration of this machine, which is used as the prior.",
     metavar="RUN",
 )
+@file_option(
+    "--compare",
+    help="Stored values to compare with the estimate, such as those of a firmware: a robot file, "
+    "or a file with the table 'identified' of some parameters.",
+)
 @click.option(
     "--free-limb",
     metavar="LIMB",
@@ -84,6 +89,7 @@ def calibrate(
     output: Path,
     hold_out: float,
     prior: Path | None,
+    compare: Path | None,
     seed: int,
     force: bool,
     verbose: bool,
@@ -113,23 +119,25 @@ def calibrate(
       loopcal calibrate printer.yaml heights.csv -o run --noise estimated
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
+      loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
     """  # noqa: D301
     from loopcal import workflow
-    from loopcal.io import load_robot
+    from loopcal.io import load_robot, load_stored_values
     from loopcal.io.runs.run_folder import build_document, load_prior, refuse_run_folder, save_run
     from loopcal.io.runs.run_verdict import name_robot_file
     from loopcal.report.calibration_view import view_calibration
 
-    inputs = _list_inputs(robot, data, prior)
+    inputs = _list_inputs(robot, data, prior, compare)
+    machine = load_robot(robot)
     settings = workflow.CalibrationOptions(
         make_fit_options(options),
         hold_out,
         seed=seed,
         prior=None if prior is None else load_prior(prior, data),
+        compare_with=None if compare is None else load_stored_values(compare, machine),
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},
     )
-    machine = load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
     accepted = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
     measurements = read_measurements(data, machine, **accepted)
@@ -147,14 +155,20 @@ def calibrate(
     return report.exit_code
 
 
-def _list_inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, Path]:
+def _list_inputs(
+    robot: str, data: Sequence[Path], prior: Path | None, compare: Path | None
+) -> dict[str, Path]:
     """Return role -> file of everything that is read."""
     from loopcal.io.data.measurement_file import list_measurement_files
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.io.runs.run_folder import RESULT
 
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
-    return inputs if prior is None else {**inputs, "prior": prior / RESULT}
+    if prior is not None:
+        inputs["prior"] = prior / RESULT
+    if compare is not None:
+        inputs["compare"] = find_robot_file(compare)
+    return inputs
 
 
 @click.command()

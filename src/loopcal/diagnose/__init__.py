@@ -67,5 +67,6 @@ from loopcal.diagnose.row_errors import compute_row_errors as compute_row_errors
 from loopcal.diagnose.suggestions import MeasurementSuggestion as MeasurementSuggestion
 from loopcal.diagnose.suggestions import describe_missing_equations as describe_missing_equations
 from loopcal.diagnose.suggestions import suggest_measurements as suggest_measurements
-from loopcal.diagnose.truth_comparison import TruthComparison as TruthComparison
-from loopcal.diagnose.truth_comparison import compare_with_truth as compare_with_truth
+from loopcal.diagnose.value_comparison import ValueComparison as ValueComparison
+from loopcal.diagnose.value_comparison import compare_with_truth as compare_with_truth
+from loopcal.diagnose.value_comparison import compare_with_values as compare_with_values

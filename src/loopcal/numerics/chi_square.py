@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chi-square distribution: tail probabilities and quantiles.
+"""The chi-square and F distributions: tail probabilities and quantiles.
 
 scipy.special is imported when a function is called, so that `import loopcal` does not pay for it.
 """
@@ -22,6 +22,22 @@ def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatAr
     degrees = np.asarray(degrees, dtype=float)
     tail = chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic)
     return np.where(degrees > 0.0, tail, 1.0)
+
+
+def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) -> FloatArray:
+    """Return the probability that F exceeds a statistic; NaN without degrees of freedom left.
+
+    F is a chi-square per degree of freedom, where the noise is estimated from residuals.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom of the statistic. left : of the residuals. All broadcast.
+    """
+    from scipy.special import fdtrc
+
+    left = np.asarray(left, dtype=float)
+    tail = fdtrc(degrees, np.where(left > 0.0, left, 1.0), statistic)
+    return np.where(left > 0.0, tail, np.nan)
 
 
 def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:

@@ -55,6 +55,8 @@ def view_calibration(
         blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
     if fit.converged and not verbose and fit.regularization is not None:
         blocks.append(f"  {fit.regularization.finding}")
+    if report.comparison is not None:
+        blocks += ["", str(report.comparison.outcome)]
     blocks += ["", f"Next: {report.next_step}"]
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")

@@ -14,6 +14,7 @@ from loopcal.diagnose import (
     check_conventions,
     check_start_values,
     choose_model,
+    compare_with_values,
     compute_reading_errors,
     describe_missing_equations,
     examine_fit,
@@ -168,6 +169,8 @@ def _report(
     count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
+    stored = options.compare_with
+    comparison = None if stored is None else compare_with_values(fit, stored)
     findings = [
         *_report_conventions(conventions),
         *_report_fit(fit),
@@ -177,6 +180,7 @@ def _report(
         start.finding,
         *(() if examination is None else examination.findings),
         *(() if result.choice is None else (result.choice.finding,)),
+        *(() if comparison is None else (comparison.outcome,)),
     ]
     count.begin("done")
     return CalibrationReport(
@@ -194,6 +198,7 @@ def _report(
         reading_errors=compute_reading_errors(fit, fitted) if fit.converged else None,
         model_choice=result.choice,
         change=result.change,
+        comparison=comparison,
         provenance=describe_provenance(options),
     )
 

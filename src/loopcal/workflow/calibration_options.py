@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from loopcal.apply.validation_findings import check_limit
@@ -14,6 +14,7 @@ from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_number, check_seed, check_type
+from loopcal.mechanism import Mechanism
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class CalibrationOptions:
     limit_position, limit_angle : largest allowed errors [m], [rad] on held-out poses.
     choose_model : free only as many parameters as held-out predictions justify.
     prior : the posterior of an earlier calibration of this machine; its knowledge is kept.
+    compare_with : stored values, such as those of a firmware or published ones: by name [SI], or a
+        robot that has them. They are tested jointly, see `loopcal.compare_with_values`.
     free_limb : with `prior`: a limb that was repaired, which starts again from its tolerances.
     frame : in which expected errors are stated: "fitted", "base", "relative", or the name of the
         frame of an instrument, see `loopcal.pose_uncertainty`.
@@ -52,6 +55,7 @@ class CalibrationOptions:
     prior: Posterior | None = None
     free_limb: str | None = None
     frame: str = FITTED
+    compare_with: Mapping[str, float] | Mechanism | None = None
     check_conventions: bool = True
     allow_still: bool = False
 

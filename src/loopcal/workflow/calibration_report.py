@@ -18,6 +18,7 @@ from loopcal.diagnose import (
     ModelChoice,
     ReadingError,
     StartCheck,
+    ValueComparison,
 )
 from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
@@ -81,6 +82,7 @@ class CalibrationReport:
     reading_errors : recorded actuator readings against the estimated ones; None for exact readings.
     model_choice : the comparison of parameter sets, where it was asked for.
     change : whether the machine changed since the earlier calibration that is the prior.
+    comparison : the joint test of stored values, where they were given.
     provenance : versions, seeds and options.
     """
 
@@ -98,6 +100,7 @@ class CalibrationReport:
     reading_errors: tuple[ReadingError, ...] | None
     model_choice: ModelChoice | None
     change: Change | None
+    comparison: ValueComparison | None
     provenance: Provenance
 
     @property
@@ -174,6 +177,7 @@ class CalibrationReport:
         optional = {
             "change": self.change,
             "expected_error": self.budget,
+            "comparison": self.comparison,
             "model_choice": self.model_choice,
             "examination": self.examination,
             "remedies": self.suggestions,

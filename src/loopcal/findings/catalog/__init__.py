@@ -28,6 +28,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "workflow": ("gates", "workflow"),
     "fit": ("fit", "prior", "poses", "setup"),
     "residuals": ("noise", "residuals"),
+    "comparison": ("comparison",),
     "identifiability": ("identifiability", "model"),
     "outliers": ("outliers",),
     "data": ("conventions", "data"),

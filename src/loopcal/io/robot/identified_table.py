@@ -54,10 +54,18 @@ def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     FileError
         A bad row, an unknown or duplicate parameter, a value that is not a number, a wrong unit.
     """
+    values = robot.values.copy()
+    for name, value in read_rows(file, robot).items():
+        values[robot.parameters.index(name)] = value
+    return values
+
+
+def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
+    """Return the values [SI] of the file's table by name; raise as `read_identified_values`."""
     rows = file.content[TABLE]
     if not isinstance(rows, list):
         raise file.error(f"{TABLE!r} must be a list of {EXAMPLE}", (TABLE,))
-    values, names = robot.values.copy(), set()
+    values: dict[str, float] = {}
     for i, row in enumerate(rows):
         place: Location = (TABLE, i)
         if not isinstance(row, dict):
@@ -70,17 +78,16 @@ def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
             hint = suggest_names(str(name), robot.parameters.names)
             sentence = f"{name!r} is not a parameter of this robot{hint}; correct the name"
             raise file.error(sentence, place)
-        if name in names:
+        if name in values:
             raise file.error(f"duplicate parameter {name!r}; remove one", place)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise file.error(f"the value of {name!r} is {value!r}; write a number", place)
-        index = robot.parameters.index(name)
+        dimension = robot.parameters.dimensions[robot.parameters.index(name)]
         try:
-            factor = find_unit(str(symbol), robot.parameters.dimensions[index]).factor_to_si
+            factor = find_unit(str(symbol), dimension).factor_to_si
         except UnitError as error:
             raise file.error(f"the unit of {name!r}: {error}", place) from None
-        values[index] = value * factor
-        names.add(name)
+        values[name] = value * factor
     return values
 
 

@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the parameters of a fit with given values, in the directions that the data determine.
+
+The values are true ones in a simulation, or a stored answer: published anchors, the numbers of a
+firmware, an earlier result. Fits of one machine may differ by millimeters along unobservable
+directions without any effect on the measurements, so the plain difference means little. With the
+differences z in tolerances and an orthonormal basis N of the unobservable directions, the
+comparable part is, to first order,
+
+    e = (1 - N N') (z_estimate - z_given)
+
+The joint test takes all comparable directions at once. Let e = Q y with orthonormal Q, and let the
+posterior spread of y be Q' B, where B B' is the posterior covariance [tolerances] of the determined
+directions. The singular value decomposition Q' B = U S V' whitens the difference:
+
+    chi-square = |S^-1 U' y|^2,   as many degrees of freedom as there are directions.
+
+No matrix is inverted. See docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.errors import EstimationError, suggest_names
+from loopcal.estimate.inference.null_space import Combination
+from loopcal.estimate.inference.residual_test import SIGNIFICANCE, ResidualTest
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
+from loopcal.geometry import log_so3
+from loopcal.geometry.alignment import align_point_sets
+from loopcal.measure import make_random_stream
+from loopcal.mechanism import (
+    POSITION,
+    Mechanism,
+    Status,
+    compute_readings,
+    forward_trials,
+    inverse_trials,
+    read_coordinates,
+)
+from loopcal.numerics.chi_square import compute_chi_square_tail, compute_f_tail
+from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
+
+TINY = 1e-99
+"""Probability below which a sentence states no number."""
+MOST_NAMED = 4
+"""Parameters that name the direction of the largest difference."""
+LEAST_PART = 0.3
+"""Smallest part of a parameter in that direction, relative to the largest, for it to be named."""
+EQUAL = 1e-6
+"""Relative difference up to which fixed values, and poses of two robot files, are equal: files
+state some seven digits.
+"""
+POSES, NEAR = 8, 0.05
+"""Poses at which two robot files are compared, and their distance from home: a share of the
+robot's size, or radians.
+"""
+DRAWN_POSES = 5  # purpose of a random stream
+
+
+@dataclass(frozen=True, eq=False)
+class ValueComparison:
+    """A fit against given values of its parameters; arrays (k,) in the order of `names`.
+
+    Attributes
+    ----------
+    names : of the compared parameters.
+    raw : estimate minus given value [SI].
+    error : the same without the unobservable directions [SI].
+    tolerances : `error` in tolerances [1].
+    dropped : the unobservable directions with a part of these parameters, as combinations.
+    degrees : number of directions that are compared.
+    chi_square : of the differences, divided by their posterior uncertainty; NaN without intervals.
+    p_value : probability of a larger chi-square (with estimated noise: of a larger F) if the given
+        values are right; NaN where it cannot be decided.
+    noise : what the uncertainty is based on: "given", "estimated", or "widened" where the residuals
+        exceed the stated noise.
+    sigma : the largest difference in a single direction [posterior standard deviations].
+    direction : names of the parameters that this direction mostly consists of.
+    """
+
+    names: tuple[str, ...]
+    raw: FloatArray
+    error: FloatArray
+    tolerances: FloatArray
+    dropped: tuple[Combination, ...]
+    degrees: int
+    chi_square: float
+    p_value: float
+    noise: str
+    sigma: float
+    direction: tuple[str, ...]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the error in tolerances over the compared directions; NaN without
+        any.
+        """
+        return float(np.sqrt(np.sum(self.tolerances**2) / self.degrees)) if self.degrees else np.nan
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether the values agree with the estimate; None where it cannot be decided."""
+        return None if np.isnan(self.p_value) else self.p_value >= SIGNIFICANCE
+
+    @property
+    def finding(self) -> Finding:
+        """The compared directions, and those that the data do not determine."""
+        return report_finding(
+            "identifiability.compared-with-truth",
+            parameters=len(self.names),
+            compared=self.degrees,
+            excluded=self._excluded,
+        )
+
+    @property
+    def outcome(self) -> Finding:
+        """The outcome of the joint test in one sentence."""
+        if self.agrees is None:
+            code = "comparison.undecided"
+        else:
+            code = "comparison.agrees" if self.agrees else "comparison.differs"
+        return report_finding(
+            code,
+            parameters=len(self.names),
+            chi_square=self.chi_square,
+            degrees=self.degrees,
+            p_value=self.p_value,
+            tiny=self.p_value < TINY,
+            noise=self.noise,
+            sigma=self.sigma,
+            direction=self.direction,
+            excluded=self._excluded,
+        )
+
+    @property
+    def _excluded(self) -> tuple[dict[str, object], ...]:
+        return tuple(dict(combination.finding.data) for combination in self.dropped)
+
+    def __repr__(self) -> str:
+        return (
+            f"<ValueComparison: {len(self.names)} parameters, {self.degrees} directions, "
+            f"chi-square {self.chi_square:.4g} (p = {self.p_value:.2g}), "
+            f"rms {self.rms:.3g} tolerances>"
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the attributes, the root mean square, the answer and the finding, SI."""
+        return {**vars(self), "rms": self.rms, "agrees": self.agrees, "finding": self.outcome}
+
+
+def compare_with_truth(fit: Identification, truth: ArrayLike) -> ValueComparison:
+    """Compare the parameters of a fit with true ones in the directions that its data determine.
+
+    Parameters
+    ----------
+    fit : Identification
+    truth : (parameters of the robot,) or (free parameters,) [SI]
+        True values of the robot's table, or of its free parameters only, in that order.
+
+    Raises
+    ------
+    EstimationError
+        The number of true values is different, or one of them is not finite.
+    """
+    true = np.asarray(truth, dtype=np.float64)
+    p, total = len(fit.names), len(fit.robot.parameters)
+    if true.shape not in ((p,), (total,)) or not np.isfinite(true).all():
+        problem = "" if np.isfinite(true).all() else " and numbers that are not finite"
+        raise EstimationError(
+            f"the truth has shape {true.shape}{problem}; give {total} values for all parameters of "
+            f"{fit.robot.name!r}, or {p} for the free ones"
+        )
+    true = true[fit.free_parameters.places] if len(true) == total else true
+    return _compare(fit, np.arange(p), true)
+
+
+def compare_with_values(
+    fit: Identification, values: Mapping[str, float] | Mechanism
+) -> ValueComparison:
+    """Compare a fit with a stored answer: published values, or those of a firmware.
+
+    Parameters
+    ----------
+    fit : Identification
+    values : of parameters by name [SI], all of them or some (the others are free to differ); or a
+        robot of the same structure, whose values are compared. Parameters that the fit keeps fixed
+        must have the same value in both.
+
+    Raises
+    ------
+    EstimationError
+        An unknown name, a value that is not finite, no parameter that was estimated, another value
+        of a fixed parameter, or a robot with other dimensions: the values belong to another
+        geometry, or to another frame, and equal values do not mean the same machine.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> robot = lc.load_robot("examples/delta-printer/printer.yaml")
+    >>> data = lc.load_measurements("examples/delta-printer/heights.csv", robot)
+    >>> fit = lc.identify(robot, data, lc.LeastSquares())
+    >>> bool(lc.compare_with_values(fit, {"radius": 0.105}).agrees)
+    False
+    >>> bool(lc.compare_with_values(fit, {"radius": 0.10569}).agrees)
+    True
+    """
+    table = fit.robot.parameters
+    if isinstance(values, Mechanism):
+        _refuse_other_dimensions(fit.robot, values)
+        values = dict(zip(table.names, map(float, values.values), strict=True))
+    for name, value in values.items():
+        if name not in table.names:
+            hint = suggest_names(str(name), table.names)
+            raise EstimationError(f"{name!r} is not a parameter of {fit.robot.name!r}{hint}")
+        if not np.isfinite(value):
+            raise EstimationError(f"the value of {name!r} is {value}; give a finite number")
+    _refuse_other_fixed_values(fit, values)
+    at = [i for i, name in enumerate(fit.names) if name in values]
+    if not at:
+        raise EstimationError(
+            f"no value belongs to an estimated parameter of {fit.robot.name!r}; give some of "
+            f"{', '.join(fit.names)}"
+        )
+    return _compare(fit, np.array(at), np.array([values[fit.names[i]] for i in at]))
+
+
+def _refuse_other_fixed_values(fit: Identification, values: Mapping[str, float]) -> None:
+    """Refuse other values of parameters that the fit keeps fixed."""
+    robot = fit.robot
+    for name in (name for name in values if name not in fit.names):
+        place = robot.parameters.index(name)
+        kept, dimension = float(robot.values[place]), robot.parameters.dimensions[place]
+        size = robot.size if dimension is Dimension.LENGTH else 1.0
+        if abs(values[name] - kept) > EQUAL * size:
+            given = robot.to_quantity(float(values[name]), dimension)
+            data = {"name": name, "kept": robot.to_quantity(kept, dimension), "given": given}
+            raise EstimationError(report_finding("comparison.fixed-differs", **data))
+
+
+def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
+    """Refuse a machine that has other poses with the same values of all parameters."""
+    if stored.parameters.names != robot.parameters.names:
+        raise EstimationError(
+            f"{stored.name!r} does not have the parameters of {robot.name!r}; give a robot file of "
+            "the same family and structure, or only the values to compare"
+        )
+    home = read_coordinates(robot.home[None], robot.controlled)[0]
+    drawn = make_random_stream(0, 0, DRAWN_POSES).uniform(-1.0, 1.0, (POSES, len(home)))
+    is_length = np.isin(robot.controlled, POSITION)
+    target = home + drawn * np.where(is_length, NEAR * robot.size, NEAR)
+    known = robot.values[None]
+    reached = inverse_trials(robot, known, target[None])
+    q = compute_readings(robot, known, reached)
+    states = [forward_trials(one, known, q) for one in (robot, stored)]
+    is_reached = np.all([s.status[0] == Status.CONVERGED for s in (reached, *states)], axis=0)
+    mine, theirs = (state.T[0][is_reached] for state in states)
+    apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max(initial=0.0)
+    if is_reached.any() and apart <= EQUAL * robot.size:
+        return
+    own = forward_trials(stored, stored.values[None], q).T[0][is_reached]
+    rotation = align_point_sets(own[:, :3, 3], mine[:, :3, 3])[:3, :3]
+    raise EstimationError(
+        report_finding(
+            "comparison.other-dimensions",
+            stored=stored.name,
+            robot=robot.name,
+            apart=robot.to_quantity(float(apart), Dimension.LENGTH),
+            rotation=float(np.rad2deg(np.linalg.norm(log_so3(rotation)))),
+        )
+    )
+
+
+def _compare(fit: Identification, at: IntArray, given: FloatArray) -> ValueComparison:
+    """Compare the free parameters at places `at` (k,) with given values (k,) [SI]."""
+    posterior, tolerance = fit.posterior, fit.tolerance[at]
+    raw = fit.estimate[at] - given
+    parts = (posterior.unit[at] / tolerance)[:, None] * posterior.directions[at]
+    is_open = ~posterior.determined
+    comparable = _find_complement(parts[:, is_open])
+    y = comparable.T @ (raw / tolerance)
+    known = np.where(is_open, 0.0, posterior.variance)
+    whitened, u = np.full(len(y), np.nan), np.eye(len(y))
+    if np.isfinite(known).all() and len(y):
+        u, s, _ = np.linalg.svd(comparable.T @ (parts * np.sqrt(known)), full_matrices=False)
+        whitened = (u.T @ y) / s
+    chi_square = float(np.sum(whitened**2))
+    names = tuple(fit.names[i] for i in at)
+    sigma, direction = _name_largest(names, comparable @ u, whitened)
+    is_cut = comparable.shape[1] < len(names)
+    return ValueComparison(
+        names=names,
+        raw=raw,
+        error=comparable @ y * tolerance,
+        tolerances=comparable @ y,
+        dropped=tuple(c for c in fit.unidentifiable if is_cut and set(names) & set(c.names)),
+        degrees=len(y),
+        chi_square=chi_square,
+        p_value=_compute_p_value(fit.residual_test, len(y), chi_square),
+        noise="widened" if fit.residual_test.failed else fit.residual_test.noise,
+        sigma=sigma,
+        direction=direction,
+    )
+
+
+def _find_complement(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (k, d) of the vectors that are orthogonal to columns (k, c)."""
+    u, s, _ = np.linalg.svd(columns)
+    return u[:, int((s > NULL_COMPONENT).sum()) :]
+
+
+def _compute_p_value(test: ResidualTest, degrees: int, chi_square: float) -> float:
+    """Return the probability of a larger chi-square; with a noise from the residuals, of F."""
+    if degrees == 0 or not np.isfinite(chi_square):
+        return float("nan")
+    if test.noise == "estimated" or test.failed:
+        left = test.dof if test.noise == "estimated" else test.degrees
+        return float(compute_f_tail(degrees, left, chi_square / degrees))
+    return float(compute_chi_square_tail(degrees, chi_square))
+
+
+def _name_largest(
+    names: tuple[str, ...], directions: FloatArray, whitened: FloatArray
+) -> tuple[float, tuple[str, ...]]:
+    """Return the largest whitened difference, and the parameters that its direction consists of."""
+    if not np.isfinite(whitened).all() or not len(whitened):
+        return float("nan"), ()
+    worst = int(np.argmax(np.abs(whitened)))
+    part = np.abs(directions[:, worst])
+    order = [int(i) for i in np.argsort(-part) if part[i] > LEAST_PART * part.max()]
+    return float(abs(whitened[worst])), tuple(names[i] for i in order[:MOST_NAMED])

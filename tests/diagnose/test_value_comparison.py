@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Comparison of parameters with a truth or a stored answer: unidentifiable combinations are removed
+and named, and the p value of a right answer is uniform.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from loopcal.apply import validate
+from loopcal.diagnose import compare_with_truth, compare_with_values
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
+from loopcal.io import load_robot
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import Component, Instrument, Noise, Pose, Sensor, sample_truth, simulate
+from tests import zoo
+from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise
+
+
+def simulate_in_unknown_frame(n: int = 30, seed: int = 0):
+    """Simulate poses of the true hexapod in an unknown frame."""
+    truth = zoo.hexapod().with_values(zoo.hexapod_truth())
+    kind = Pose(unknown=("frame",))
+    sensor = Sensor(kind, noise(*[0.1 * URAD] * 3, *[0.02 * UM] * 3))
+    placed = {"frame.x": 0.02, "frame.ry": 0.1}
+    return simulate(
+        truth, hexapod_poses(n, seed), Instrument((sensor,)), seed, nuisance_values=placed
+    )
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return identify(hexapod(), simulate_in_unknown_frame(), LeastSquares())
+
+
+def test_unidentifiable_combinations_are_removed_from_the_error_and_named(fit):
+    result = compare_with_truth(fit, zoo.hexapod_truth())
+    assert len(result.dropped) == 6
+    assert np.abs(result.raw).max() > 0.01e-3  # [m] the base frame is free
+    assert (
+        np.abs(result.error).max() < 0.001e-3
+    )  # [m] noise of 0.02 um and 0.1 urad, condition about 100
+    finding = result.finding
+    assert (finding.data["parameters"], finding.data["compared"]) == (42, 36)
+    assert [c["names"] for c in finding.data["excluded"]] == [c.names for c in result.dropped]
+    np.testing.assert_allclose(
+        result.tolerances * fit.tolerance, result.error, rtol=1e-12, atol=1e-18
+    )
+    assert json.loads(to_json(result.to_dict()))["rms"] == pytest.approx(result.rms)
+
+
+def test_truth_moved_along_the_null_space_gives_the_same_error(fit):
+    known = fit.posterior
+    rng = np.random.default_rng(0)
+    null_space = known.directions[:, ~known.determined]
+    move = known.unit * (null_space @ rng.standard_normal(null_space.shape[1]))
+    one, other = (compare_with_truth(fit, zoo.hexapod_truth() + step) for step in (0.0, move))
+    np.testing.assert_allclose(one.error, other.error, atol=1e-15)  # [m] double rounding
+    seen = known.unit * known.directions[:, known.determined][:, 0]
+    assert (
+        np.abs(compare_with_truth(fit, zoo.hexapod_truth() + seen).error - one.error).max() > 1e-6
+    )
+
+
+def test_error_of_an_identifiable_robot_is_the_plain_difference():
+    fit = identify(hexapod(), hexapod_data(20), LeastSquares())
+    result = compare_with_truth(fit, zoo.hexapod_truth())
+    assert result.dropped == ()
+    np.testing.assert_array_equal(result.error, result.tolerances * fit.tolerance)
+    np.testing.assert_allclose(result.error, result.raw, rtol=1e-12)
+    assert result.finding.data["compared"] == 42
+
+
+@pytest.mark.parametrize(
+    ("truth", "message"), [(np.zeros(41), r"shape \(41,\)"), (np.full(42, np.nan), "not finite")]
+)
+def test_truth_with_wrong_shape_or_nan_is_refused(fit, truth, message):
+    with pytest.raises(
+        EstimationError, match=f"{message}.*give 42 values for all parameters of 'hexapod'"
+    ):
+        compare_with_truth(fit, truth)
+
+
+def test_validation_keeps_the_frame_of_the_fit_unless_a_refit_is_requested(fit):
+    others = simulate_in_unknown_frame(8, seed=5)
+    kept = validate(fit, others)
+    assert kept.alignment == {"kept": ("frame",), "fitted": ()}
+    by_name = validate(fit.robot, others, before=fit.initial, nuisance_values=fit.nuisance.values)
+    np.testing.assert_allclose(by_name.after.position, kept.after.position, rtol=1e-9)
+    anew = validate(fit, others, refit=("fra*",))
+    assert anew.alignment == {"kept": (), "fitted": ("frame",)}
+    assert "validation.setup-fitted" in [f.code for f in anew.findings]
+    assert anew.after.statistics("position").rms <= kept.after.statistics("position").rms
+    assert json.loads(to_json(anew.to_dict()))["alignment"]["fitted"] == ["frame"]
+    with pytest.raises(DataError, match=r"is called 'tracker'; the data have: frame"):
+        validate(fit, others, refit=("tracker",))
+
+
+ROBOT = load_robot("linear-delta")
+SIGMA = 20e-6  # [m]
+COUNT = 100
+"""Simulated machines. Their p values differ from uniform ones by less than 0.163 (KS test, 1 %)."""
+
+
+class UnderstatedNoise(Noise):
+    """Noise that is larger than the sigma that is stated."""
+
+    def __init__(self, scale: float) -> None:
+        self.scale = scale
+
+    @property
+    def sigma(self) -> np.ndarray:
+        return np.array([SIGMA])
+
+    def draw(self, generator: np.random.Generator, n: int) -> np.ndarray:
+        return self.scale * SIGMA * generator.standard_normal((n, 1))
+
+
+def simulate_printers(scale: float = 1.0, count: int = COUNT):
+    """Simulate heights of machines with drawn errors; the noise is `scale` times the stated one."""
+    poses = np.random.default_rng(7).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.02], (14, 3))
+    free = [name for name in ROBOT.parameters.names if "arm" not in name and name != "tower3.angle"]
+    robot = replace(ROBOT, parameters=ROBOT.parameters.with_free(free))
+    instrument = Instrument((Sensor(Component(("z",)), UnderstatedNoise(scale)),))
+    for i, values in enumerate(sample_truth(robot, count, seed=3)):
+        yield robot, simulate(robot.with_values(values), poses, instrument, seed=i), values
+
+
+def measure_uniformity(p_values: list[float]) -> float:
+    """Return the largest distance of the distribution of p values from the uniform one."""
+    ordered = np.sort(p_values)
+    steps = np.arange(len(ordered) + 1) / len(ordered)
+    return float(np.max(np.maximum(ordered - steps[:-1], steps[1:] - ordered)))
+
+
+@pytest.mark.parametrize(
+    ("options", "scale"),
+    [
+        (FitOptions(method=LeastSquares()), 1.0),
+        (FitOptions(method=MAP()), 1.0),
+        (FitOptions(method=LeastSquares(), noise="estimated"), 3.0),
+    ],
+    ids=["least squares", "tolerances as prior", "sigma three times too small, estimated"],
+)
+def test_p_value_of_a_right_answer_is_uniform_and_a_wrong_one_is_rejected(options, scale) -> None:
+    right, some, wrong = [], [], []
+    for robot, data, truth in simulate_printers(scale):
+        fit = identify(robot, data, options=options)
+        values = dict(zip(robot.parameters.names, truth, strict=True))
+        result = compare_with_values(fit, values)
+        right.append(result.p_value)
+        part = {name: values[name] for name in ("radius", "tower1.stop")}
+        some.append(compare_with_values(fit, part).p_value)
+        moved = {**values, "tower1.stop": values["tower1.stop"] + 2e-3}
+        wrong.append(compare_with_values(fit, moved).agrees)
+    assert measure_uniformity(right) < 0.163
+    assert measure_uniformity(some) < 0.163
+    assert not any(wrong)
+
+
+def test_stated_sigma_that_is_wrong_decides_unless_it_is_estimated() -> None:
+    """A sigma three times too small rejects right answers; estimated noise does not."""
+    accepted = {"given": 0, "estimated": 0}
+    for robot, data, truth in simulate_printers(3.0, 30):
+        for basis in accepted:
+            options = FitOptions(method=LeastSquares(), noise=basis)
+            fit = identify(robot, data, options=options)
+            result = compare_with_truth(fit, truth)
+            assert result.noise == ("estimated" if basis == "estimated" else "widened")
+            accepted[basis] += result.p_value > 0.05
+    assert accepted["estimated"] >= 25
+    assert accepted["given"] >= 25  # the residuals contradict the sigma and widen the uncertainty
+
+
+def test_joint_test_equals_the_inverse_of_the_covariance(fit) -> None:
+    (robot, data, truth), *_ = simulate_printers(count=1)
+    estimated = identify(robot, data, LeastSquares())
+    names = ("radius", "tower2.angle", "tower3.stop")
+    at = [estimated.names.index(name) for name in names]
+    all_values = dict(zip(robot.parameters.names, truth, strict=True))
+    result = compare_with_values(estimated, {name: all_values[name] for name in names})
+    off = estimated.estimate[at] - [all_values[name] for name in names]
+    scale = estimated.standard_deviations[at]
+    correlation = estimated.covariance[np.ix_(at, at)] / np.outer(scale, scale)
+    expected = (off / scale) @ np.linalg.solve(correlation, off / scale)
+    assert result.chi_square == pytest.approx(expected, rel=1e-8)
+    assert result.degrees == 3
+    assert result.p_value == pytest.approx(scipy.stats.chi2.sf(expected, 3), rel=1e-8)
+
+
+def test_answer_in_another_frame_has_the_same_chi_square_and_names_the_frame(fit) -> None:
+    """Of the hexapod in an unknown frame six motions are open; along them answers may differ."""
+    known, truth = fit.posterior, zoo.hexapod_truth()
+    null_space = known.unit[:, None] * known.directions[:, ~known.determined]
+    moved = truth + null_space @ np.full(6, 3.0)  # three tolerances along each
+    first, second = (compare_with_truth(fit, values) for values in (truth, moved))
+    assert first.degrees == 36
+    assert second.chi_square == pytest.approx(first.chi_square, rel=1e-6)
+    assert first.agrees
+    assert len(first.dropped) == 6
+    assert "Not compared, because these data do not determine it" in str(first.outcome)
+    some = {name: value for name, value in zip(fit.names, moved, strict=True) if "base" in name}
+    part = compare_with_values(fit, some)
+    assert part.degrees == len(some) - 6  # the base joints alone hold the six motions
+    assert part.agrees
+
+
+def test_values_that_cannot_be_compared_are_refused_or_undecided(tmp_path) -> None:
+    (robot, data, truth), *_ = simulate_printers(count=1)
+    fit = identify(robot, data, LeastSquares())
+    arm, tower = "arm1.length", "tower3.angle"
+    with pytest.raises(EstimationError, match=r"stored value of arm1.length is .* keeps it at"):
+        compare_with_values(fit, {"radius": 0.1, arm: 0.9})
+    with pytest.raises(EstimationError, match="another frame"):
+        compare_with_values(fit, {tower: truth[robot.parameters.index(tower)] + 0.02})
+    with pytest.raises(EstimationError, match=r"'radiu' is not a parameter.*radius"):
+        compare_with_values(fit, {"radiu": 0.1})
+    with pytest.raises(EstimationError, match="finite"):
+        compare_with_values(fit, {"radius": np.nan})
+    with pytest.raises(EstimationError, match="no value belongs to an estimated parameter"):
+        compare_with_values(fit, {})
+    with pytest.raises(EstimationError, match="does not have the parameters"):
+        compare_with_values(fit, load_robot("five-bar"))
+    few = data.take(np.arange(data.n_poses) < 7)
+    estimated = identify(robot, few, options=FitOptions(method=LeastSquares(), noise="estimated"))
+    result = compare_with_truth(estimated, truth)
+    assert result.agrees is None
+    assert str(result.outcome).startswith("The stored values cannot be compared")
