@@ -137,6 +137,7 @@ def measure_uniformity(p_values: list[float]) -> float:
     return float(np.max(np.maximum(ordered - steps[:-1], steps[1:] - ordered)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "scale"),
     [
