@@ -97,11 +97,11 @@ def test_sets_with_too_few_equations_are_listed_and_not_compared(printers):
 def test_any_robot_file_can_state_what_its_controller_stores(tmp_path: Path):
     text = (Path(lc.__file__).parent / "robots" / "hexapod-42.yaml").read_text("utf-8")
     path = tmp_path / "robot.yaml"
-    path.write_text(text + "\ncontroller: [leg*.length, leg*.base.*]\n", "utf-8")
+    path.write_text(text + "\nstored_parameters: [leg*.length, leg*.base.*]\n", "utf-8")
     sets = list_parameter_sets(lc.load_robot(path))
     assert len(sets["controller"]) == 24
-    path.write_text(text + "\ncontroller: [leg*.lenght]\n", "utf-8")
-    with pytest.raises(FileError, match="under `controller` matches no parameter"):
+    path.write_text(text + "\nstored_parameters: [leg*.lenght]\n", "utf-8")
+    with pytest.raises(FileError, match="under `stored_parameters` matches no parameter"):
         lc.load_robot(path)
     assert "controller" not in list_parameter_sets(lc.load_robot("hexapod-42"))
 

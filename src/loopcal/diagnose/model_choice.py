@@ -173,12 +173,12 @@ def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
 def list_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
     """Return the nested sets of a robot, and the set that its controller stores, by size.
 
-    The controller's set, `Assembly.controller`, takes the place of a nested one that is equal.
+    The controller's set, `Assembly.stored_parameters`, takes the place of a nested one that is equal.
     Parameters that are fixed are left out.
     """
     sets = nest_parameter_sets(robot)
     free = [p.name for p in robot.parameters.entries if p.free]
-    stored = tuple(name for name in free if name in robot.assembly.controller)
+    stored = tuple(name for name in free if name in robot.assembly.stored_parameters)
     if stored:
         sets = {name: names for name, names in sets.items() if names != stored}
         sets[CONTROLLER] = stored

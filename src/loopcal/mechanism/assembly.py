@@ -187,7 +187,7 @@ class Assembly:
     home : (4, 4) T_base_platform of the home pose; only its controlled coordinates must be exact.
     tool : (4, 4) T_platform_tool. workspace : coordinate -> (low, high) [m, rad].
     parameters, maps, shared : the unknowns and their maps.
-    controller : names of the parameters that the controller of the machine stores, so that a
+    stored_parameters : names of the parameters that the controller of the machine stores, so that a
         calibration can be entered there; empty where they are not known.
     """
 
@@ -203,7 +203,7 @@ class Assembly:
     tool: FloatArray = field(default_factory=lambda: np.eye(4))
     workspace: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""
-    controller: tuple[str, ...] = ()
+    stored_parameters: tuple[str, ...] = ()
 
 
 def check_assembly(assembly: Assembly) -> None:

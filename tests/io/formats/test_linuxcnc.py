@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from loopcal import geometry as rigid
+from loopcal.diagnose import list_parameter_sets
 from loopcal.errors import DataError, FileError
 from loopcal.io import load_robot
 from loopcal.io.formats import linuxcnc
@@ -48,6 +49,12 @@ def read(folder: Path, text: str, **options) -> Mechanism:
 @pytest.fixture
 def geometry(data_folder) -> dict:
     return json.loads((data_folder / "kinematics_oracles" / "genhexkins_geometry.json").read_text())
+
+
+def test_pins_are_the_parameters_that_the_controller_stores(tmp_path, geometry) -> None:
+    sets = list_parameter_sets(read(tmp_path, format_hal(geometry), home_height=0.020))
+    assert len(sets["controller"]) == 36
+    assert not any(name.endswith("length") for name in sets["controller"])
 
 
 @pytest.mark.parametrize("lift", [0.0, 7.5])

@@ -59,6 +59,7 @@ platform:
 {platform}
 lengths: 0
 home: {{z: {home}}}
+stored_parameters: [leg*.base.?, leg*.platform.?]     # what genhexkins stores
 {tolerances}{screw}"""
 TOLERANCES = "tolerances: {{base: {{sd: {sd}}}, platform: {{sd: {sd}}}}}     # measured by hand\n"
 SCREW = """\

@@ -180,11 +180,11 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
 
 
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
-    """Return the assembly of a record; an unknown name under `fixed` or `controller` is refused at
-    its line.
+    """Return the assembly of a record; an unknown name in a list of parameters is refused at its
+    line.
     """
     names = [parameter.name for parameter in record.expand().parameters]
-    for key in ("fixed", "controller"):
+    for key in ("fixed", "stored_parameters"):
         for i, pattern in enumerate(getattr(record, key)):
             try:
                 match_parameter_names(pattern, names, key)

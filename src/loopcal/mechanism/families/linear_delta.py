@@ -83,12 +83,12 @@ class LinearDelta(RobotRecord):
     arms : lengths of the rods [m], one or three. stops : end-stop heights [m], one or three.
     readings : `drop` below the end stop or `height` above the lowest carriage position. stroke :
         allowed readings [m].
-    controller : by default what the firmware of printers calibrates: radius, angles and stops.
+    stored_parameters : by default what firmware of printers calibrates: radius, angles, stops.
     """
 
     family = "linear-delta"
 
-    controller: tuple[str, ...] = ("radius", "tower*.angle", "tower*.stop")
+    stored_parameters: tuple[str, ...] = ("radius", "tower*.angle", "tower*.stop")
     radius: Length = 0.0
     angles: tuple[Angle, ...] = ()
     arms: Length | tuple[Length, ...] = 0.0

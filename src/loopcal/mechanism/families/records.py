@@ -133,7 +133,7 @@ class RobotRecord:
     home : platform pose in the base at which the loops are closed first; zero by default.
     tool : tool pose on the platform. workspace : where the machine works; poses are drawn from it.
     fixed : parameters that are not identified, by name or pattern, such as `arm*.length`.
-    controller : parameters that the controller of the machine stores, by name or pattern.
+    stored_parameters : parameters that the controller of the machine stores, by name or pattern.
     """
 
     family: ClassVar[str] = ""
@@ -145,7 +145,7 @@ class RobotRecord:
     tool: PoseRecord = field(default_factory=PoseRecord)
     workspace: Workspace = field(default_factory=Workspace)
     fixed: tuple[str, ...] = ()
-    controller: tuple[str, ...] = ()
+    stored_parameters: tuple[str, ...] = ()
 
     def expand(self) -> Assembly:
         """Return the generic description of this robot."""
@@ -188,12 +188,12 @@ class RobotRecord:
         expanded = self.expand()
         names = [parameter.name for parameter in expanded.parameters]
         fixed = _match_all(self.fixed, names, "fixed")
-        stored = _match_all(self.controller, names, "controller")
+        stored = _match_all(self.stored_parameters, names, "stored_parameters")
         parameters = tuple(
             replace(p, free=False) if p.name in fixed else p for p in expanded.parameters
         )
-        controller = tuple(name for name in names if name in stored)
-        return replace(expanded, parameters=parameters, controller=controller)
+        present = tuple(name for name in names if name in stored)
+        return replace(expanded, parameters=parameters, stored_parameters=present)
 
 
 def _match_all(patterns: Iterable[str], names: Sequence[str], key: str) -> set[str]:
