@@ -12,6 +12,7 @@ from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.io.runs.run_folder import load_run
+from loopcal.mechanism import forward
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"  # noqa: E501
@@ -259,6 +260,42 @@ def test_simulate_writes_the_drawn_errors_as_a_robot_file(run) -> None:
     drawn = load_robot("drawn.yaml")
     assert 1e-6 < np.std(drawn.values - drawn.parameters.nominal) < 1e-4  # [m], tolerance 0.029 mm
     assert run("calibrate hexapod-42 drawn.csv -o run")[0] == 0
+
+
+def test_simulate_keeps_the_names_of_poses(run, tmp_path) -> None:
+    rows = ["home,0mm,0mm,200mm,0deg,0deg,0deg", "A2,5mm,-5mm,205mm,2deg,1deg,-1deg"]
+    header = "pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]"
+    lines = [header, *(row.replace("mm", "").replace("deg", "") for row in rows)]
+    (tmp_path / "named.csv").write_text("\n".join(lines) + "\n")
+    assert run("simulate hexapod-42 --poses named.csv -o data.csv")[0] == 0
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
+    assert data.labels == ("home", "A2")
+    (tmp_path / "twice.csv").write_text("\n".join([*lines, lines[1]]) + "\n")
+    code, _, err = run("simulate hexapod-42 --poses twice.csv -o other.csv")
+    assert code == 1
+    assert "pose 'home' is also row 1; give each pose a name of its own" in err
+    assert not (tmp_path / "other.csv").exists()
+
+
+def test_simulate_draws_uniform_noise_with_the_stated_sigma(run, tmp_path) -> None:
+    words = "simulate hexapod-42 --draw 200 --kind position --sigma-position 1um --seed 4"
+    for name in ("normal", "uniform"):
+        assert run(f"{words} --distribution {name} -o {name}.csv")[0] == 0
+    robot = load_robot("hexapod-42")
+    normal, uniform = (
+        load_measurements(tmp_path / f"{name}.csv", robot) for name in ("normal", "uniform")
+    )
+    true = forward(robot, uniform.readings).T[:, :3, 3]
+    noise, gaussian = (data.observations[0].measured - true for data in (uniform, normal))
+    limit = np.sqrt(3.0) * 1e-6
+    assert 0.99 * limit < np.abs(noise).max() < limit + 1e-9  # [m], digits of the file
+    assert noise.std() == pytest.approx(1e-6, rel=0.08)  # 5 sd of the sd of 600 values
+    assert np.abs(gaussian).max() > 1.3 * limit
+    weights = [data.observations[0].weight for data in (uniform, normal)]
+    np.testing.assert_array_equal(*weights)  # the file states the sigma
+    code, _, err = run("simulate hexapod-42 --fill normal.csv --distribution uniform -o x.csv")
+    assert code == 1
+    assert "--distribution" in err
 
 
 def test_simulate_adds_the_requested_noise_to_readings_and_states_it(run, tmp_path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.errors import DataError, FileError
 from loopcal.papers import PAPERS, Paper, paper
+from loopcal.papers.drawing import choose_styles, draw
 from loopcal.papers.printed import Comparison, Printed, Table
 from loopcal.papers.reproduction import OWN_CHECK, Figure, Reproduction, Series, Verdict
 from loopcal.papers.wording import Wording
@@ -141,6 +142,36 @@ def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> No
     write_folder(folder, build_reproduction(), MADE_BY, force=True)
     assert not (folder / "old").exists()
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 14])
+@pytest.mark.parametrize("log", ["", "y", "xy"])
+def test_legend_covers_no_curve_and_lies_within_the_picture(count, log) -> None:
+    """Curves that fill the axes to their corners, with as many labels as the studies have."""
+    rng = np.random.default_rng(count)
+    x = tuple(map(float, np.geomspace(1e-5, 1.0, 30)))
+    series = [
+        Series(
+            f"MAP, errors of {i} mm, aligned", x, tuple(map(float, 10 ** rng.uniform(-4, 2, 30)))
+        )
+        for i in range(count)
+    ]
+    levels = {"before, errors of 0.01 mm": 1e-4, "MAP, phi and theta [deg]": 99.0}
+    small = Figure("f", "Title", "lambda [1]", "error [mm]", "Of 1.", tuple(series), levels, log)
+    canvas = draw(small, choose_styles([small]))
+    canvas.canvas.draw()
+    legend = canvas.legends[0].get_window_extent()
+    axes = canvas.axes[0]
+    points = [axes.transData.transform(line.get_xydata()) for line in axes.lines[:count]]
+    x0, y0, x1, y1 = legend.extents
+    for xy in points:
+        inside = (xy[:, 0] >= x0) & (xy[:, 0] <= x1) & (xy[:, 1] >= y0) & (xy[:, 1] <= y1)
+        assert not inside.any()
+    assert not legend.overlaps(axes.get_tightbbox())
+    assert canvas.bbox.x0 <= x0
+    assert x1 <= canvas.bbox.x1
+    assert canvas.bbox.y0 <= y0
+    assert axes.get_window_extent().height > 150  # [pixels] the curves keep room
 
 
 def test_unknown_paper_and_invalid_seed_or_trials_are_refused() -> None:

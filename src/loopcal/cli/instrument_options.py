@@ -87,6 +87,15 @@ draw_option = click.option(
     help="Number of poses to draw evenly from the workspace where no poses are given.",
 )
 
+distribution_option = click.option(
+    "--distribution",
+    type=click.Choice(("normal", "uniform")),
+    default="normal",
+    help="Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
+    "standard deviations; a limit of 1 um is --sigma-position 0.57735um.",
+)
+"""Decorator of a command that simulates noise."""
+
 sigma_reading_option = click.option(
     "--sigma-reading",
     metavar="QUANTITY",
@@ -124,6 +133,7 @@ def make_instrument(options: Mapping[str, Any]) -> Instrument:
             sigma_position=options["sigma_position"],
             sigma_angle=options["sigma_angle"],
             unknown_frames=tuple(frames.split(",")) if frames is not None else (),
+            distribution=options.get("distribution", "normal"),
         )
     )
 

@@ -14,6 +14,7 @@ from loopcal.cli import terminal
 from loopcal.cli.fit_options import rank_tolerance_option
 from loopcal.cli.instrument_options import (
     DESCRIPTION,
+    distribution_option,
     draw_option,
     instrument_options,
     make_instrument,
@@ -176,7 +177,9 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
 
 @click.command()
 @robot_argument
-@file_option("--poses", help="CSV file of commanded poses, one column per coordinate.")
+@file_option(
+    "--poses", help="CSV file of commanded poses, one column per coordinate. Their names are kept."
+)
 @draw_option
 @file_option(
     "--fill",
@@ -185,6 +188,7 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
 )
 @file_option("-o", "--output", help="Measurement file to write.", required=True)
 @instrument_options
+@distribution_option
 @sigma_reading_option
 @flag_option(
     "--draw-errors",
@@ -220,12 +224,13 @@ def simulate(
       loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
       loopcal simulate truth.yaml --poses poses.csv --sigma-position 1um -o measurements.csv
       loopcal simulate linear-delta --kind position --sigma-reading 5um -o measurements.csv
+      loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """  # noqa: D301
     from loopcal.io import load_robot, save_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.io.data.measurement_file import load_pose_names, load_poses
     from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.workflow.simulated_measurements import simulate_measurements
@@ -241,6 +246,7 @@ def simulate(
             draw if poses is None else load_poses(poses, machine),
             draw_errors=draw_errors,
             reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            labels=None if poses is None else load_pose_names(poses),
             seed=seed,
         )
         drawn = _name_drawn_poses(machine, draw, seed)
@@ -273,7 +279,7 @@ def _fill_in(
     from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(
-        ("poses", "draw", *DESCRIPTION[2:], "sigma_reading"),
+        ("poses", "draw", *DESCRIPTION[2:], "distribution", "sigma_reading"),
         f"because --fill {sheet} states poses and instrument",
     )
     instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}

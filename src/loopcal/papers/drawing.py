@@ -8,6 +8,8 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
     from loopcal.papers.reproduction import Figure
 
 COLORS, MARKERS = 10, "osD^vPX"
@@ -41,6 +43,13 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
     ----------
     figure : what to draw. style : of every named label, see `choose_styles`.
     """
+    stream = BytesIO()
+    draw(figure, style).savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def draw(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> Canvas:
+    """Draw a figure with its legend below the axes; arguments as for `png`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
     from matplotlib.ticker import MaxNLocator
@@ -78,6 +87,4 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
     canvas.legend(
         fontsize=8.5, loc="outside lower center", ncols=columns
     )  # below the axes, where no data are
-    stream = BytesIO()
-    canvas.savefig(stream, format="png", metadata={"Software": None})
-    return stream.getvalue()
+    return canvas

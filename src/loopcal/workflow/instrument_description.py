@@ -4,18 +4,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
-from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
+from loopcal.measure import KINDS, Gaussian, Instrument, Noise, Sensor, Uniform
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
 """A frame that may be unknown -> the names that kinds have for it."""
+
+DISTRIBUTIONS: Mapping[str, Callable[[FloatArray], Noise]] = {
+    "normal": Gaussian,
+    "uniform": lambda sigma: Uniform(np.sqrt(3.0) * sigma),
+}
+"""Name of a distribution -> noise with given standard deviations (m,) [SI]."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,8 @@ class InstrumentDescription:
         measures. orientation : form of measured angles; None for the default of the kind.
     sigma_position, sigma_angle : standard deviations of each length [m] and angle [rad].
     unknown_frames : of "base" (the frame of the instrument in the base) and "tool".
+    distribution : of simulated noise, one of DISTRIBUTIONS; both have the stated standard
+        deviations. Uniform noise lies within sqrt(3) of them.
     """
 
     kinds: Sequence[str] = ("pose",)
@@ -36,6 +45,7 @@ class InstrumentDescription:
     sigma_position: float = 1e-5
     sigma_angle: float = 5e-5
     unknown_frames: Sequence[str] = ()
+    distribution: str = "normal"
 
 
 def build_instrument(description: InstrumentDescription) -> Instrument:
@@ -56,7 +66,7 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
         noise = np.array([sigma[column.dimension] for column in kind.noise_columns])
         if description.unknown_frames:
             kind = replace(kind, unknown=_name_unknown_frames(description.unknown_frames, kind))
-        sensors.append(Sensor(kind, Gaussian(noise)))
+        sensors.append(Sensor(kind, DISTRIBUTIONS[description.distribution](noise)))
     for setting in settings:
         if not any(setting in _setting_names(name) for name in description.kinds):
             kinds = ",".join(description.kinds)

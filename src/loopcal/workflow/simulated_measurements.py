@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from numpy.typing import ArrayLike
 
@@ -34,6 +35,7 @@ def simulate_measurements(
     *,
     draw_errors: bool = False,
     reading_sigma: ArrayLike | None = None,
+    labels: Sequence[str] | None = None,
     seed: int = 1,
 ) -> SimulatedMeasurements:
     """Command a robot to poses by its nominal geometry, and measure where the true machine goes.
@@ -44,7 +46,7 @@ def simulate_measurements(
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
     draw_errors : draw the true machine from the tolerances instead.
     reading_sigma : (a,) [SI] noise of the recorded readings; None as the robot states.
-    seed : of poses, errors and noise.
+    labels : (n,) names of the poses; None numbers them. seed : of poses, errors and noise.
 
     Raises
     ------
@@ -54,6 +56,8 @@ def simulate_measurements(
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     targets = resolve_poses(truth.nominal, poses, seed)
     data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma)
+    if labels is not None:
+        data = replace(data, labels=tuple(labels))
     check_strokes(data, truth)
     return SimulatedMeasurements(data, truth)
 

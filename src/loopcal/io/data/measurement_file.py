@@ -202,6 +202,23 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
     )
 
 
+def load_pose_names(path: str | Path) -> tuple[str, ...]:
+    """Read the names of commanded poses (n,); "1", "2", ... without a column `pose`.
+
+    Raises
+    ------
+    FileError : a name occurs twice.
+    """
+    table = read_table(path)
+    names = table.pose_names()
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            first = names.index(name) + 1
+            sentence = f"pose {name!r} is also row {first}; give each pose a name of its own"
+            raise table.row_error(i, sentence)
+    return names
+
+
 def _read_tables(path: Paths) -> tuple[Table, ...]:
     """Read the files, and those that they name under `poses`."""
     given = path if isinstance(path, list | tuple) else [path]
