@@ -21,6 +21,7 @@ from loopcal.papers.tsvd_2016.draws import (
     CROSS,
     HINDSIGHT,
     METHODS,
+    NARROW,
     PRIOR_FIVE,
     RAW_FIVE,
     RAW_LS,
@@ -28,6 +29,7 @@ from loopcal.papers.tsvd_2016.draws import (
     RAW_TSVD,
     TRUE,
     WHITENED_FIVE,
+    WIDE,
 )
 from loopcal.papers.tsvd_2016.figures import make_figures
 from loopcal.papers.tsvd_2016.machines import (
@@ -482,11 +484,18 @@ def test_evidence_map_is_better_than_raw_methods_and_near_gcv_and_hindsight() ->
 
 
 @pytest.mark.evidence
+def test_evidence_map_with_tolerances_that_are_too_small_is_worse_than_raw_tsvd() -> None:
+    medians = read_column(load_evidence("three_prs_draws"), "medians", 1)  # position
+    assert medians[NARROW] > medians[RAW_TSVD] > medians[WIDE] > medians[PRIOR]
+
+
+@pytest.mark.evidence
 def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_is_as_accurate() -> None:
     document = load_evidence("three_prs_draws")
-    assert all(
-        inside for algorithm in document["minimum_inside"].values() for inside in algorithm.values()
-    )
+    for freedoms in ("6", "5"):
+        for algorithm in document["minimum_inside"][freedoms].values():
+            assert all(inside["median"] for inside in algorithm.values())
+            assert min(inside["machines"] for inside in algorithm.values()) > 70
     for number in (1, 3):  # position, angle
         medians = read_column(document, "medians", number)
         assert medians[RAW_FIVE] == pytest.approx(medians[RAW_LS], rel=0.02)
@@ -495,11 +504,22 @@ def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_is_as_accurate() ->
 
 
 @pytest.mark.evidence
+def test_evidence_position_after_commanding_is_that_of_the_true_parameters() -> None:
+    for name in ("three_prs_draws", "ru_pus_prs_draws"):
+        position, angle = (read_column(load_evidence(name), "medians", i) for i in (7, 8))
+        assert position[PRIOR] == pytest.approx(position[TRUE], rel=0.01)
+        assert angle[TRUE] == 0.0
+        assert angle[PRIOR] < 0.05 * angle[BEFORE]
+
+
+@pytest.mark.evidence
 def test_evidence_curves_of_the_ru_pus_prs_are_u_shaped_in_angle_only() -> None:
     document = load_evidence("ru_pus_prs_draws")
-    for algorithm in ("RE", "TSVD"):
-        inside = document["minimum_inside"][algorithm]
-        assert inside["phi and theta [deg]"]
-        assert not inside["position [mm]"]
+    for freedoms in ("6", "5"):
+        for algorithm in document["minimum_inside"][freedoms].values():
+            assert algorithm["phi and theta [deg]"]["median"]
+            assert algorithm["phi and theta [deg]"]["machines"] > 0.8 * document["draws"]
+            assert not algorithm["position [mm]"]["median"]
+            assert algorithm["position [mm]"]["machines"] < 0.3 * document["draws"]
     for method in (RAW_LS, RAW_RE, RAW_TSVD):
         assert read_column(document, "ratios", 4)[f"MAP over {method}"] < 1.0

@@ -22,12 +22,20 @@ from loopcal.papers.tsvd_2016.draws import (
     Draws,
 )
 from loopcal.papers.tsvd_2016.machines import MEASURES
-from loopcal.papers.tsvd_2016.situations import RE, TSVD, Situation, has_interior_minimum
+from loopcal.papers.tsvd_2016.situations import (
+    GAIN,
+    RE,
+    TSVD,
+    Situation,
+    has_interior_minimum,
+)
 from loopcal.papers.wording import read_wording
 from loopcal.typing import FloatArray
 
 DIVERGED = "diverged"
 """Cell of a number that a diverged fit does not have."""
+ROUNDING = 1e-10
+"""Size below which an error [mm, deg, tolerances] is rounding."""
 COMPARED = (
     RAW_LS, RAW_RE, RAW_TSVD, WHITENED, CROSS, NARROW, WIDE, HINDSIGHT,
 )  # fmt: skip
@@ -35,8 +43,10 @@ COMPARED = (
 
 
 def show_number(value: float) -> Cell:
-    """Return a number as a cell; one that is not finite belongs to a fit that diverged."""
-    return float(value) if np.isfinite(value) else DIVERGED
+    """Return a number as a cell: rounding as 0, and what is not finite as a fit that diverged."""
+    if not np.isfinite(value):
+        return DIVERGED
+    return float(value) if abs(value) > ROUNDING else 0.0
 
 
 def make_medians(draws: Draws) -> Table:
@@ -99,7 +109,7 @@ def to_document(draws: Draws, seed: int) -> dict[str, Any]:
             algorithm: {
                 measure: {
                     "median": has_interior_minimum(_take_median(situation, algorithm, i)),
-                    "machines": int((situation.compute_rises(algorithm, i) > 1.05).sum()),
+                    "machines": int((situation.compute_rises(algorithm, i) > GAIN).sum()),
                 }
                 for i, measure in enumerate(MEASURES[:2])
             }
