@@ -22,13 +22,7 @@ from loopcal.papers.tsvd_2016.draws import (
     Draws,
 )
 from loopcal.papers.tsvd_2016.machines import MEASURES
-from loopcal.papers.tsvd_2016.situations import (
-    GAIN,
-    RE,
-    TSVD,
-    Situation,
-    has_interior_minimum,
-)
+from loopcal.papers.tsvd_2016.situations import GAIN, RE, TSVD, Situation, has_interior_minimum
 from loopcal.papers.wording import read_wording
 from loopcal.typing import FloatArray
 
