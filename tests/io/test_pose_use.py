@@ -183,6 +183,25 @@ def test_few_rows_of_a_first_file_do_not_start_a_shared_frame(files, robot, data
             assert abs(start[name] - value) < 1e-4
 
 
+def test_data_without_any_value_are_refused_with_a_code(files, robot):
+    Path("second.csv").write_text(Path("sheet.csv").read_text())
+    for paths in (["sheet.csv"], ["sheet.csv", "second.csv"]):  # empty rows repeat nothing
+        with pytest.raises(DataError) as refused:
+            lc.calibrate(robot, load_measurements(paths, robot))
+        assert refused.value.code == "data.no-measured-value"
+
+
+def test_held_out_poses_without_any_value_are_refused_with_a_code(files, robot):
+    lines = Path("all.csv").read_text().splitlines()
+    lines = [
+        ",".join(line.split(",")[:-3]) + ",,," if ",held-out," in line else line for line in lines
+    ]
+    Path("all.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError) as refused:
+        lc.calibrate(robot, load_measurements("all.csv", robot))
+    assert refused.value.code == "data.no-held-out-value"
+
+
 def test_files_without_any_value_keep_their_kinds(files, robot):
     """A sheet that is to be filled in by a simulation has no value yet."""
     data = load_measurements("sheet.csv", robot)

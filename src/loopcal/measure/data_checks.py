@@ -104,7 +104,8 @@ def check_duplicates(
     """Refuse a row that repeats another one to the last bit: readings, kind and values.
 
     Two copies of one measurement count as twice the information. True repeats differ by their
-    noise. `allow` is for coarse instruments, which show the same number again.
+    noise. Rows without a measured value repeat nothing. `allow` is for coarse instruments, which
+    show the same number again.
 
     Parameters
     ----------
@@ -129,8 +130,10 @@ def check_duplicates(
         ]
         owners = [np.unique(text, return_inverse=True)[1].reshape(-1, 1) for text in texts]
         measured = np.concatenate([rows.measured for rows in alike])
+        is_empty = ~np.concatenate([rows.present.any(axis=1) for rows in alike])
+        own = np.where(is_empty, np.arange(1, len(poses) + 1), 0)[:, None]  # equal to no other row
         content = np.concatenate(
-            [measurements.readings[poses].reshape(len(poses), -1), measured, *owners], axis=1
+            [measurements.readings[poses].reshape(len(poses), -1), measured, *owners, own], axis=1
         )
         _, first, member = np.unique(
             np.nan_to_num(content, nan=1e300), axis=0, return_index=True, return_inverse=True

@@ -96,11 +96,9 @@ def calibrate(
     )
     redundant = robot.program.sigma is not None  # then readings are measurements, too
     if not split.fitted.n_rows and not redundant:
-        raise DataError("the data hold no measured value; fill in what the instrument showed")
+        raise DataError(report_finding("data.no-measured-value"))
     if split.held_out is not None and not split.held_out.n_rows and not redundant:
-        raise DataError(
-            "the held-out poses have no measured value, or are excluded; hold out other poses"
-        )
+        raise DataError(report_finding("data.no-held-out-value"))
     result = _fit(robot, split.fitted, options, count)
     return _report(result, split, conventions, options, count)
 

@@ -168,6 +168,22 @@ def test_taped_lengths_bring_a_real_machine_closer_to_its_published_anchors(
     assert (round(before, 1), round(after, 1)) == (18.7, 12.7)  # [mm], the numbers of the page
 
 
+def test_tape_reduces_the_uncertainty_of_the_anchors_along_their_lines_to_a_quarter(
+    tmp_path, data_folder, root
+) -> None:
+    samples = load_real_samples(data_folder)
+    names = ("A.anchor.y", "B.anchor.x", "C.anchor.x", "D.anchor.z")
+    page = (root / "docs" / "cable-robots.md").read_text("utf-8")
+    for what, found in (
+        ("none", {key: value for key, value in samples.items() if key != TAPED}),
+        ("5 mm", samples),
+    ):
+        fit = fit_samples(tmp_path, found, 1.0, sigma_tape=5e-3)
+        half = [1e3 * fit.plus_minus[NAMES.index(name)] for name in names]  # [mm]
+        cells = " | ".join(f"{value:.0f} mm" for value in half)
+        assert f"| {what} | {cells} |" in page
+
+
 def test_stated_anchors_are_prior_knowledge_only_with_their_sigma(tmp_path) -> None:
     anchors = TRUTH[ANCHORS].reshape(4, 3).round(0).tolist()
     for options, sd in (({}, 0.2), ({"sigma_anchor": 0.012}, 0.012)):
