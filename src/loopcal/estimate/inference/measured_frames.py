@@ -61,8 +61,9 @@ class MeasuredFrames:
         """Return the arrays of the run folder, which `frames_from_arrays` reads."""
         p = next((f.by_parameters.shape[1] for f in self.instruments.values()), 0)
         of_frames = {"T": (4, 4), "by_parameters": (6, p), "own": (6, 6)}
+        count = len(self.instruments)
         stacked = {
-            name: np.array([getattr(f, name) for f in self.instruments.values()]).reshape(-1, *size)
+            name: np.reshape([getattr(f, name) for f in self.instruments.values()], (count, *size))
             for name, size in of_frames.items()
         }
         content = {"unfixed": self.unfixed, "readings": self.readings, **stacked}
