@@ -124,12 +124,20 @@ def test_held_out_poses_are_never_fitted(files, robot):
     assert lc.identify(robot, data.fitted).converged
 
 
-@pytest.mark.parametrize("options", [{"hold_out": 0.25}, {"held_out": ("1",)}])
+@pytest.mark.parametrize(
+    "options", [{"hold_out": 0.25}, {"held_out": ("1",)}, {"held_out": HELD_OUT[:3]}]
+)
 def test_second_choice_of_held_out_poses_is_refused(files, robot, options):
     data = load_measurements("named.csv", robot)
     with pytest.raises(DataError) as refused:
         lc.calibrate(robot, data, lc.CalibrationOptions(**options))
     assert refused.value.code == "data.held-out-twice"
+
+
+def test_naming_the_same_held_out_poses_again_is_accepted(files, robot):
+    split = split_data(load_measurements("named.csv", robot), held_out=HELD_OUT[::-1])
+    assert split.held_out is not None
+    assert split.held_out.n_poses == len(HELD_OUT)
 
 
 def test_row_that_compares_poses_states_the_use_of_both(tmp_path, robot):

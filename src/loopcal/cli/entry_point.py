@@ -111,7 +111,7 @@ def commands() -> None:
     Exit codes:
       0  good
       1  wrong use, or input that is refused
-      2  a quality gate is not met (see calibrate, validate and compensate)
+      2  a quality gate is not met (see calibrate, validate, compensate, import and export)
     """  # noqa: D301
 
 

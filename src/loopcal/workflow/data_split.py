@@ -53,7 +53,7 @@ def split_data(
     DataError : a label that the data do not have, two choices of poses, or no pose is left to fit.
     """
     stated = tuple(label for label, out in zip(data.labels, data.is_held_out, strict=True) if out)
-    if stated and (hold_out or set(held_out) - set(stated)):
+    if stated and (hold_out or (held_out and set(held_out) != set(stated))):
         raise DataError(report_finding("data.held-out-twice", count=len(stated)))
     held_out = stated or held_out
     if held_out:
