@@ -10,6 +10,7 @@ import pytest
 import loopcal as lc
 from loopcal import geometry
 from loopcal.apply import compute_error_budget, pose_uncertainty
+from loopcal.diagnose.error_frames import solve_home
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify, identify_trials
 from loopcal.measure import (
     Gaussian,
@@ -73,15 +74,18 @@ def measure_trials(sensor: Sensor, machine: Mechanism | None = None, **options):
     )
 
 
-def test_total_is_the_pose_uncertainty_and_the_variances_add_up():
+@pytest.mark.parametrize("frame", ["fitted", "base", "relative", "frame"])
+def test_total_is_the_pose_uncertainty_and_the_variances_add_up(frame):
     sensor = Sensor(
         Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets")),
         noise(*[10 * UM] * 9),
     )
     data = simulate(robot(), measured_poses(30), Instrument((sensor,)), 1)
     fit = identify(robot(), data)
-    budget = compute_error_budget(fit, data)
-    uncertainty = pose_uncertainty(fit, sample_workspace(fit.robot, 200, 0).solution)
+    budget = compute_error_budget(fit, data, frame)
+    uncertainty = pose_uncertainty(
+        fit, sample_workspace(fit.robot, 200, 0).solution, frame=frame, origin=solve_home(fit.robot)
+    )
     for sources, expected in (
         (budget.position, uncertainty.position),
         (budget.orientation, uncertainty.orientation),
@@ -91,6 +95,8 @@ def test_total_is_the_pose_uncertainty_and_the_variances_add_up():
         assert sources.rms == pytest.approx(np.sqrt((expected**2).mean()), rel=1e-9)
         assert min(sources.instrument, sources.setup, sources.tolerances) > 0.0
     assert budget.is_workspace
+    if frame == "base":  # the unknown frame leaves the place of the base to its tolerances
+        assert budget.position.setup > 0.9 * sum(budget.position)
 
 
 def test_with_known_frames_and_accurate_data_the_instrument_is_the_only_source():
