@@ -37,7 +37,10 @@ SECTIONS = {
         "validate": "Validate a calibration, or a robot file, with measurements.",
         "compensate": "Compute readings or commands that reach targets.",
     },
-    "Published studies": {"reproduce": "Repeat a published study and compare its numbers."},
+    "Published studies": {
+        "reproduce": "Repeat a published study and compare its numbers.",
+        "per-leg": "Identify a hexapod leg by leg, to compare with calibrate.",
+    },
 }
 """Headings of the help, and the commands below each."""
 
@@ -47,7 +50,7 @@ MODULES = {
     "measurement_commands": ("identifiability", "simulate"),
     "plan_command": ("plan",),
     "calibration_commands": ("calibrate", "validate", "compensate"),
-    "study_commands": ("reproduce",),
+    "study_commands": ("reproduce", "per-leg"),
 }
 """Modules of this package, and the commands in each; they are imported when they run."""
 
@@ -85,7 +88,7 @@ def find_command(name: str) -> click.Command | None:
     module = next((module for module, names in MODULES.items() if name in names), None)
     if module is None:
         return None
-    function = name + "_" * keyword.iskeyword(name)
+    function = name.replace("-", "_") + "_" * keyword.iskeyword(name)
     return getattr(import_module(f"loopcal.cli.{module}"), function)
 
 

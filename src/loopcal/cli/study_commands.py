@@ -1,19 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal reproduce`: repeat a published study and compare its printed numbers."""
+"""`loopcal reproduce` repeats a published study; `loopcal per-leg` uses the method of one."""
 
 from __future__ import annotations
 
 import sys
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.options import file_option, flag_option, json_option
+from loopcal.cli.options import (
+    data_argument,
+    data_options,
+    file_option,
+    flag_option,
+    force_option,
+    json_option,
+    leave_out_held_out,
+    read_checked_measurements,
+    robot_argument,
+    take_flags,
+)
 
 if TYPE_CHECKING:
+    from loopcal.papers.hexapod_42.leg_form import PerLegEstimate
     from loopcal.papers.printed import Table as PrintedTable
     from loopcal.papers.reproduction import Reproduction
     from loopcal.report.tables import Table
@@ -84,6 +96,77 @@ def reproduce(
     if output is not None:
         last = f"Written to {output}: page.md, tables, figures"
     terminal.print_page([*_view_reproduction(result), "", last])
+
+
+@click.command()
+@robot_argument
+@data_argument("DATA...")
+@click.option(
+    "--steps", type=click.IntRange(min=1), default=3, metavar="N", help="Gauss-Newton steps."
+)
+@file_option("-o", "--output", help="Robot file to write, with the identified values.")
+@force_option("the output file")
+@data_options
+@json_option
+def per_leg(
+    robot: str,
+    data: tuple[Path, ...],
+    steps: int,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Identify the hexapod ROBOT leg by leg from full poses DATA, as the study hexapod-42 does.
+
+    All equations have weight one, and the noise that the legs share is ignored. The result has no
+    uncertainties and larger errors than that of calibrate; this command is for comparisons.
+
+    \b
+    Examples:
+      loopcal per-leg hexapod-42 measurements.csv
+      loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
+    """  # noqa: D301
+    from loopcal.io import load_robot, save_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.papers.hexapod_42.leg_form import identify_per_leg
+
+    refuse_outputs((output,), (find_robot_file(robot), *data), force)
+    machine = load_robot(robot)
+    measurements = leave_out_held_out(
+        read_checked_measurements(data, machine, **take_flags(options))
+    )
+    estimate = identify_per_leg(machine, measurements, steps)
+    if output is not None:
+        save_robot(estimate.robot, output)
+    if as_json:
+        terminal.print_json(estimate.to_dict())
+        return
+    terminal.print_page(_view_legs(estimate, len(measurements.readings), output))
+
+
+def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> list[Block]:
+    """Return the parameters, the condition numbers of the legs and the last step."""
+    from loopcal.report.tables import Column, Table, word_column
+
+    columns = (word_column("parameter"), *map(Column, ("unit", "nominal", "estimate", "change")))
+    rows = [
+        (row["name"], row["unit"], f"{row['nominal']:.6g}", f"{row['estimate']:.6g}",
+         f"{row['estimate'] - row['nominal']:+.3g}")
+        for row in estimate.to_dict()["parameters"]
+    ]  # fmt: skip
+    conditions = ", ".join(f"{condition:.0f}" for condition in estimate.conditions)
+    steps = len(estimate.estimate_history) - 1
+    name = estimate.robot.name
+    note = "No uncertainties: this method ignores the noise of the instrument."
+    page: list[Block] = [
+        f"{name} identified leg by leg from {poses} full poses: {steps} steps",
+        f"Condition numbers of the legs: {conditions}",
+        Table("Parameters", columns, tuple(rows)),
+        f"{note} For calibrations use loopcal calibrate.",
+    ]
+    return page if output is None else [*page, f"Written to {output}"]
 
 
 def _print_step(text: str) -> None:

@@ -11,12 +11,15 @@ simulation of the calibration algorithm for a 6-DOF parallel mechanism", section
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism, Solution, differentiate_pose, forward
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray, IntArray
 
 SHARED = 1e-9
@@ -94,6 +97,17 @@ class PerLegEstimate:
     estimate_history: FloatArray
     conditions: FloatArray
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the parameters in the units of the robot file, and the condition numbers."""
+        factor, symbols = select_free_parameters(self.robot).display()
+        table = zip(self.robot.parameters.entries, self.robot.values, factor, symbols, strict=True)
+        rows = [
+            {"name": p.name, "unit": unit, "nominal": p.nominal / one, "estimate": value / one}
+            for p, value, one, unit in table
+        ]
+        conditions = self.conditions.tolist()
+        return {"robot": self.robot.name, "parameters": rows, "conditions": conditions}
+
 
 def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> PerLegEstimate:
     """Identify a hexapod leg by leg in a fixed number of Gauss-Newton steps.
@@ -105,8 +119,14 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
     Raises
     ------
     EstimationError
-        The data are not full poses, a parameter moves no leg or several, or a pose is out of reach.
+        The robot has not six actuators, the data are not full poses in known frames or too few, a
+        parameter moves no leg or several, or a pose is out of reach.
     """
+    if len(robot.actuators) != 6:
+        raise EstimationError(
+            f"{robot.name} has {len(robot.actuators)} actuators; identification leg by leg needs "
+            "six legs with one actuator each; use identify"
+        )
     observations = _select_full_poses(data)
     q = data.readings[observations.rows]
     values, history, conditions = robot.values.copy(), [robot.values.copy()], np.zeros(0)
@@ -119,7 +139,7 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
                 "check the readings"
             )
         legs = LegForm.at(machine, solution)
-        _check_members(robot, legs)
+        _check_members(robot, legs, len(q))
         evaluated = observations.kind.evaluate(solution.T[None], observations.measured[None])
         twists = -np.linalg.solve(evaluated.jacobian[0], evaluated.residual[0, :, :, None])[:, :, 0]
         values = values + legs.fit(twists)
@@ -128,8 +148,8 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
     return PerLegEstimate(robot.with_values(values), np.stack(history), conditions)
 
 
-def _check_members(robot: Mechanism, legs: LegForm) -> None:
-    """Refuse parameters that do not move exactly one leg."""
+def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
+    """Refuse parameters that do not move exactly one leg, or that these poses do not determine."""
     count = np.zeros(len(robot.parameters), dtype=int)
     for members in legs.members:
         count[members] += 1
@@ -139,6 +159,20 @@ def _check_members(robot: Mechanism, legs: LegForm) -> None:
             f"{name} moves {int(count[count != 1][0])} legs, not exactly one, so the legs cannot "
             "be identified one by one; use identify"
         )
+    most = max(len(members) for members in legs.members)
+    if poses < most:
+        raise EstimationError(
+            f"{poses} poses are too few for the {most} parameters of a leg; measure at least {most}"
+        )
+    for leg, members in enumerate(legs.members):
+        columns = legs.G[:, leg, members]
+        scaled = columns / np.linalg.norm(columns, axis=0)
+        rank = int(are_nonzero(np.linalg.svd(scaled, compute_uv=False)).sum())
+        if rank < len(members):
+            raise EstimationError(
+                f"these poses determine {rank} of the {len(members)} parameters of leg {leg + 1} "
+                "(relative rank tolerance 1e-11); use identify"
+            )
 
 
 def _select_full_poses(data: Measurements) -> Observations:
@@ -146,6 +180,12 @@ def _select_full_poses(data: Measurements) -> Observations:
     kinds = [observations for observations in data.observations if len(observations)]
     if len(kinds) == 1:
         kept = kinds[0].take(kinds[0].weight > 0.0)
+        unknown = kept.kind.unknown
+        if unknown:
+            raise EstimationError(
+                f"identification leg by leg needs poses in known frames, but {unknown[0]} is "
+                "unknown; use identify"
+            )
         if kept.present.shape[1] == 6 and kept.present.all() and len(kept):
             return kept
     raise EstimationError(
