@@ -81,6 +81,8 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
     state = forward_trials(robot, values[None], readings[None])
     D = differentiate_pose(robot, values[None], readings[None], state).parameters[0]
     usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
+    if not usable.any():
+        return FrameMotions(null, (), 0, np.zeros((12, 0)))
     twists = D[usable][:, :, posterior.places] * posterior.unit
     motions, base, platform = _weigh_motions(robot, state.T[0, usable], twists)
     limit = NO_MOTION * float(np.linalg.norm(motions))

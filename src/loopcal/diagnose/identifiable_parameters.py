@@ -23,6 +23,7 @@ from loopcal.estimate.inference.null_space import (
 )
 from loopcal.estimate.inference.posterior import Posterior, compute_posterior
 from loopcal.estimate.information import collect_information, count_equations
+from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism, sample_workspace
@@ -294,6 +295,9 @@ def identifiability(
         )
     if not count:
         raise EstimationError(report_finding("fit.no-measured-value"))
+    open_poses = find_open_poses(robot, data)
+    if open_poses.are_most:
+        raise EstimationError(open_poses.report("fit.poses-open"))
     factor, reached = collect_information(free, data)
     if not reached.all():
         names = tuple(data.labels[i] for i in np.flatnonzero(~reached))

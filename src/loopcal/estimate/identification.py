@@ -48,6 +48,7 @@ from loopcal.estimate.poses.estimate import (
     report_doubtful_readings,
     report_uneven_sigmas,
 )
+from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
@@ -86,8 +87,9 @@ def identify(
 
     Raises
     ------
-    EstimationError : nothing to identify, fewer equations than parameters, or poses out of reach at
-        the start.
+    EstimationError : nothing to identify, fewer equations than parameters, poses out of reach at
+        the start, or redundant readings that contradict each other so widely that the fit does not
+        converge.
     """
     check_types(robot, data)
     options = merge_options(options, method, loss)
@@ -105,7 +107,15 @@ def identify(
     fit, weights, weighted = _descend_weighted(problem, data, z, options)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(problem, data, z, fit.cost)
-    return _assemble(robot, free, options, data, fit, weights, problem, weighted)
+    open_poses = find_open_poses(robot.with_values(values), data)
+    if fit.status[0] != DescentStatus.CONVERGED and open_poses.are_most:
+        raise EstimationError(open_poses.report("fit.poses-open"))
+    result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
+    if not open_poses.poses:
+        return result
+    return replace(
+        result, findings=(*result.findings, open_poses.report("fit.poses-open-at-start"))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,12 +270,7 @@ def _assemble(
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
     excluded, estimates = tuple(options.excluded_poses), solution.estimates
     poses = None if estimates is None else estimate_poses(estimates, data, excluded)
-    history = History(
-        status,
-        int(fit.iterations[0]),
-        fit.cost_history[:, 0],
-        free.nominal + free.tolerance * fit.deviation_history[:, 0],
-    )
+    history = _record_history(free, fit)
     regularization = describe_regularization(_method(options), fit.decomposition, fit.penalty)
     findings = [
         *([] if converged else [history.finding]),
@@ -304,6 +309,16 @@ def _assemble(
         nuisance=nuisance,
         poses=poses,
         findings=tuple(findings),
+    )
+
+
+def _record_history(free: FreeParameters, fit: Descent) -> History:
+    """Return the iteration of the first trial."""
+    return History(
+        DescentStatus(int(fit.status[0])),
+        int(fit.iterations[0]),
+        fit.cost_history[:, 0],
+        free.nominal + free.tolerance * fit.deviation_history[:, 0],
     )
 
 

@@ -88,7 +88,7 @@ def guess_nuisance_values_batch(
         values instead.
     """
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
-    sets = max((len(m) for m in measured), default=1)
+    sets = max((len(m) for m in measured), default=len(T))
     values = np.tile(nuisance.values(), (sets, 1))
     for i, members, indices in _list_groups(measurements, nuisance):
         if known[indices].all():

@@ -27,7 +27,14 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_rows
+from loopcal.mechanism.states import (
+    Status,
+    driven_values,
+    replace_rows,
+    reshape_rows,
+    select_rows,
+    without_poses,
+)
 from loopcal.mechanism.transmission import joints_from_readings, readings_from_joints
 from loopcal.typing import BoolArray, FloatArray
 
@@ -63,6 +70,8 @@ def forward_trials(
     that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
     these rows are marked at once, in a fraction of the time.
     """
+    if not q.shape[1]:
+        return without_poses(robot.home_state, max(len(values), len(q)))
     e, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row

@@ -62,6 +62,11 @@ def select_poses(state: State, rows: np.ndarray) -> State:
     return map_arrays(lambda a: a[:, rows], state)
 
 
+def without_poses(state: State, trials: int) -> State:
+    """Return the arrays of a state for some trials and no pose."""
+    return map_arrays(lambda a: np.zeros((trials, 0, *a.shape[2:]), a.dtype), state)
+
+
 def select_block(state: State, rows: tuple[slice, slice]) -> State:
     """Return a block of trials and poses of a state (t, n)."""
     return map_arrays(lambda a: a[rows], state)

@@ -139,6 +139,15 @@ def _list_changes(names: Sequence[str], data: Data, most: int) -> str:
     return list_names([f"{name} {change:+.4g} {unit}" for name, change, unit in zipped], most)
 
 
+def open_gaps(data: Data) -> str:
+    """Return which poses are open, and by how much, the widest first."""
+    pairs = zip(data["poses"], data["gaps"], strict=True)
+    return list_names([f"pose {pose} by {gap}" for pose, gap in pairs], SHOWN_GAPS)
+
+
+SHOWN_GAPS = 5
+"""Open poses that a sentence lists."""
+
 RULES = {
     "GCV": "generalized cross-validation",
     "TruncationGCV": "generalized cross-validation",
