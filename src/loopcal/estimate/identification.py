@@ -34,6 +34,7 @@ from loopcal.estimate.methods.regularization import describe_regularization
 from loopcal.estimate.minimization.closure_start import descend_from_closure, report_unused_closure
 from loopcal.estimate.minimization.descent import Descent, descend
 from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
+from loopcal.estimate.nuisance.baseline import fit_setup_before
 from loopcal.estimate.nuisance.estimate import (
     NuisanceEstimate,
     add_followers,
@@ -250,19 +251,17 @@ def _assemble(
     """Return the result; the weighted problem is linearized once more where it has nuisance
     parameters.
     """
-    status = DescentStatus(int(fit.status[0]))
-    converged = status is DescentStatus.CONVERGED
-    noise = name_noise(options, data)
-    test = run_residual_test(
-        fit.decomposition, fit.penalty, noise, options.loss is not None, converged
-    )
+    converged = bool(fit.status[0] == DescentStatus.CONVERGED)
+    noise, is_weighted = name_noise(options, data), options.loss is not None
+    test = run_residual_test(fit.decomposition, fit.penalty, noise, is_weighted, converged)
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = _test_prior(free, fit, _method(options))
     d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
     linearization = _linearize_nuisance(weighted, fit)
-    nuisance = _estimate_nuisance(weighted, linearization, robot, d, penalty, variance)
+    baseline = fit_setup_before(problem, robot, options, data.with_weights(weights), fit)
+    nuisance = _estimate_nuisance(weighted, linearization, robot, d, penalty, variance, baseline)
     frames = find_measured_frames(
         weighted, data, fit.deviation, fit.start, options.prior, linearization, variance
     )
@@ -350,11 +349,13 @@ def _estimate_nuisance(
     d: Decomposition,
     penalty: FloatArray,
     variance: float,
+    baseline: FloatArray | None,
 ) -> NuisanceEstimate:
     """Return the nuisance parameters at the estimate, where the rows are linearized."""
     if problem.nuisance is None or linearization is None:
         return empty_nuisance_estimate(problem.parameters)
-    return estimate_nuisance(problem.nuisance, linearization, robot, d, penalty, variance)
+    nuisance = problem.nuisance
+    return estimate_nuisance(nuisance, linearization, robot, d, penalty, variance, baseline)
 
 
 def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:

@@ -21,7 +21,11 @@ from loopcal.measure.array_checks import (
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
+from loopcal.numerics.elimination_tree import connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+SAME_READING = 1e-9
+"""Readings [m] or [rad] that differ by less belong to repeats of one pose."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,6 +122,12 @@ class Measurements:
         return sum(rows.n_residuals for rows in self.observations)
 
     @property
+    def repeats(self) -> IntArray:
+        """(n,) number of the pose that each pose repeats: equal ones have the same readings."""
+        rounded = np.round(self.readings / SAME_READING)
+        return np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
+
+    @property
     def noise_source(self) -> str:
         """Whether the noise of the rows is "stated", "assumed", or "mixed"."""
         assumed = {rows.is_noise_assumed for rows in self.observations}
@@ -203,7 +213,8 @@ class Measurements:
     def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
         """Split the poses at random into a set to fit and a held-out set.
 
-        Blocks are not split. The poses of each set keep their order.
+        Blocks are not split, and repeats of a pose (`repeats`) stay together: a repeat of a fitted
+        pose says nothing of other poses. The poses of each set keep their order.
 
         Parameters
         ----------
@@ -230,7 +241,12 @@ class Measurements:
                 f"cannot hold out a share of {hold_out}; give the share of the poses that is not "
                 "fitted, above 0 and below 1, such as 0.25"
             )
-        names, member, sizes = np.unique(self.block, return_inverse=True, return_counts=True)
+        block = np.unique(self.block, return_inverse=True)[1]
+        order = np.argsort(self.repeats, kind="stable")
+        repeated = np.flatnonzero(np.diff(self.repeats[order]) == 0)
+        links = np.column_stack([block[order[repeated]], block[order[repeated + 1]]])
+        joined = connected_groups(links, int(block.max()) + 1)[block]
+        names, member, sizes = np.unique(joined, return_inverse=True, return_counts=True)
         if len(names) < 2:
             raise DataError(
                 "cannot split measurements of a single block; measure more poses, or state smaller "

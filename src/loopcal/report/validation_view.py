@@ -174,6 +174,8 @@ def view_validation(validation: Validation, with_before: bool, verbose: bool) ->
 
 def _compare(change: ErrorChange) -> str:
     """Return in words how much an error changed."""
+    if change.before != change.before:  # NaN: the geometry before has no setup that fits
+        return "not known before calibration"
     if change.is_noise:
         return "within the noise before and after calibration"
     if abs(change.times - 1.0) < SIMILAR:

@@ -99,7 +99,8 @@ def calibrate(
         raise DataError(report_finding("data.no-measured-value"))
     if split.held_out is not None and not split.held_out.n_rows and not redundant:
         raise DataError(report_finding("data.no-held-out-value"))
-    result = _fit(robot, split.fitted, options, count)
+    held_out = 0 if split.held_out is None else split.held_out.n_poses
+    result = _fit(robot, split.fitted, options, count, held_out)
     return _report(result, split, conventions, options, count)
 
 
@@ -113,7 +114,11 @@ class _FitResult:
 
 
 def _fit(
-    robot: Mechanism, data: Measurements, options: CalibrationOptions, count: StepCounter
+    robot: Mechanism,
+    data: Measurements,
+    options: CalibrationOptions,
+    count: StepCounter,
+    held_out: int = 0,
 ) -> _FitResult:
     """Identify from the tolerances, or again with an earlier calibration as the prior."""
     excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)
@@ -144,6 +149,7 @@ def _fit(
                 "workflow.too-few-equations",
                 equations=available,
                 parameters=free,
+                held_out=held_out,
                 suggestions=describe_missing_equations(chosen, data) or "",
             )
         )
@@ -174,6 +180,7 @@ def _report(
         *_report_fit(fit),
         *impossible,
         *(_report_validation(errors, held_out is not None) if fit.converged else ()),
+        *_report_repeats(split),
         *_report_freedoms(fit),
         start.finding,
         *(() if examination is None else examination.findings),
@@ -273,6 +280,12 @@ def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Fin
             if change.has_grown
         ),
     ]
+
+
+def _report_repeats(split: DataSplit) -> list[Finding]:
+    """Return which held-out poses repeat fitted ones, where poses were chosen by name."""
+    names = tuple(f"pose {label}" for label in split.list_repeats())
+    return [report_finding("workflow.held-out-repeats", names=names)] if names else []
 
 
 def _report_freedoms(fit: Identification) -> list[Finding]:

@@ -6,9 +6,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements
+
+UNKNOWN = np.array(np.inf)
+"""Sigma of readings that may be missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +32,17 @@ class DataSplit:
     share: float
     seed: int
 
+    def list_repeats(self) -> tuple[str, ...]:
+        """Return the labels of held-out poses that repeat a fitted one."""
+        if self.held_out is None:
+            return ()
+        n = self.fitted.n_poses
+        readings = np.concatenate([self.fitted.readings, self.held_out.readings])
+        repeats = Measurements(self.fitted.robot_name, readings, (), reading_sigma=UNKNOWN).repeats
+        is_repeat = np.isin(repeats[n:], repeats[:n])
+        pairs = zip(self.held_out.labels, is_repeat, strict=True)
+        return tuple(label for label, repeated in pairs if repeated)
+
     def to_dict(self) -> dict[str, object] | None:
         """Return share, seed and labels of the held-out poses for JSON; None without any."""
         if self.held_out is None:
@@ -44,8 +60,8 @@ def split_data(
 
     Parameters
     ----------
-    hold_out : share of the poses to hold out, drawn by whole blocks as `data.split` does. 0 holds
-        nothing out.
+    hold_out : share of the poses to hold out, drawn by whole blocks, and with all repeats of a
+        pose, as `data.split` does. 0 holds nothing out.
     held_out : labels of the poses to hold out, instead of a share.
 
     Raises

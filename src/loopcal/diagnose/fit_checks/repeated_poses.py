@@ -27,9 +27,6 @@ from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import IntArray
 
-SAME_READING = 1e-9
-"""Readings [m] or [rad] that differ by less belong to repeats of one pose."""
-
 UNMEASURED = 1e-12
 """Singular values of the whiteners of repeats below this share of the largest belong to components
 that no repeat measured, which have no mean. Stated sigmas differ by less than that.
@@ -82,10 +79,8 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     if fill_in_reading_sigma(fit.robot, data).reading_sigma is not None:
         return _untested("residuals.repeats-with-uncertain-readings")
     data = exclude_poses(data, fit.options.excluded_poses)
-    _, member, times = np.unique(
-        np.round(data.readings / SAME_READING), axis=0, return_inverse=True, return_counts=True
-    )
-    member = member.reshape(-1)
+    member = data.repeats
+    times = np.bincount(member)
     pure, degrees = _pure_error(fit, data, member)
     lack = float(fit.history.cost[-1]) - pure
     lack_degrees = fit.residual_test.dof - degrees

@@ -37,7 +37,8 @@ class NuisanceEstimate:
     Attributes
     ----------
     table : nominal values, priors, and which were kept fixed.
-    start : values with which the fit began.
+    start : values that fit best at the geometry from which the fit starts; NaN where its poses do
+        not determine them.
     estimate : (U,).
     sd : standard deviations; infinite where the data do not determine the parameter, 0 where it is
         fixed, NaN without an interval.
@@ -72,7 +73,7 @@ class NuisanceEstimate:
 
     @property
     def starts(self) -> Mapping[str, float]:
-        """Values by name [SI] with which the fit began: those that fit the initial machine."""
+        """Values by name [SI] that fit best at the geometry from which the fit starts."""
         return dict(zip(self.names, self.start.tolist(), strict=True))
 
     def rows(self, coverage: float) -> list[dict[str, Any]]:
@@ -135,7 +136,7 @@ def estimate_nuisance(
     nuisance : of the problem. linearization : at the estimate (t = 1).
     robot : for its units. decomposition, penalty : of the fit (t = 1).
     noise : variance of the whitened rows; NaN where no interval is given.
-    start : (U,) values with which the fit began; default: those of the warm start.
+    start : (U,) values that fit the initial geometry; default: those with which the fit began.
     """
     table = nuisance.local.table
     begin = linearization.next_start.first_nuisance[0] if start is None else start
