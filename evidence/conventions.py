@@ -33,7 +33,7 @@ from loopcal.units import Dimension
 SEED, POSES = 3, 20
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
 RATIO = 1e-4  # [1], of columns without a unit
-ERROR_FACTORS = (1.0, 3.0, 30.0)
+ERROR_FACTORS = (1.0, 3.0, 10.0, 30.0)
 ROBOTS_WITH_EVERY_KIND = ("hexapod-42", "3-prs", "linear-delta")
 """Robots with every kind; the others are measured as full poses and as positions in an unknown
 frame, and up to 3 times off.
@@ -192,6 +192,18 @@ VALUE_SLIPS: tuple[tuple[str, Kind, Change, Details], ...] = (
         unit_slip("lengths", 10.0),
     ),
     ("drop for rise", Component(("z",)), scale_columns([0], -1.0), {"slip": "sign", "column": "z"}),
+    (
+        "heights in inches written as mm",
+        Component(("z",)),
+        scale_columns([0], 1.0 / 25.4),
+        {"slip": "unit", "factor": 25.4},
+    ),
+    (
+        "inches written as mm, and x and y swapped",
+        Pose(),
+        lambda values: scale_columns([3, 4, 5], 1.0 / 25.4)(values)[:, [0, 1, 2, 4, 3, 5]],
+        {"slip": "combination"},
+    ),
 )
 READING_SLIPS: tuple[tuple[str, Change, Details], ...] = (
     (
@@ -199,6 +211,12 @@ READING_SLIPS: tuple[tuple[str, Change, Details], ...] = (
         lambda q: q[:, [1, 0, *range(2, q.shape[1])]],
         {"slip": "swapped-readings"},
     ),
+    (
+        "actuators counted from the second one",
+        lambda q: np.roll(q, 1, axis=1),
+        {"slip": "permuted-readings"},
+    ),
+    ("half the gear factor", lambda q: 2.0 * q, {"slip": "gear-factor", "factor": 0.5}),
     ("readings of the other sign", lambda q: -q, {"slip": "reading-sign"}),
     (
         "rows moved by one",
@@ -244,8 +262,44 @@ def count_detections() -> list[list]:
     return rows
 
 
+def count_verdicts_on_random_data() -> list[list]:
+    """Return for each kind of random numbers: data sets, those doubtful, refused."""
+    rng = np.random.default_rng(SEED)
+
+    def draw(values: np.ndarray) -> np.ndarray:
+        return rng.uniform(values.min(axis=0), values.max(axis=0), values.shape)
+
+    rows = []
+    for name, of_values, of_readings in (
+        ("measured values", draw, np.array),
+        ("measured values, 1000 times too large", lambda values: 1e3 * draw(values), np.array),
+        ("measured values of other rows", rng.permutation, np.array),
+        ("readings", np.array, draw),
+    ):
+        result = []
+        for robot in map(load_robot, ROBOTS_WITH_EVERY_KIND):
+            for kind in (Pose(), IN_UNKNOWN_FRAME):
+                data = simulate_data(robot, kind, 1.0, SEED)
+                if data is not None:
+                    observations = data.observations[0]
+                    drawn = replace(observations, measured=of_values(observations.measured))
+                    random = replace(
+                        data, readings=of_readings(data.readings), observations=(drawn,)
+                    )
+                    result.append(compare_conventions(robot, random))
+        rows.append(
+            [
+                name,
+                len(result),
+                sum(check.is_doubtful for check in result),
+                sum(check.is_refused for check in result),
+            ]
+        )
+    return rows
+
+
 def collect() -> dict:
-    """Collect false alarms and detections."""
+    """Collect false alarms, detections and verdicts on random numbers."""
     alarms = {
         "columns": [
             "errors [tolerances]",
@@ -263,8 +317,13 @@ def collect() -> dict:
         "formats": ["", "d", "d", "d", "d"],
         "rows": count_detections(),
     }
+    random = {
+        "columns": ["random numbers", "data sets", "misfit above 10", "refused"],
+        "formats": ["", "d", "d", "d"],
+        "rows": count_verdicts_on_random_data(),
+    }
     return {
         "seed": SEED,
         "poses": POSES,
-        "tables": {"false_alarms": alarms, "detection": detection},
+        "tables": {"false_alarms": alarms, "detection": detection, "random": random},
     }

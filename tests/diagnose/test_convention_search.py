@@ -297,3 +297,21 @@ def test_far_machines_are_not_refused_and_their_mistakes_are_named() -> None:
         result = compare_conventions(robot, inches)
         assert result.is_refused, (name, result)
         assert has_slip(result, **unit_slip("lengths", 25.4)), result
+
+
+def test_sign_of_small_heights_is_undecided_and_said_so() -> None:
+    """Deviations of probed heights: opposite errors of the machine explain the opposite sign."""
+    robot = load_cached_robot("linear-delta")
+    values = robot.values.copy()
+    values[robot.parameters.names.index("tower1.stop")] += 1e-3
+    at = np.random.default_rng(0).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.0], (16, 3))
+    sensor = Sensor(Component(("z",)), Gaussian(np.array([2e-5])))
+    truth, instrument = robot.with_values(values), Instrument((sensor,))
+    data = simulate_measurements(truth, at, instrument, 0, controller=robot)
+    for factor in (1.0, -1.0):
+        result = compare_conventions(robot, change_values(data, scaled([0], factor)))
+        assert not result.is_refused
+        assert result.finding is not None
+        assert result.finding.code == "conventions.height-sign-undecided"
+    touched = simulate_measurements(truth, at, instrument, 0, controller=truth)
+    assert compare_conventions(robot, touched).finding is None  # heights of 0 have no sign

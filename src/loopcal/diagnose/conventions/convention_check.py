@@ -20,6 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.diagnose.conventions.equal_interpretations import (
+    compute_opposite_misfit,
+    find_equal_orders,
+)
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.diagnose.conventions.judgement import BETTER
 from loopcal.diagnose.conventions.misfit import (
@@ -33,9 +37,9 @@ from loopcal.diagnose.conventions.misfit import (
 from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.diagnose.conventions.selection import (
     ALLOWED,
+    EQUALLY,
     Search,
     Selection,
-    find_equal_orders,
     search_interpretations,
     shares_poses,
 )
@@ -198,20 +202,23 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
         return ConventionCheck(float("nan"))
     misfit = compute_quick_misfit(free, known)
     if not misfit > ALLOWED:
-        return ConventionCheck(misfit, finding=_report_orders(free, known))
+        return ConventionCheck(misfit, finding=_report_equals(free, known, misfit))
     thinned = _thin_out(known)
     reach = select_reached(free, thinned, follow=True)
     stated, against, misfit = None, None, np.inf
     if reach.is_enough:
         whole = compare_with_robot(free, reach.data)
         if not whole.misfit > ALLOWED:
-            return ConventionCheck(whole.misfit, finding=_report_orders(free, reach.data))
+            return ConventionCheck(
+                whole.misfit, finding=_report_equals(free, reach.data, whole.misfit)
+            )
         stated = exclude_far_rows(whole)
         misfit = min(whole.misfit, refine_misfit(stated)[0])
         if not misfit > ALLOWED:
             has_far_rows = whole.misfit > IMPLAUSIBLE and bool(stated.excluded)
-            finding = _report_far_rows(stated) if has_far_rows else _report_orders(free, reach.data)
-            return ConventionCheck(misfit, finding=finding)
+            if has_far_rows:
+                return ConventionCheck(misfit, finding=_report_far_rows(stated))
+            return ConventionCheck(misfit, finding=_report_equals(free, reach.data, misfit))
         if misfit > IMPLAUSIBLE:
             against = find_contradiction(stated, misfit, BETTER)
     description = {
@@ -329,8 +336,18 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
 
 
-def _report_orders(free: FreeParameters, data: Measurements) -> Finding | None:
-    """Report other orders of the actuators that explain data as well; None without any."""
+def _report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Finding | None:
+    """Report other orders of the actuators, or the other sign of heights, that explain data as well
+    as they are written; None without any.
+    """
+    opposite = compute_opposite_misfit(free, data)
+    if opposite <= max(EQUALLY * misfit, 1.0):
+        return report_finding(
+            "conventions.height-sign-undecided",
+            robot=free.robot.name,
+            misfit=misfit,
+            other_misfit=opposite,
+        )
     orders = find_equal_orders(free, data)
     if not orders:
         return None

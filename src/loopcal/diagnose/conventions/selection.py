@@ -22,7 +22,6 @@ from loopcal.diagnose.conventions.misfit import (
     THOROUGH,
     Comparison,
     compute_misfits,
-    is_redundant,
     select_reached,
 )
 from loopcal.diagnose.conventions.reading_interpretations import list_reading_interpretations
@@ -33,7 +32,7 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import compute_readings, find_directly_reachable
 from loopcal.typing import FloatArray, IntArray
 
-FAR_BETTER = 25.0
+FAR_BETTER = 10.0
 """Factor by which it must fit better if tolerances and noise do not explain the rest, as of a robot
 far from nominal in data with a wrong unit.
 """
@@ -63,14 +62,6 @@ LOWERED, MOST_BASES = 0.7, 3
 """Share of the misfit below which an interpretation is a base of pairs, and largest number of bases
 among the values, and among the readings.
 """
-
-MEASURED = 12
-"""Number of measured residuals from which the order of a redundant robot's actuators is certain:
-those of four positions, by which no machine of another order agrees with its redundant readings.
-"""
-
-ORDERS = ("swapped-readings", "reversed-readings", "permuted-readings")
-"""Slips in the order of the actuators."""
 
 EQUALLY = 1.2
 """Ratio of misfits up to which two interpretations fit equally well; the first in the list is
@@ -141,33 +132,6 @@ def search_interpretations(
         limit = misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST
         best = _select_best(free, data, written, singles, misfit, limit)
     return Search(best, tried, count)
-
-
-def find_equal_orders(free: FreeParameters, data: Measurements) -> tuple[Interpretation, ...]:
-    """Find other orders of the actuators that explain data of a redundant robot as well as the
-    stated one, which explains them.
-
-    Only data whose measured rows are few leave that open: poses are then known from the readings.
-    """
-    measured = sum(o.n_residuals for o in data.observations)
-    if not is_redundant(free) or measured >= MEASURED:
-        return ()
-    few = data.take(_select_measured(data))
-    equal = []
-    for interpretation in list_reading_interpretations(few, free.robot.actuators):
-        if interpretation.slip in ORDERS:
-            comparison = judge_data(free, interpretation.apply(few))
-            if comparison is not None and refine_misfit(comparison)[0] <= ALLOWED:
-                equal.append(interpretation)
-    return tuple(equal)
-
-
-def _select_measured(data: Measurements) -> IntArray:
-    """Return the measured poses, and others spread over the data up to `FEWEST_POSES`."""
-    measured = np.unique(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
-    others = np.setdiff1d(np.arange(data.n_poses), measured)
-    spread = np.linspace(0, max(len(others) - 1, 0), max(FEWEST_POSES - len(measured), 0))
-    return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
 
 
 def shares_poses(data: Measurements) -> bool:
