@@ -267,9 +267,11 @@ def test_published_table_has_no_false_refusal_and_names_three_of_four_slips(root
         assert count - silent >= 40
         assert refused == 0
         assert doubted == 0 or times > 3.0
-    for _, count, doubted, refused, named in tables["detection"]["rows"]:
+    for name, count, doubted, refused, named in tables["detection"]["rows"]:
         assert count == 5
-        assert doubted >= refused >= named >= 3
+        assert doubted >= refused >= named >= (2 if ", and " in name else 3)  # two mistakes at once
+    for _, count, doubted, refused in tables["random"]["rows"]:
+        assert (doubted, refused) == (count, 0)
     assert sum(row[-1] for row in tables["detection"]["rows"]) >= 0.75 * 5 * len(
         tables["detection"]["rows"]
     )
