@@ -15,7 +15,6 @@ from loopcal.diagnose.conventions.misfit import (
     Comparison,
     compare_with_robot,
     exclude_far_rows,
-    is_redundant,
     select_reached,
 )
 from loopcal.estimate.free_parameters import FreeParameters
@@ -70,11 +69,8 @@ def guess_frames(
 def is_informative(
     free: FreeParameters, data: Measurements, interpretation: Interpretation, misfit: float
 ) -> bool:
-    """Return whether data fit far better in an interpretation than controls without information.
-
-    Redundant readings that agree with each other are information by themselves.
-    """
-    if is_redundant(free) and all(part.observation is None for part in interpretation.parts):
+    """Return whether values that shrink fit far better than controls without information."""
+    if not any(part.shrinks for part in interpretation.parts):
         return True
     for control in _list_controls(data, interpretation):
         comparison = judge_data(free, control)
@@ -84,21 +80,20 @@ def is_informative(
 
 
 def _list_controls(data: Measurements, interpretation: Interpretation) -> Iterator[Measurements]:
-    """Yield data with the values of other rows, and with constants in place of values that shrink:
-    random numbers fit as well at any pose, and zeros in every unit.
+    """Yield data with the values of other rows, and with constants in place of changed values:
+    random numbers of any size fit as well at any pose, and zeros in every unit.
     """
     changed, rng = interpretation.apply(data), np.random.default_rng(0)
     shuffled = (
         replace(o, measured=o.measured[rng.permutation(len(o))]) for o in changed.observations
     )
     yield replace(changed, observations=tuple(shuffled))
-    if any(part.shrinks for part in interpretation.parts):
-        pairs = zip(data.observations, changed.observations, strict=True)
-        constant = (
-            replace(new, measured=_make_constant(old.measured, new.measured)) for old, new in pairs
-        )
-        readings = _make_constant(data.readings, changed.readings)
-        yield replace(changed, readings=readings, observations=tuple(constant))
+    pairs = zip(data.observations, changed.observations, strict=True)
+    constant = (
+        replace(new, measured=_make_constant(old.measured, new.measured)) for old, new in pairs
+    )
+    readings = _make_constant(data.readings, changed.readings)
+    yield replace(changed, readings=readings, observations=tuple(constant))
 
 
 def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
