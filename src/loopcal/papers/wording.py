@@ -31,8 +31,6 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
-import numpy as np
-
 from loopcal.findings.wording import fill_template
 from loopcal.papers.printed import Cell, Comparison, Printed, Table
 from loopcal.papers.reproduction import OWN_CHECK, Figure, Series, Verdict
@@ -68,7 +66,6 @@ class Wording:
         evidence: str = "",
         /,
         *,
-        agrees: bool | np.bool_ | None = None,
         draws: Sequence[Mapping[str, Any]] = (),
         **data: Any,
     ) -> Verdict:
@@ -77,16 +74,15 @@ class Wording:
         Parameters
         ----------
         claim : its name. evidence : which of several texts `evidence_NAME` of the claim to use.
-        agrees : whether the numbers support it, for a claim without comparisons. By default its
-            comparisons decide. draws : the numbers of each repeated draw of a random study, which
-            replace those of `data` in the comparisons. data : the numbers.
+        draws : the numbers of each repeated draw of a random study, which replace those of `data`
+            in the comparisons. data : the numbers.
         """
         text = self.claims[claim]
         judged = tuple(judge_numbers(text, {**data, **drawn}) for drawn in draws)
         if judged:
             decided = judged[0] if len(set(judged)) == 1 else None
         else:
-            decided = judge_numbers(text, data) if agrees is None else bool(agrees)
+            decided = judge_numbers(text, data)
         return Verdict(
             claim=fill_template(text["claim"], **data),
             agrees=decided,
