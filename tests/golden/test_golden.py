@@ -36,7 +36,7 @@ BY_TARGET = (
     "wires have length errors; rows that measure no such quantity have no entry in place of NaN"
 )
 BEST_FIT = (
-    "errors are those after the best rigid fit of the frames that the instrument does not determine; "
+    "errors are those after the best rigid fit of frames that the instrument does not determine; "
     "a plan for such an instrument makes these small, and chooses other poses"
 )
 CONTROLLER_SET = (

@@ -13,7 +13,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli import main
-from loopcal.errors import DataError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP
 from loopcal.findings import Severity, report_finding
 from loopcal.io import load_run, save_run
@@ -28,7 +28,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.
 
 @pytest.fixture(scope="module")
 def robot():
-    return lc.load_robot("hexapod-42")
+    return lc.load_robot('hexapod-42')
 
 
 @pytest.fixture(scope="module")
@@ -322,3 +322,8 @@ def test_suggestions_use_the_rank_tolerance_of_the_fit(robot, data) -> None:
     report = calibrate(robot, data, CalibrationOptions(fit=fit))
     assert report.identification.unidentifiable
     assert report.suggestions
+
+
+def test_unknown_frame_of_errors_is_refused_before_the_fit(robot, data):
+    with pytest.raises(EstimationError, match=r"frame is 'laser'.*'fitted', 'base', 'relative'"):
+        calibrate(robot, data, CalibrationOptions(frame="laser"))

@@ -140,7 +140,7 @@ def _describe_instruments(
 ) -> dict[str, InstrumentFrame]:
     """Return the frames in which the kinds of measurements measure."""
     frames: dict[str, InstrumentFrame] = {}
-    for name, stated, is_unknown in _list_frames(data):
+    for name, stated, is_unknown in list_instrument_frames(data):
         if not is_unknown:
             nothing = np.zeros((6, len(free)))
             frames[name] = InstrumentFrame(stated, nothing, np.zeros((6, 6)))
@@ -151,7 +151,7 @@ def _describe_instruments(
     return frames
 
 
-def _list_frames(data: Measurements) -> Iterable[tuple[str, FloatArray, bool]]:
+def list_instrument_frames(data: Measurements) -> Iterable[tuple[str, FloatArray, bool]]:
     """Return name, stated T_base_frame (4, 4) and whether it is unknown of each complete frame."""
     listed: dict[str, tuple[FloatArray, bool]] = {}
     for rows in data.observations:

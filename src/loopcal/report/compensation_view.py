@@ -48,8 +48,10 @@ def view_compensation(result: Compensation) -> list[Block]:
                 f"{format_number(turn, 3)} {angle} from the best reachable poses."
             )
     if result.uncertainty is not None:
+        is_of_all = result.uncertainty.reference.data["frame"] in ("fitted", "base")
+        others = "" if is_of_all else " Errors before and after are in the base frame."
         blocks.append(
-            "Errors are distances and angles; 95 % of those that remain are below U. Frame: "
-            f"{result.uncertainty.frame}."
+            "Errors are distances and angles. 95 % of those of the machine after compensation are "
+            f"below U. Frame{'' if is_of_all else ' of U'}: {result.uncertainty.frame}.{others}"
         )
     return blocks

@@ -23,9 +23,11 @@ from loopcal.diagnose import (
     interpret_fit,
     suggest_measurements,
 )
+from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
 from loopcal.errors import DataError
 from loopcal.estimate import Change, Identification, identify, recalibrate
 from loopcal.estimate.fit_input import check_types, exclude_poses
+from loopcal.estimate.frame_freedoms import list_instrument_frames
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.importance import sort_by_importance
@@ -82,6 +84,8 @@ def calibrate(
     options = CalibrationOptions() if options is None else options
     check_types(robot, data)
     check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
+    instruments = (name for name, *_ in list_instrument_frames(data))
+    check_frame(options.frame, (FITTED, BASE, RELATIVE, *instruments))
     kept = exclude_poses(data, options.fit.excluded_poses)
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
     if options.has_limit and split.held_out is None:
