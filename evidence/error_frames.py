@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.apply import PoseUncertainty, pose_uncertainty, validate
+from loopcal.apply import PoseUncertainty, compute_error_budget, pose_uncertainty, validate
 from loopcal.diagnose import estimate_calibration_gain
 from loopcal.diagnose.error_frames import fit_frames, fit_unfixed_frames
 from loopcal.estimate import identify, identify_trials
@@ -67,7 +67,8 @@ ANCHORS = ((0.35, 0.05, 0.1), (-0.2, 0.3, 0.05), (-0.1, -0.25, 0.45))
 FIGURES = {
     "planned": "expected by the plan, over the workspace",
     "expected": "expected by the calibration, at the measured poses",
-    "stated": "stated uncertainty, over the workspace",
+    "total": "first lines of the calibration, over the workspace",
+    "stated": "uncertainty of poses, over the workspace",
 }
 """Reported position errors, and what they are."""
 
@@ -206,12 +207,14 @@ class Report:
     """Position errors that are reported of one machine [m], root mean square.
 
     planned : expected by the plan over the workspace. expected : by the calibration at the measured
-    poses. stated : uncertainty over the workspace. validated, floor, exact : errors of held-out
+    poses. total : from all sources over the workspace; NaN where residuals contradict the noise.
+    stated : uncertainty of the compared poses. validated, floor, exact : errors of held-out
     values with their noise, the noise floor, and the errors without noise [sigma].
     """
 
     planned: float
     expected: float
+    total: float
     stated: float
     validated: float
     floor: float
@@ -232,10 +235,12 @@ def report_machine(
     """
     fit = identify(study.robot, data)
     uncertainty = state_uncertainty(study, fit.posterior)
+    budget = compute_error_budget(fit, data)
     noisy, without_noise = (validate(fit, rows).kinds[-1] for rows in (held_out, exact))
     return Report(
         planned=study.spread * study.plan.errors.after.position,
         expected=study.spread * estimate_calibration_gain(fit, data).position_after,
+        total=np.nan if budget is None else study.spread * budget.position.rms,
         stated=float(np.sqrt((uncertainty.position**2).mean())),
         validated=noisy.after,
         floor=study.spread * noisy.noise_floor,
@@ -272,7 +277,7 @@ class TrueFigures:
     machines : number of fits that converged.
     rms, median : over these machines, of their position errors [m], each a root mean square over
     poses: `planned` over the workspace after the best fit there, `expected` at the measured poses,
-    `stated` over the workspace after the best fit at the measured poses.
+    `total` and `stated` over the workspace after the best fit at the measured poses.
     uncertainty : what is stated of the latter [m], median.
     components, positions, orientations : shares of errors below their expanded uncertainty.
     """
@@ -296,7 +301,8 @@ def measure_true_figures(study: Study, machines: int = STACKED) -> TrueFigures:
         posterior = _posterior_of(fits, int(i), frames)
         true = compute_true_errors(study, posterior, trials.truth[i])
         uncertainty = state_uncertainty(study, posterior)
-        sizes.append([_rms(e) for e in (true.over_workspace, true.at_measured, true.errors)])
+        errors = (true.over_workspace, true.at_measured, true.errors, true.errors)
+        sizes.append([_rms(twists) for twists in errors])
         stated.append(float(np.sqrt((uncertainty.position**2).mean())))
         covered.append(_find_covered(true.errors, uncertainty))
     rms = np.sqrt(np.mean(np.square(sizes), axis=0)).tolist()
@@ -337,9 +343,13 @@ def _posterior_of(fits: IdentifiedTrials, trial: int, frames: MeasuredFrames | N
 
 
 def report_medians(reports: list[Report]) -> dict[str, float]:
-    """Return every reported figure, median over the machines."""
-    names = (*FIGURES, "validated", "exact_with_noise")
-    return {name: float(np.median([getattr(r, name) for r in reports])) for name in names}
+    """Return every reported figure, median over the machines that report it."""
+    medians = {}
+    for name in (*FIGURES, "validated", "exact_with_noise"):
+        values = np.array([getattr(report, name) for report in reports])
+        known = values[np.isfinite(values)]
+        medians[name] = float(np.median(known)) if len(known) else float("nan")
+    return medians
 
 
 def collect() -> dict:
