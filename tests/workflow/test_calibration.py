@@ -28,7 +28,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.
 
 @pytest.fixture(scope="module")
 def robot():
-    return lc.load_robot('hexapod-42')
+    return lc.load_robot("hexapod-42")
 
 
 @pytest.fixture(scope="module")
