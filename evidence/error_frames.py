@@ -85,11 +85,9 @@ class Setup:
     @cached_property
     def instrument(self) -> Instrument:
         """Return the instrument with its noise."""
-        return Instrument(tuple(Sensor(kind, Gaussian(_sigma(kind))) for kind in self.kinds))
-
-
-def _sigma(kind: Kind) -> Array:
-    return np.array([SIGMA[column.dimension] for column in kind.noise_columns])
+        sigmas = [[SIGMA[column.dimension] for column in k.noise_columns] for k in self.kinds]
+        pairs = zip(self.kinds, sigmas, strict=True)
+        return Instrument(tuple(Sensor(kind, Gaussian(np.array(s))) for kind, s in pairs))
 
 
 def list_setups() -> tuple[Setup, ...]:
@@ -161,13 +159,13 @@ class Study:
         return replace(trials, measured=other.measured)
 
 
-def prepare_study(setup: Setup, noise: float = 1.0, spread: float = 1.0) -> Study:
+def prepare_study(setup: Setup) -> Study:
     """Return a set-up with its plan."""
     robot = load_robot(setup.robot)
     options = PlanOptions(n_poses=setup.poses, n_candidates=300, seed=SEED)
     planned = plan(robot, setup.instrument, options=options)
     test = sample_workspace(robot, COVERED, SEED).coordinates
-    return Study(setup, planned, test, noise, spread)
+    return Study(setup, planned, test)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +232,7 @@ def report_machine(
     `exact` are the held-out measurements without noise.
     """
     fit = identify(study.robot, data)
-    uncertainty = state_uncertainty(study, fit.posterior)
-    budget = compute_error_budget(fit, data)
+    uncertainty, budget = state_uncertainty(study, fit.posterior), compute_error_budget(fit, data)
     noisy, without_noise = (validate(fit, rows).kinds[-1] for rows in (held_out, exact))
     return Report(
         planned=study.spread * study.plan.errors.after.position,
