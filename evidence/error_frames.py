@@ -302,11 +302,11 @@ def measure_true_figures(study: Study, machines: int = STACKED) -> TrueFigures:
         sizes.append([_rms(twists) for twists in errors])
         stated.append(float(np.sqrt((uncertainty.position**2).mean())))
         covered.append(_find_covered(true.errors, uncertainty))
-    rms = np.sqrt(np.mean(np.square(sizes), axis=0)).tolist()
+    rms, median = np.sqrt(np.mean(np.square(sizes), axis=0)), np.median(sizes, axis=0)
     return TrueFigures(
         len(covered),
-        dict(zip(FIGURES, rms, strict=True)),
-        dict(zip(FIGURES, np.median(sizes, axis=0).tolist(), strict=True)),
+        dict(zip(FIGURES, rms.tolist(), strict=True)),
+        dict(zip(FIGURES, median.tolist(), strict=True)),
         float(np.median(stated)),
         *np.mean(covered, axis=0).tolist(),
     )
@@ -314,12 +314,9 @@ def measure_true_figures(study: Study, machines: int = STACKED) -> TrueFigures:
 
 def _find_covered(errors: Array, uncertainty: PoseUncertainty) -> list[float]:
     """Return the shares of components, positions and orientations below their U."""
-    moving = uncertainty.expanded > 0.0
-    position, orientation = (
-        np.linalg.norm(errors[:, part], axis=1) for part in (slice(3, 6), slice(0, 3))
-    )
+    position, orientation = (np.linalg.norm(e, axis=1) for e in (errors[:, 3:], errors[:, :3]))
     return [
-        float((np.abs(errors) <= uncertainty.expanded)[moving].mean()),
+        float((np.abs(errors) <= uncertainty.expanded).mean()),
         float((position <= uncertainty.expanded_position).mean()),
         float((orientation <= uncertainty.expanded_orientation).mean()),
     ]
