@@ -259,7 +259,8 @@ def _assemble(
     d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
-    linearization = _linearize_nuisance(weighted, fit)
+    has_nuisance = weighted.nuisance is not None
+    linearization = weighted.linearize(fit.deviation, fit.start) if has_nuisance else None
     baseline = fit_setup_before(problem, robot, options, data.with_weights(weights), fit)
     nuisance = _estimate_nuisance(weighted, linearization, robot, d, penalty, variance, baseline)
     frames = find_measured_frames(
@@ -333,13 +334,6 @@ def _test_prior(free: FreeParameters, fit: Descent, method: Method) -> PriorConf
         return None
     sigma = float(method.sigma(fit.decomposition)[0])
     return assess_prior_conflict(free, fit.decomposition, fit.penalty, sigma, fit.deviation[0])
-
-
-def _linearize_nuisance(problem: Problem, fit: Descent) -> Linearization | None:
-    """Return the problem linearized at the estimate; None without nuisance parameters."""
-    if problem.nuisance is None:
-        return None
-    return problem.linearize(fit.deviation, fit.start)
 
 
 def _estimate_nuisance(
