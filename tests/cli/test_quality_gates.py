@@ -10,6 +10,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.errors import DataError
+from loopcal.findings import report_finding
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
@@ -76,7 +77,9 @@ def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
     folder_with_wrong_cell, capsys, monkeypatch, hold_out
 ) -> None:
     def raise_data_error(*_):
-        raise DataError("the calibrated geometry cannot follow")
+        counts = {"poses": 10, "before": 10, "after": 0}
+        code = "residuals.calibrated-out-of-reach"
+        raise DataError(report_finding(code, robot="hexapod-42", **counts))
 
     monkeypatch.setattr("loopcal.workflow.calibration.validate", raise_data_error)
     assert (
@@ -90,5 +93,5 @@ def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
     assert result["passed"] is False
     (failure,) = [f for f in result["findings"] if f["severity"] == "failure"]
     assert failure["code"] == "gates.poses-unreachable"
-    assert "the calibrated geometry cannot follow" in failure["data"]["reason"]
+    assert "No pose of hexapod-42 is reached" in failure["data"]["reason"]
     assert result["reasons"] == [failure["text"]]

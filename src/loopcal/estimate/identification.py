@@ -252,8 +252,8 @@ def _assemble(
     parameters.
     """
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
-    noise, is_weighted = name_noise(options, data), options.loss is not None
-    test = run_residual_test(fit.decomposition, fit.penalty, noise, is_weighted, converged)
+    noise, weighs = name_noise(options, data), options.loss is not None
+    test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged)
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = _test_prior(free, fit, _method(options))
     d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
@@ -314,12 +314,9 @@ def _assemble(
 
 def _record_history(free: FreeParameters, fit: Descent) -> History:
     """Return the iteration of the first trial."""
-    return History(
-        DescentStatus(int(fit.status[0])),
-        int(fit.iterations[0]),
-        fit.cost_history[:, 0],
-        free.nominal + free.tolerance * fit.deviation_history[:, 0],
-    )
+    status, steps = DescentStatus(int(fit.status[0])), int(fit.iterations[0])
+    values = free.nominal + free.tolerance * fit.deviation_history[:, 0]
+    return History(status, steps, fit.cost_history[:, 0], values)
 
 
 def _method(options: FitOptions) -> Method:
