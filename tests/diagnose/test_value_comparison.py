@@ -13,10 +13,11 @@ import scipy.stats
 from loopcal.apply import validate
 from loopcal.diagnose import compare_with_truth, compare_with_values
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
+from loopcal.estimate import MAP, FitOptions, LeastSquares, TruncatedSVD, identify
 from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import Component, Instrument, Noise, Pose, Sensor, sample_truth, simulate
+from loopcal.mechanism import sample_workspace
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise
 
@@ -231,3 +232,29 @@ def test_values_that_cannot_be_compared_are_refused_or_undecided(tmp_path) -> No
     result = compare_with_truth(estimated, truth)
     assert result.agrees is None
     assert str(result.outcome).startswith("The stored values cannot be compared")
+
+
+def test_least_squares_far_from_the_truth_decides_nothing_and_map_does() -> None:
+    """On the 3-PRS second-order effects of a direction of 30 tolerances exceed the noise."""
+    robot = load_robot("3-prs")
+    (truth,) = sample_truth(robot, 1, seed=0)
+    coordinates = sample_workspace(robot, 25, 0).coordinates
+    instrument = Instrument((Sensor(Pose(), noise(*[1e-5] * 3, *[1e-5] * 3)),))
+    data = simulate(robot.with_values(truth), coordinates, instrument, 0)
+    wide, near = (
+        compare_with_truth(identify(robot, data, method), truth)
+        for method in (LeastSquares(), MAP())
+    )
+    assert wide.agrees is None
+    assert wide.outcome.code == "comparison.not-linear"
+    assert wide.second_order > 20.0
+    assert near.second_order < 0.1
+    assert near.agrees
+
+
+def test_truncated_directions_are_not_tested() -> None:
+    data = hexapod_data(20)
+    fit = identify(hexapod(), data, TruncatedSVD(30))
+    result = compare_with_truth(fit, zoo.hexapod_truth())
+    assert (result.compared, result.degrees) == (42, 30)
+    assert np.isfinite(result.chi_square)

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.diagnose.second_order import draw_readings, measure_second_order
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE, ResidualTest
@@ -33,16 +34,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.geometry import log_so3
 from loopcal.geometry.alignment import align_point_sets
-from loopcal.measure import make_random_stream
-from loopcal.mechanism import (
-    POSITION,
-    Mechanism,
-    Status,
-    compute_readings,
-    forward_trials,
-    inverse_trials,
-    read_coordinates,
-)
+from loopcal.mechanism import Mechanism, Status, forward_trials
 from loopcal.numerics.chi_square import compute_chi_square_tail, compute_f_tail
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.typing import FloatArray, IntArray
@@ -58,11 +50,6 @@ EQUAL = 1e-6
 """Relative difference up to which fixed values, and poses of two robot files, are equal: files
 state some seven digits.
 """
-POSES, NEAR = 8, 0.05
-"""Poses at which two robot files are compared, and their distance from home: a share of the
-robot's size, or radians.
-"""
-DRAWN_POSES = 5  # purpose of a random stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +63,13 @@ class ValueComparison:
     error : the same without the unobservable directions [SI].
     tolerances : `error` in tolerances [1].
     dropped : the unobservable directions with a part of these parameters, as combinations.
-    degrees : number of directions that are compared.
+    compared : number of directions that the data determine.
+    degrees : number of directions that are tested: those of them that were estimated.
     chi_square : of the differences, divided by their posterior uncertainty; NaN without intervals.
     p_value : probability of a larger chi-square (with estimated noise: of a larger F) if the given
         values are right; NaN where it cannot be decided.
+    second_order : chi-square of what the linear test leaves out, see `measure_second_order`; the
+        test decides only where its answer does not depend on this: `is_linear`.
     noise : what the uncertainty is based on: "given", "estimated", or "widened" where the residuals
         exceed the stated noise.
     sigma : the largest difference in a single direction [posterior standard deviations].
@@ -91,9 +81,12 @@ class ValueComparison:
     error: FloatArray
     tolerances: FloatArray
     dropped: tuple[Combination, ...]
+    compared: int
     degrees: int
     chi_square: float
     p_value: float
+    second_order: float
+    is_linear: bool
     noise: str
     sigma: float
     direction: tuple[str, ...]
@@ -103,12 +96,14 @@ class ValueComparison:
         """Root mean square of the error in tolerances over the compared directions; NaN without
         any.
         """
-        return float(np.sqrt(np.sum(self.tolerances**2) / self.degrees)) if self.degrees else np.nan
+        if not self.compared:
+            return float("nan")
+        return float(np.sqrt(np.sum(self.tolerances**2) / self.compared))
 
     @property
     def agrees(self) -> bool | None:
         """Whether the values agree with the estimate; None where it cannot be decided."""
-        return None if np.isnan(self.p_value) else self.p_value >= SIGNIFICANCE
+        return self.p_value >= SIGNIFICANCE if self.is_linear else None
 
     @property
     def finding(self) -> Finding:
@@ -116,7 +111,7 @@ class ValueComparison:
         return report_finding(
             "identifiability.compared-with-truth",
             parameters=len(self.names),
-            compared=self.degrees,
+            compared=self.compared,
             excluded=self._excluded,
         )
 
@@ -124,7 +119,8 @@ class ValueComparison:
     def outcome(self) -> Finding:
         """The outcome of the joint test in one sentence."""
         if self.agrees is None:
-            code = "comparison.undecided"
+            has_test = not np.isnan(self.p_value)
+            code = "comparison.not-linear" if has_test else "comparison.undecided"
         else:
             code = "comparison.agrees" if self.agrees else "comparison.differs"
         return report_finding(
@@ -136,6 +132,7 @@ class ValueComparison:
             tiny=self.p_value < TINY,
             noise=self.noise,
             sigma=self.sigma,
+            second_order=self.second_order,
             direction=self.direction,
             excluded=self._excluded,
         )
@@ -252,15 +249,9 @@ def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
             f"{stored.name!r} does not have the parameters of {robot.name!r}; give a robot file of "
             "the same family and structure, or only the values to compare"
         )
-    home = read_coordinates(robot.home[None], robot.controlled)[0]
-    drawn = make_random_stream(0, 0, DRAWN_POSES).uniform(-1.0, 1.0, (POSES, len(home)))
-    is_length = np.isin(robot.controlled, POSITION)
-    target = home + drawn * np.where(is_length, NEAR * robot.size, NEAR)
-    known = robot.values[None]
-    reached = inverse_trials(robot, known, target[None])
-    q = compute_readings(robot, known, reached)
+    known, q = robot.values[None], draw_readings(robot)
     states = [forward_trials(one, known, q) for one in (robot, stored)]
-    is_reached = np.all([s.status[0] == Status.CONVERGED for s in (reached, *states)], axis=0)
+    is_reached = np.all([s.status[0] == Status.CONVERGED for s in states], axis=0)
     mine, theirs = (state.T[0][is_reached] for state in states)
     apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max(initial=0.0)
     if is_reached.any() and apart <= EQUAL * robot.size:
@@ -283,27 +274,41 @@ def _compare(fit: Identification, at: IntArray, given: FloatArray) -> ValueCompa
     posterior, tolerance = fit.posterior, fit.tolerance[at]
     raw = fit.estimate[at] - given
     parts = (posterior.unit[at] / tolerance)[:, None] * posterior.directions[at]
-    is_open = ~posterior.determined
-    comparable = _find_complement(parts[:, is_open])
-    y = comparable.T @ (raw / tolerance)
+    comparable = _find_complement(parts[:, ~posterior.determined])
+    z = comparable @ (comparable.T @ (raw / tolerance))
+    # a direction that a truncation leaves out is determined, but not estimated
+    is_open = ~posterior.determined | np.isinf(posterior.variance)
+    tested = _find_complement(parts[:, is_open])
+    y = tested.T @ (raw / tolerance)
     known = np.where(is_open, 0.0, posterior.variance)
-    whitened, u = np.full(len(y), np.nan), np.eye(len(y))
+    whitened, u, second_order = np.full(len(y), np.nan), np.eye(len(y)), np.nan
     if np.isfinite(known).all() and len(y):
-        u, s, _ = np.linalg.svd(comparable.T @ (parts * np.sqrt(known)), full_matrices=False)
+        scaled = parts * np.sqrt(known)
+        u, s, wt = np.linalg.svd(tested.T @ scaled, full_matrices=False)
         whitened = (u.T @ y) / s
+        # the most probable change of all parameters with this difference of the compared ones
+        change = posterior.directions @ (np.sqrt(known) * (wt.T @ whitened))
+        second_order = measure_second_order(posterior, posterior.unit * change)
     chi_square = float(np.sum(whitened**2))
     names = tuple(fit.names[i] for i in at)
-    sigma, direction = _name_largest(names, comparable @ u, whitened)
+    sigma, direction = _name_largest(names, tested @ u, whitened)
     is_cut = comparable.shape[1] < len(names)
+    p_value, *bounds = (
+        _compute_p_value(fit.residual_test, len(y), max(root, 0.0) ** 2)
+        for root in np.sqrt(chi_square) + np.array([0.0, -1.0, 1.0]) * np.sqrt(second_order)
+    )
     return ValueComparison(
         names=names,
         raw=raw,
-        error=comparable @ y * tolerance,
-        tolerances=comparable @ y,
+        error=z * tolerance,
+        tolerances=z,
         dropped=tuple(c for c in fit.unidentifiable if is_cut and set(names) & set(c.names)),
+        compared=comparable.shape[1],
         degrees=len(y),
         chi_square=chi_square,
-        p_value=_compute_p_value(fit.residual_test, len(y), chi_square),
+        p_value=p_value,
+        second_order=second_order,
+        is_linear=len({bound >= SIGNIFICANCE for bound in bounds}) == 1 and p_value >= 0.0,
         noise="widened" if fit.residual_test.failed else fit.residual_test.noise,
         sigma=sigma,
         direction=direction,
