@@ -24,7 +24,7 @@ def run(root, tmp_path, monkeypatch, capsys):
     def call(words: str) -> tuple[int, str]:
         code = main(words.split())
         out, err = capsys.readouterr()
-        return code, " ".join((out + err).split())
+        return code, " ".join((err if code == 1 else out).split())
 
     return call
 
