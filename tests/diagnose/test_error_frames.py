@@ -234,6 +234,16 @@ def test_pose_in_the_instrument_frame_has_the_error_of_both():
     assert np.sqrt((stated.position**2).mean()) == pytest.approx(rms, rel=0.25)
 
 
+def test_a_stated_frame_is_no_reference_where_an_unknown_anchor_leaves_the_base_open():
+    _, fit = calibrate(
+        instrument("distance", anchor=np.array([0.5, 0.3, 0.2]), unknown=("anchor",))
+    )
+    assert not fit.posterior.frames.instruments
+    assert fit.posterior.frames.unfixed.shape[1] == 9
+    with pytest.raises(EstimationError, match=r"frame is 'frame'.* 'relative'$"):
+        pose_uncertainty(fit, sample_workspace(fit.robot, 2, 7).coordinates, frame="frame")
+
+
 def test_frames_survive_the_run_folder():
     _, fit = three_targets()
     back = posterior_from_arrays(fit.robot, fit.arrays())

@@ -128,6 +128,9 @@ def find_measured_frames(
     eliminated = None if linearization is None else linearization.nuisance
     local = None if problem.nuisance is None else problem.nuisance.local
     frames = _describe_instruments(problem.free, data, local, eliminated, noise)
+    if np.linalg.norm(unfixed[:6]) > UNFIXED:
+        # a stated frame is that of the base, which something else leaves open, such as an anchor
+        frames = {name: frame for name, frame in frames.items() if frame.own.any()}
     return MeasuredFrames(unfixed, readings, frames)
 
 
