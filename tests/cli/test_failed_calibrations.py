@@ -160,7 +160,10 @@ def write_printer(wrong: float = 0.0) -> None:
     Path("printer.cfg").write_text("\n".join(lines) + "\n")
 
 
-IMPORT = "import printer.cfg -o p.yaml --data heights.csv --corrected corrected.cfg --sigma-height 0.01mm"
+IMPORT = (
+    "import printer.cfg -o p.yaml --data heights.csv --corrected corrected.cfg "
+    "--sigma-height 0.01mm"
+)
 
 
 def test_import_corrects_a_file_where_the_calibration_passes(tmp_path, monkeypatch) -> None:

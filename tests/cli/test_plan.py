@@ -67,7 +67,7 @@ def test_sheet_states_commands_that_agree_with_the_data_file(folder):
     data = read_rows(folder / "plan" / "measurements.csv")
     assert [row["pose"] for row in sheet] == [row["pose"] for row in data]
     assert [row["use"] for row in sheet] == [row["use"] for row in data]
-    assert [row["use"] for row in data].count("held-out") == 2
+    assert [row["use"] for row in data].count("held-out") == 5  # a verdict needs five
     assert all(row["x [mm]"] == "" for row in data)
     headers = [
         f"{name} [{unit}]"
@@ -225,7 +225,6 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(folder, 
             "--frames cannot be combined with --measure plane-line",
         ),
         ("--measure plane-line --points 3", "give at least 4"),
-        ("--measure plane-line --groups 1 --points 4", "plan at least"),
         ("--min-margin 2", "share of the median"),
         ("--max-tilt -3deg", "angle above 0"),
         ("--seen-from 1m,2m", "give three numbers"),

@@ -58,6 +58,6 @@ def test_python_code_of_the_page_runs(page, capsys) -> None:
     exec(block[1], names)  # noqa: S102
     assert names["plan"].n_poses == 12
     assert (
-        "12 poses of printer for calibration and 3 for validation (component)"
+        "12 poses of printer for calibration and 5 for validation (component)"
         in capsys.readouterr().out
     )

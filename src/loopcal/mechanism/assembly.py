@@ -281,10 +281,10 @@ def _check_freedoms(assembly: Assembly) -> None:
     rotations = [f for f in freedoms if f.startswith("r")]
     if len(rotations) == 2:
         raise MechanismError(
-            f"{assembly.name} has the freedoms {' and '.join(rotations)}, which define no pose: the "
-            "same two rotations in another order lead to another one. Let the platform have all "
-            "freedoms, and add a limb with the joint that holds it, such as {joint: U, axes: [x, "
-            "y]} with the ending rigid"
+            f"{assembly.name} has the freedoms {' and '.join(rotations)}, which define no pose: "
+            "the same two rotations in another order lead to another one. Let the platform have "
+            "all freedoms, and add a limb with the joint that holds it, such as {joint: U, axes: "
+            "[x, y]} with the ending rigid"
         )
     if not assembly.controlled:
         raise MechanismError(

@@ -34,7 +34,7 @@ class PlanOptions:
     goal : expected error of `target` to reach [m, rad], root mean square over the workspace; the
         plan then has the smallest number of poses that reaches it.
     hold_out : number of further poses for validation, drawn evenly; default one for four poses of
-        the fit.
+        the fit, and at least 5, which a verdict needs.
     frame : in which errors are stated: "fitted", after the best rigid fit of the base and platform
         frames as far as no measurement determines them; "base", the base frame of the robot file;
         "relative", relative to the home pose.

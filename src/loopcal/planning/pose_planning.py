@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument
@@ -46,7 +47,9 @@ DIGITS = 8
 EXTENSIONS = 12
 """Largest number of times that poses are added where a goal is missed because some are held out."""
 FITTED_PER_HELD_OUT = 4
-"""Poses of the fit for each validation pose, by default."""
+"""Poses of the fit for each validation pose, by default. At least FEW_ROWS poses are held out: fewer
+leave the verdict of a calibration undecided.
+"""
 
 
 def plan(
@@ -172,7 +175,8 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
 def _require_numbers(problem: PlanningProblem, n_poses: int) -> int:
     """Return the number of poses to hold out; refuse impossible numbers."""
     k, hold_out = problem.poses_per_group, problem.options.hold_out
-    n_held_out = n_poses // FITTED_PER_HELD_OUT // k * k if hold_out is None else hold_out
+    default = max(n_poses // FITTED_PER_HELD_OUT // k, -(-FEW_ROWS // k)) * k
+    n_held_out = default if hold_out is None else hold_out
     for use, number, least in (("for the fit", n_poses, 1), ("to hold out", n_held_out, 0)):
         if number < least or number % k:
             multiples = (
