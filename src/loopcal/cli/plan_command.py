@@ -83,7 +83,8 @@ EXCLUDED_BY_PLANE_LINE = {
     "--hold-out",
     type=int,
     metavar="N",
-    help="Number of further poses for validation, drawn evenly.  [default: one for four, at least 5]",
+    help="Number of further poses for validation, drawn evenly.  "
+    "[default: one for four, at least 5]",
 )
 @data_option("--like", "Measurement file whose settings describe the instrument.")
 @unknown_options

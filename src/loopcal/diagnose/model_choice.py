@@ -173,8 +173,8 @@ def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
 def list_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
     """Return the nested sets of a robot, and the set that its controller stores, by size.
 
-    The controller's set, `Assembly.stored_parameters`, takes the place of a nested one that is equal.
-    Parameters that are fixed are left out.
+    The controller's set, `Assembly.stored_parameters`, takes the place of a nested one that is
+    equal. Parameters that are fixed are left out.
     """
     sets = nest_parameter_sets(robot)
     free = [p.name for p in robot.parameters.entries if p.free]

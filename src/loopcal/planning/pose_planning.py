@@ -47,8 +47,8 @@ DIGITS = 8
 EXTENSIONS = 12
 """Largest number of times that poses are added where a goal is missed because some are held out."""
 FITTED_PER_HELD_OUT = 4
-"""Poses of the fit for each validation pose, by default. At least FEW_ROWS poses are held out: fewer
-leave the verdict of a calibration undecided.
+"""Poses of the fit for each validation pose, by default. At least FEW_ROWS poses are held out:
+fewer leave the verdict of a calibration undecided.
 """
 
 
