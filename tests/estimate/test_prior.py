@@ -29,6 +29,7 @@ def join_measurements(a, b):
         readings=np.vstack([a.readings, b.readings]),
         observations=(*a.observations, rows),
         block=np.arange(a.n_poses + b.n_poses),
+        is_held_out=np.zeros(a.n_poses + b.n_poses, dtype=bool),
         labels=tuple(str(i) for i in range(a.n_poses + b.n_poses)),
     )
 
