@@ -9,14 +9,15 @@ import pytest
 from scipy.optimize import least_squares
 
 from loopcal import geometry, load_robot, pose_uncertainty
-from loopcal.diagnose import estimate_calibration_gain
+from loopcal.diagnose import estimate_calibration_gain, frame_motions
 from loopcal.diagnose.error_frames import fit_unfixed_frames
+from loopcal.diagnose.frame_motions import probe_readings
 from loopcal.errors import EstimationError
 from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from
 from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.inference.posterior import posterior_from_arrays
 from loopcal.measure import KINDS, Gaussian, Instrument, Sensor, StatedValue, sample_truth, simulate
-from loopcal.mechanism import forward, inverse, sample_workspace
+from loopcal.mechanism import find_directly_reachable, forward, inverse, sample_workspace
 from loopcal.planning import PlanOptions, plan
 
 SIGMA = 5e-6
@@ -51,6 +52,20 @@ def calibrate(measured_by, seed=3, name="hexapod-42"):
 @cache
 def three_targets(seed=3):
     return calibrate(instrument("position", **THREE_TARGETS), seed)
+
+
+@pytest.mark.parametrize("name", ["hexapod-nategh-agheli", "rotary-delta", "3-prs"])
+def test_probed_poses_are_reached_from_home_without_following_a_path(name):
+    robot = load_robot(name)
+    readings = probe_readings(robot)
+    assert len(readings) >= 12
+    assert find_directly_reachable(robot, robot.values[None], readings[None]).all()
+
+
+def test_probed_poses_shrink_about_home_until_half_of_them_are_reached(monkeypatch):
+    monkeypatch.setattr(frame_motions, "SPREAD_LENGTH", 2.0)
+    robot = load_robot("hexapod-42")
+    assert len(probe_readings(robot)) >= 12
 
 
 KNOWN_POINT = np.array([[0.02, 0.01, 0.03]])

@@ -2,6 +2,7 @@
 """Setup parameters (frames, targets, surfaces), linked poses and joint sensors in the fit."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,12 +186,38 @@ def test_intervals_of_robot_and_frame_contain_the_truth():
         # same
         assert np.isinf(sd).sum() == 6
         (finding,) = fit.nuisance.report_unobservable()
-        assert finding.code == "setup.unobservable"
+        assert finding.code == "setup.common-displacement"
         assert finding.data["names"] == ["frame", "target"]
     assert all(fit.converged for fit in fits)
     # intervals of one fit are correlated: the band is that of as many draws as there are fits, at
     # four standard deviations
     assert np.mean(inside) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / len(fits)))
+
+
+def fit_targets(name, unknown, drop=()):
+    """Return the codes of findings on the setup of a robot with two targets in a tracker frame."""
+    robot, _, poses = make_machine(name, 25)
+    places = np.array([[0.06, 0.0, 0.01], [-0.03, 0.05, 0.02]])
+    kind = lc.KINDS["position"](targets=("a", "b"), places=places, unknown=unknown, frame="tracker")
+    instrument = Instrument((make_sensor(kind, Gaussian, 20 * UM),))
+    data = simulate(robot, poses, instrument, 1)
+    if drop:
+        (rows,) = data.observations
+        measured = rows.measured.copy()
+        measured[:, list(drop)] = np.nan
+        data = replace(data, observations=(replace(rows, measured=measured),))
+    return [f.code for f in identify(robot, data, MAP()).nuisance.report_unobservable()]
+
+
+@pytest.mark.parametrize("name", ["rotary-delta", "five-bar", "3-rrr"])
+def test_displacements_that_no_pose_shows_are_harmless(name):
+    assert fit_targets(name, ("frame", "targets")) == ["setup.common-displacement"]
+
+
+def test_a_target_that_is_never_measured_is_not_harmless():
+    assert fit_targets("rotary-delta", ("targets",), (3, 4, 5)) == ["setup.unobservable"]
+    both = fit_targets("rotary-delta", ("frame", "targets"), (3, 4, 5))
+    assert both == ["setup.unobservable"]
 
 
 @pytest.mark.parametrize("block", [16, 512])

@@ -291,9 +291,8 @@ def reference_poses(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     They are the measured poses; poses about home where a run folder does not name these.
     """
     robot, frames = posterior.robot, posterior.frames
-    readings = probe_readings(robot)
-    if frames is not None and len(frames.readings):
-        readings = frames.readings
+    is_named = frames is not None and len(frames.readings) > 0
+    readings = frames.readings if is_named else probe_readings(robot)
     state = forward_trials(robot, robot.values[None], readings[None])
     reached = state.status[0] == Status.CONVERGED
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]

@@ -26,6 +26,7 @@ from loopcal.mechanism import (
     Status,
     compute_readings,
     differentiate_pose,
+    find_directly_reachable,
     forward_trials,
 )
 from loopcal.typing import BoolArray, FloatArray
@@ -38,6 +39,9 @@ directions in question.
 
 SPREAD_LENGTH, SPREAD_ANGLE = 0.05, 0.1
 """Range of the readings of these poses to each side of home, in robot sizes and radians."""
+
+SHARES = (1.0, 0.1, 0.01)
+"""Shares of this range that are tried, until half of the poses are reached."""
 
 NO_MOTION = 1e-8
 """Share of the motion by all parameters below which a motion counts as none: the square root of
@@ -78,7 +82,7 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
         probe_readings(posterior.robot),
         posterior.robot.values,
     )
-    state = forward_trials(robot, values[None], readings[None])
+    state = forward_trials(robot, values[None], readings[None], follow=False)
     D = differentiate_pose(robot, values[None], readings[None], state).parameters[0]
     usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
     if not usable.any():
@@ -111,8 +115,7 @@ def twist_weights(robot: Mechanism) -> FloatArray:
 
 def probe_workspace(free: FreeParameters, joints: Iterable[str] = ()) -> ObservedPoses:
     """Return poses about home with evenly spread readings, without those out of reach."""
-    poses = observe_poses(free, probe_readings(free.robot), joints)
-    return observe_poses(free, poses.readings[poses.is_reached], joints)
+    return observe_poses(free, probe_readings(free.robot), joints)
 
 
 def interpret_combinations(
@@ -165,13 +168,23 @@ def _gauge_projector(gauge: FloatArray, infinite: BoolArray) -> FloatArray:
 
 
 def probe_readings(robot: Mechanism) -> FloatArray:
-    """Return readings (PROBES, a) about those of home."""
+    """Return readings (n, a) about those of home that the robot reaches, at most `PROBES`.
+
+    The range shrinks until half of them are reached. Those that Newton's method does not reach from
+    home are left out: following a path to each of them would take longer than all the rest.
+    """
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     spread = [
         SPREAD_LENGTH * robot.size if a.dimension is Dimension.LENGTH else SPREAD_ANGLE
         for a in robot.actuators
     ]
-    return home + np.random.default_rng(0).uniform(-1.0, 1.0, (PROBES, len(home))) * spread
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (PROBES, len(home))) * spread
+    for share in SHARES:
+        readings = home + share * drawn
+        reached = find_directly_reachable(robot, robot.values[None], readings[None])[0]
+        if reached.mean() >= 0.5:
+            break
+    return readings[reached]
 
 
 def _weigh_motions(

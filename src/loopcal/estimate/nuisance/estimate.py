@@ -19,11 +19,12 @@ from loopcal.estimate.inference.null_space import Combination, sparsify_basis
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance.elimination import NuisanceElimination
 from loopcal.findings import Finding, report_finding
+from loopcal.measure.kinds.setup_parameters import ROTATION_AXES
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import find_unit
+from loopcal.units import Dimension, find_unit
 
 SMALLEST_EFFECT = 1e-7
 """Share of all that the machine does to a nuisance parameter below which a direction does not move
@@ -47,6 +48,8 @@ class NuisanceEstimate:
     is_unobservable : (U,) parameters with a part in a direction that no row determines, whatever
         the machine.
     display : factor to SI and symbol of the unit in which each is shown.
+    is_harmless : whether the unobservable directions only displace targets and frames together,
+        along directions that the platform never turns: no pose of this robot shows them.
     """
 
     table: ParameterTable
@@ -57,6 +60,7 @@ class NuisanceEstimate:
     root: FloatArray
     is_unobservable: BoolArray
     display: tuple[tuple[float, str], ...]
+    is_harmless: bool = False
 
     def __len__(self) -> int:
         return len(self.table)
@@ -108,7 +112,8 @@ class NuisanceEstimate:
         owners = _owners(
             n for n, lost in zip(self.names, self.is_unobservable, strict=True) if lost
         )
-        return (report_finding("setup.unobservable", names=owners),) if owners else ()
+        code = "setup.common-displacement" if self.is_harmless else "setup.unobservable"
+        return (report_finding(code, names=owners),) if owners else ()
 
 
 def empty_nuisance_estimate(parameters: int) -> NuisanceEstimate:
@@ -171,6 +176,7 @@ def estimate_nuisance(
         done.joint_root()[0] * np.sqrt(noise),
         is_unobservable,
         shown,
+        _only_displaces(robot, table, is_unobservable, int(is_free.sum() - done.rank[0])),
     )
 
 
@@ -190,6 +196,22 @@ def add_followers(
         names = _owners(n for n, m in zip(nuisance.names, moved, strict=True) if m)
         described.append(replace(combination, nuisance=tuple(names)))
     return tuple(described)
+
+
+def _only_displaces(
+    robot: Mechanism, table: ParameterTable, is_unobservable: BoolArray, count: int
+) -> bool:
+    """Return whether `count` unobservable directions are common displacements of targets and
+    frames along directions that the platform never turns: all three where it only translates, and
+    the axis where it has one rotation.
+    """
+    lost = [p for p, is_lost in zip(table.entries, is_unobservable, strict=True) if is_lost]
+    rotations = sum(freedom in ROTATION_AXES for freedom in robot.freedoms)
+    return (
+        count <= {0: 3, 1: 1}.get(rotations, 0)
+        and all(p.dimension is Dimension.LENGTH for p in lost)
+        and len(_owners(p.name for p in lost)) > 1
+    )
 
 
 def _owners(names: Iterable[str]) -> list[str]:
