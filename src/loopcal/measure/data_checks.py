@@ -32,6 +32,11 @@ so that a probe touches a surface, a bar keeps its length, or the platform stays
 from nominal then predicts a small change of a large motion.
 """
 
+LARGEST_TILT = 0.25
+"""Largest rotation of the base [rad], and displacement in sizes of the robot, with which values count
+as constant by design. End stops that are wrong by millimeters tilt the bed of a printer.
+"""
+
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
     """Refuse readings that do not have one column for each actuator.
@@ -160,7 +165,8 @@ def check_targets_move(
 
     A reflector on the floor, a frozen display or the column of another target give such values. Any
     fit to them is wrong. Values that are constant by design are accepted: by the given geometry,
-    the poses change them by less than `CONSTANT_SHARE` of what the motion of the platform could.
+    the poses change them by less than `CONSTANT_SHARE` of what the motion of the platform could,
+    perhaps after a small rigid motion of the base.
 
     Parameters
     ----------
@@ -187,7 +193,7 @@ def check_targets_move(
         expected = np.ptp(predicted[static.present][:, static.columns], axis=0)
         possible = _find_possible_change(static, T[rows.rows], size)
         moves = (expected > MOVING_SIGMAS * static.noise) & (expected > CONSTANT_SHARE * possible)
-        if np.any(moves):
+        if np.any(moves) and not _is_rigid_motion(static, predicted, possible, T[rows.rows], size):
             worst = int(np.argmax(np.where(moves, expected / static.noise, 0.0)))
             shown = DISPLAY_UNITS[kind.columns[static.columns[worst]].dimension]
             moved, planned = (
@@ -245,6 +251,30 @@ def _find_possible_change(static: _StaticTarget, T: FloatArray, size: float) -> 
         np.linalg.norm(J[:, static.columns].reshape(len(T), -1, 2, 3), axis=-1), axis=0
     ).T
     return by_rotation * max(angle, d / size) + by_translation * d
+
+
+def _is_rigid_motion(
+    static: _StaticTarget, predicted: FloatArray, possible: FloatArray, T: FloatArray, size: float
+) -> bool:
+    """Return whether a small rigid motion of the base turns the predicted values into constants.
+
+    Predicted values (r, columns) [SI] of poses T (r, 4, 4) are linearized in this motion; see
+    `CONSTANT_SHARE` and `LARGEST_TILT`.
+    """
+    kind, h = static.rows.kind, 1e-6
+    motions = np.tile(np.eye(4), (6, 1, 1))
+    motions[:3, :3, :3] = geometry.exp_so3(h * np.eye(3))
+    motions[3:, :3, 3] = h * np.eye(3)
+    noise = np.zeros((6, len(T), len(kind.noise_columns)))
+    moved = kind.measure(motions[:, None] @ T, noise)
+    at = np.ix_(static.present, static.columns)
+    slope = np.stack([(values[at] - predicted[at]).ravel() / h for values in moved], axis=1)
+    change = predicted[at] - static.rows.measured[at]
+    motion = np.linalg.lstsq(slope, -change.ravel(), rcond=1e-6)[0]
+    rest = change + (slope @ motion).reshape(change.shape)
+    is_constant = np.ptp(rest, axis=0) <= CONSTANT_SHARE * possible
+    turn, shift = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:]) / size
+    return bool(is_constant.all() and max(turn, shift) <= LARGEST_TILT)
 
 
 def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:

@@ -239,6 +239,28 @@ def test_values_that_are_constant_by_design_are_accepted_and_frozen_ones_are_not
     assert refused.value.code == "conventions.target-never-moves"
 
 
+@pytest.mark.parametrize(("tilt", "is_accepted"), [(0.12, True), (0.5, False)])
+def test_heights_of_a_tilted_bed_are_constant_by_design(tilt, is_accepted):
+    """End stops that are wrong by millimeters tilt the bed, here by more than a tenth of its size.
+    A frozen display of heights, whose poses lie in no plane, is refused.
+    """
+    kind, n = Component(("z",)).with_tool(np.eye(4)), 12
+    rng = np.random.default_rng(3)
+    coordinates = np.zeros((n, 6))
+    coordinates[:, :2] = 0.07 * rng.uniform(-1.0, 1.0, (n, 2))
+    rows = Observations.from_sigma(kind, np.arange(n), np.zeros((n, 1)), 2e-5)
+    data = Measurements("toy", np.arange(float(n))[:, None], (rows,))
+    coordinates[:, 2] = 0.003 + tilt * coordinates[:, 0] + 0.5 * coordinates[:, 1] ** 2
+    if is_accepted:
+        check_targets_move(data, zoo.make_poses(coordinates), SIZE)
+    else:
+        with pytest.raises(DataError, match="never moves"):
+            check_targets_move(data, zoo.make_poses(coordinates), SIZE)
+    coordinates[:, 2] = 0.12 * rng.uniform(-0.1, 0.1, n)
+    with pytest.raises(DataError, match="never moves"):
+        check_targets_move(data, zoo.make_poses(coordinates), SIZE)
+
+
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_poses_in_one_plane_give_unidentifiable_combinations_or_a_refusal(kind):
     """Poses without rotation at one height leave combinations unidentifiable in every kind.
