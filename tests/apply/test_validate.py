@@ -201,6 +201,10 @@ def test_diverged_geometry_and_unreachable_readings_have_different_errors():
         validate(diverged, data, before=robot)
     assert error.value.code == "residuals.calibrated-out-of-reach"
     assert error.value.args[0].data["before"] == 4
+    with pytest.raises(DataError) as error:
+        validate(robot, data, before=diverged)
+    assert error.value.code == "residuals.before-out-of-reach"
+    assert error.value.args[0].data["after"] == 4
     far = replace(data, readings=data.readings + np.array([10.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     with pytest.raises(DataError) as error:
         validate(robot, far)

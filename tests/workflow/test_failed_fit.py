@@ -4,10 +4,12 @@
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.estimate import MAP, FitOptions, Huber, Identification, LeastSquares, identify
 from loopcal.measure import Measurements
 from loopcal.report.calibration_view import view_calibration, view_fit
@@ -98,3 +100,28 @@ def test_chi_square_of_a_loss_is_that_of_the_weighted_residuals():
     assert fit.chi_square == pytest.approx((fit.pose_weights * squares).sum(), rel=1e-4)
     assert fit.chi_square < 0.9 * squares.sum()
     assert "weighted residuals" in fit.describe_statistics()
+
+
+def test_fit_that_leads_away_from_a_geometry_without_poses_is_not_called_a_failure(tmp_path):
+    """The nominal anchors close no pose, the calibrated ones all: nothing is there to compare with,
+    but the calibrated geometry is good, and a second calibration can begin with it."""
+    shipped = lc.load_robot("cable-4")
+    truth = shipped.with_values(lc.sample_truth(shipped, 1, 1)[0])
+    noise = lc.Gaussian(np.array([5e-5] * 3 + [1e-5] * 3))
+    instrument = lc.Instrument((lc.Sensor(lc.Pose(), noise),))
+    data = lc.simulate(truth, lc.sample_workspace(shipped, 12, 1).coordinates, instrument, 1)
+    text = (Path(lc.__file__).parent / "robots" / "cable-4.yaml").read_text("utf-8")
+    for old, new in (("[0, -1500, -120]", "[0, -900, -120]"), ("[1300, 750,", "[900, 1100,")):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "far.yaml").write_text(text)
+    options = CalibrationOptions(check_conventions=False)
+    first = calibrate(lc.load_robot(tmp_path / "far.yaml"), data, options)
+    assert first.verdict is Verdict.UNDECIDED
+    assert first.fitted_errors is None
+    (finding,) = [f for f in first.findings if f.code == "workflow.nothing-to-validate"]
+    assert "before calibration reaches none of the 12 poses, the calibrated one 12" in str(finding)
+    lc.save_robot(first.identification.robot, tmp_path / "corrected.yaml")
+    second = calibrate(lc.load_robot(tmp_path / "corrected.yaml"), data, options)
+    assert second.fitted_errors is not None
+    assert len(second.fitted_errors.poses) == 12

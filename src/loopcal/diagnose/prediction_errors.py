@@ -312,9 +312,11 @@ def _explain_unreached(
     robot: Mechanism, predictable: BoolArray, before: BoolArray, after: BoolArray
 ) -> Finding:
     """Return why no pose is left: readings are missing, or a geometry does not reach it."""
-    poses, reached = len(predictable), int(before.sum())
+    poses, reached, calibrated = len(predictable), int(before.sum()), int(after.sum())
     if not predictable.any():
         return report_finding("residuals.readings-missing", robot=robot.name, poses=poses)
+    if not reached and calibrated:
+        return report_finding("residuals.before-out-of-reach", poses=poses, after=calibrated)
     if not reached:
         return report_finding("residuals.poses-out-of-reach", robot=robot.name, poses=poses)
     return report_finding(
@@ -322,5 +324,5 @@ def _explain_unreached(
         robot=robot.name,
         poses=poses,
         before=reached,
-        after=int(after.sum()),
+        after=calibrated,
     )

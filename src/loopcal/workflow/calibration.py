@@ -42,8 +42,13 @@ from loopcal.workflow.data_split import DataSplit, split_data
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
 """Codes of data that a geometry cannot reach."""
 
-NOTHING_TO_COMPARE = ("residuals.readings-missing", "residuals.no-rows-to-predict")
-"""Codes of data that are needed to locate the poses, so that nothing is left to compare."""
+NOTHING_TO_COMPARE = (
+    "residuals.readings-missing",
+    "residuals.no-rows-to-predict",
+    "residuals.before-out-of-reach",
+)
+"""Codes of data that leave nothing to compare: all values locate the poses, or the initial geometry
+reaches none of these."""
 
 STEPS = 5
 """Steps that the progress callback counts: conventions, model, fit, examination, suggestions."""
