@@ -53,5 +53,5 @@ def test_every_command_of_the_first_half_hour_runs(capsys) -> None:
 
 
 def test_table_of_commands_is_complete() -> None:
-    listed = set(re.findall(r"^\| `loopcal ([a-z]+)", README, re.MULTILINE))
+    listed = set(re.findall(r"^\| `loopcal ([a-z-]+)", README, re.MULTILINE))
     assert listed == set(commands.list_commands(click.Context(commands)))

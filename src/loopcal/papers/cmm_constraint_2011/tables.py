@@ -128,7 +128,6 @@ def make_tables(results: Results) -> tuple[Table, ...]:
             "",
             errors=ERRORS / MM,
             covariance=forms.covariance,
-            machines=forms.machines,
         ),
         _list_arithmetic(words, results.printed),
     )

@@ -216,8 +216,10 @@ def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
                for name, noise in (("loud", max(noises)), ("calm", min(noises)))},
         ),
         words.judge(
-            "converged", converged=min(row.converged for row in forms.rows),
-            machines=forms.machines, most=max(row.iterations for row in forms.rows),
+            "converged", hardest=forms.hardest, noise=forms.hardest.noise / MM,
+            converged=sum(row.converged for row in forms.others),
+            fits=sum(row.machines for row in forms.others),
+            most=max(row.iterations for row in forms.rows),
             ranks=sorted({rank for row in forms.rows for rank in row.ranks}),
             noises=[f"{noise:g}" for noise in sorted(set(noises))],
         ),
