@@ -52,6 +52,14 @@ def test_every_command_of_the_first_half_hour_runs(capsys) -> None:
         assert capsys.readouterr().err == ""
 
 
+def test_demo_prints_what_the_readme_shows(capsys) -> None:
+    block = re.search(r"^```\n(Calibrated: .*?)^```", README, re.MULTILINE | re.DOTALL)
+    assert block
+    data = "examples/hexapod-42/measurements.csv"
+    assert main(["calibrate", "hexapod-42", data, "-o", "run", "--hold-out", "0.25"]) == 0
+    assert capsys.readouterr().out.startswith(block[1])
+
+
 def test_table_of_commands_is_complete() -> None:
     listed = set(re.findall(r"^\| `loopcal ([a-z-]+)", README, re.MULTILINE))
     assert listed == set(commands.list_commands(click.Context(commands)))
