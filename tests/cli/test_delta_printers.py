@@ -155,6 +155,24 @@ def test_import_reports_a_stored_geometry_that_is_not_optimal(import_record) -> 
     assert "arm3.length 215.7964 -> 215.6702" in out
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("factor", [1 / 25.4, 0.1])
+def test_import_of_distances_in_another_unit_shows_no_warnings_of_numpy(
+    tmp_path, data_folder, monkeypatch, factor
+) -> None:
+    """The fit to such distances passes radii that are longer than the arms."""
+    monkeypatch.chdir(tmp_path)
+    text = format_printer_cfg(read_records(data_folder)[WITH_DISTANCES])
+    lines = [
+        f"{line.split(' = ')[0]} = {factor * float(line.split(' = ')[1])}"
+        if re.match(r"#\*# distance\d+ = ", line)
+        else line
+        for line in text.splitlines()
+    ]
+    Path("printer.cfg").write_text("\n".join(lines) + "\n")
+    assert main("import printer.cfg -o p.yaml --data p.csv".split()) == 0
+
+
 def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
     quoted = page.split("compares the numbers of these lines -->\n```text\n")[1].split("```")[0]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import loopcal as lc
 from loopcal.diagnose import check_lack_of_fit, estimate_calibration_gain, find_correlated_groups
 from loopcal.estimate import LeastSquares, Tukey, identify
 from loopcal.measure import simulate
@@ -112,6 +113,19 @@ def test_calibration_with_a_coarse_instrument_is_not_worthwhile():
         estimate_calibration_gain(identify(hexapod(), poor, LeastSquares()), poor).position_after
         > 3 * fine.position_before
     )
+
+
+def test_orientation_that_a_delta_cannot_have_neither_decides_nor_appears():
+    """Its expected errors are rounding, 1e-16 degrees before and a third of that after."""
+    robot = lc.load_robot("linear-delta")
+    for sigma, is_worthwhile in ((1e-5, True), (0.05, False)):
+        instrument = lc.Instrument((lc.Sensor(lc.Component(("z",)), lc.Gaussian([sigma])),))
+        coordinates = lc.sample_workspace(robot, 20, 1).coordinates
+        data = simulate(robot, coordinates, instrument, 1)
+        gain = estimate_calibration_gain(identify(robot, data), data)
+        assert gain.is_worthwhile is is_worthwhile
+        assert gain.angle_before == gain.angle_after == 0.0
+        assert "orientation" not in str(gain.finding)
 
 
 def test_expected_error_before_calibration_agrees_with_drawn_robots():

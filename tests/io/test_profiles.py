@@ -90,6 +90,17 @@ def test_zero_without_a_floor_is_named_and_missing_sigma_stays_missing(tmp_path)
     assert read_rows(found.text) == ["P3,,9.75,8,4.5,5,205"]
 
 
+@pytest.mark.parametrize("floor", ["", ", floor: 0.002 mm"])
+def test_negative_sigma_does_not_become_the_floor(tmp_path, floor) -> None:
+    """Instruments write -1 where they know no uncertainty; the floor would be a confident one."""
+    profile = PROFILE.replace(", floor: 0.002 mm", floor)
+    export = EXPORT.replace("P3;4,5;5;205;;9,75", "P3;4,5;5;205;-1;9,75").replace("12,5;0", "12,5;1")
+    found = convert(tmp_path, export, profile)
+    assert "'sigma.x' is -1, but no standard deviation is negative" in found.misfits[-1][1]
+    found = convert(tmp_path, export, profile + "missing: [-1]\n")
+    assert not any("negative" in reason for _, reason in found.misfits)
+
+
 def test_factor_writes_no_more_than_seventeen_digits(tmp_path) -> None:
     third = PROFILE.replace("factor: 0.5", "factor: 0.3333333333333333")
     cells = read_rows(convert(tmp_path, profile=third).text)[0].split(",")

@@ -25,6 +25,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.diagnose.error_frames import FITTED, RELATIVE, choose_error_frame, solve_home
+from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.errors import MechanismError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import factor_known_setup, linearize_fit
@@ -37,9 +38,6 @@ from loopcal.units import Dimension
 
 POSES, SEED = 200, 0
 """Number of poses that are drawn from the workspace, and the seed of their draw."""
-
-ROUNDING = 1e-12
-"""Expected errors below this share of the robot's size, or this angle [rad], are rounding."""
 
 NEGLIGIBLE = 0.01
 """Share of an expected error below which the sentence leaves out a source."""

@@ -27,6 +27,9 @@ from loopcal.units import Dimension
 GAIN = 1.1
 """Factor by which an expected error must become smaller to count as an improvement."""
 
+ROUNDING = 1e-12
+"""Expected errors below this share of the robot's size, or this angle [rad], are rounding."""
+
 MOST_POSES = 200
 """Largest number of poses at which errors are predicted, evenly chosen."""
 
@@ -96,8 +99,9 @@ def estimate_calibration_gain(
     H = geometry.transport_matrix(T[:, :3, :3] @ fit.robot.tool[:3, 3])
     D = parameters[0, reached][..., free.places] * posterior.unit
     D, own = H @ chosen_frame.relate(D, T), H @ chosen_frame.own_errors(T)
-    angle_before, position_before = _rms_errors(D * (free.tolerance / posterior.unit))
-    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, own], axis=2))
+    size = fit.robot.size
+    angle_before, position_before = _rms_errors(D * (free.tolerance / posterior.unit), size)
+    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, own], axis=2), size)
     pairs = ((position_before, position_after), (angle_before, angle_after))
     is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)
     finding = report_finding(
@@ -117,11 +121,14 @@ def _unpredicted(code: str, **data: Any) -> CalibrationGain:
     return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
 
 
-def _rms_errors(factor: FloatArray) -> tuple[float, float]:
-    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k)."""
+def _rms_errors(factor: FloatArray, size: float) -> tuple[float, float]:
+    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k); 0 where
+    they are rounding, such as the orientation of a delta of this size [m].
+    """
     square = (factor**2).sum(axis=2)
     orientation = float(np.sqrt(square[:, :3].sum(axis=1).mean()))
-    return orientation, float(np.sqrt(square[:, 3:].sum(axis=1).mean()))
+    position = float(np.sqrt(square[:, 3:].sum(axis=1).mean()))
+    return orientation * (orientation > ROUNDING), position * (position > ROUNDING * size)
 
 
 def _quantities(

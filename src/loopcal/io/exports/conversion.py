@@ -265,6 +265,9 @@ def _scale_sigma(text: str, source: ColumnSource, name: str) -> str:
     if not text:
         return ""
     scaled = Decimal(text) * Decimal(repr(source.factor))
+    if scaled < 0:
+        act = "list this number under 'missing' if it means unknown"
+        raise Misfit(f"{name!r} is {text}, but no standard deviation is negative; {act}")
     if scaled < Decimal(source.least):
         return source.least
     if scaled <= 0:

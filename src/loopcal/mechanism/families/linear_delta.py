@@ -54,22 +54,27 @@ class TowerMap:
     def value(self, inputs: FloatArray) -> FloatArray:
         """Map (t, 4) [m, rad, m, m] to (t, 3) [m]."""
         radius, angle, arm, stop = inputs.T
-        return np.stack(
-            [radius * np.cos(angle), radius * np.sin(angle), stop + np.sqrt(arm**2 - radius**2)],
-            axis=1,
-        )
+        height = _compute_rise(arm, radius)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), stop + height], axis=1)
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
         """Return the derivative (t, 3, 4) at (t, 4)."""
         radius, angle, arm, _ = inputs.T
         c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(radius)
-        height = np.sqrt(arm**2 - radius**2)
+        height = _compute_rise(arm, radius)
         rows = [
             [c, -radius * s, zero, zero],
             [s, radius * c, zero, zero],
             [-radius / height, zero, arm / height, zero + 1.0],
         ]
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+
+def _compute_rise(arm: FloatArray, radius: FloatArray) -> FloatArray:
+    """Return how high rods rise over a radius [m]; NaN where they are too short for it."""
+    with np.errstate(invalid="ignore"):
+        rise = np.sqrt(arm**2 - radius**2)
+    return np.where(rise > 0.0, rise, np.nan)
 
 
 @dataclass(frozen=True)
