@@ -94,7 +94,9 @@ def test_zero_without_a_floor_is_named_and_missing_sigma_stays_missing(tmp_path)
 def test_negative_sigma_does_not_become_the_floor(tmp_path, floor) -> None:
     """Instruments write -1 where they know no uncertainty; the floor would be a confident one."""
     profile = PROFILE.replace(", floor: 0.002 mm", floor)
-    export = EXPORT.replace("P3;4,5;5;205;;9,75", "P3;4,5;5;205;-1;9,75").replace("12,5;0", "12,5;1")
+    export = EXPORT.replace("P3;4,5;5;205;;9,75", "P3;4,5;5;205;-1;9,75").replace(
+        "12,5;0", "12,5;1"
+    )
     found = convert(tmp_path, export, profile)
     assert "'sigma.x' is -1, but no standard deviation is negative" in found.misfits[-1][1]
     found = convert(tmp_path, export, profile + "missing: [-1]\n")
