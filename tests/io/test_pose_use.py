@@ -176,6 +176,35 @@ def test_joined_empty_sheet_does_not_change_the_errors_before(files, robot, path
         np.testing.assert_allclose(rms[0], rms[1], rtol=1e-6)
 
 
+def test_poses_that_only_an_empty_sheet_names_are_ignored(files, robot):
+    """Their uses would hold out poses without any value, and their readings are planned ones."""
+    text = Path("sheet.csv").read_text().splitlines()
+    first = next(i for i, line in enumerate(text) if line.startswith("pose,")) + 1
+    Path("other.csv").write_text(
+        "\n".join([*text[:first], *(f"planned{line}" for line in text[first:])]) + "\n"
+    )
+    alone = load_measurements("all.csv", robot)
+    for paths in (["all.csv", "other.csv"], ["other.csv", "all.csv"]):
+        data = load_measurements(paths, robot)
+        assert sorted(data.labels) == sorted(alone.labels)
+        assert data.is_held_out.sum() == len(HELD_OUT)
+        assert list_unfilled_files(paths, data) == (Path("other.csv"),)
+    report = lc.calibrate(robot, data)
+    assert report.headline.endswith(f"from {POSES - len(HELD_OUT)} poses.")
+
+
+def test_headline_counts_the_poses_that_are_measured(files, robot, data):
+    """A sheet that is not filled in to the end."""
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    measured[:2] = np.nan
+    half = replace(data, observations=(replace(rows, measured=measured),))
+    fitted = [label for label in data.labels[2:] if label not in HELD_OUT]
+    assert f"from {len(fitted)} poses." in lc.calibrate(robot, half).headline
+    dropped = lc.CalibrationOptions(fit=lc.FitOptions(excluded_poses=(fitted[0],)))
+    assert f"from {len(fitted) - 1} poses." in lc.calibrate(robot, half, dropped).headline
+
+
 def test_few_rows_of_a_first_file_do_not_start_a_shared_frame(files, robot, data):
     """Two positions do not determine a frame; the other file does."""
     observations = data.observations[0]

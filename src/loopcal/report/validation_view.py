@@ -8,6 +8,7 @@ from dataclasses import replace
 from loopcal.apply import Validation
 from loopcal.apply.validation_findings import FEW_ROWS, ErrorChange
 from loopcal.findings import Severity
+from loopcal.findings.wording import list_names
 from loopcal.report.numbers import ROUNDING, format_number
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block, format_list
@@ -145,8 +146,9 @@ def view_errors(validation: Validation, what: str, with_before: bool = True) -> 
         divided = "The same divided by sigma"
     blocks += build_kind_summary(validation, divided, with_before)
     if (rest := validation.without_blunders) is not None and rest.judged:
-        names = ", ".join(label for blunder in validation.blunders for label in blunder.poses)
-        caption = f"The same without {names}"
+        labels = [label for blunder in validation.blunders for label in blunder.poses]
+        noun = "pose" if len(labels) == 1 else "poses"
+        caption = f"The same without {noun} {list_names(labels)}"
         if rest.quantities:
             blocks.append(build_error_summary(rest, caption, with_before))
         else:

@@ -10,6 +10,8 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from loopcal.apply import ErrorBudget, Validation, collect_fitted_rows
 from loopcal.diagnose import (
     ConventionCheck,
@@ -22,6 +24,7 @@ from loopcal.diagnose import (
 )
 from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
+from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import to_json
 from loopcal.typing import FloatArray
@@ -59,6 +62,19 @@ def describe_provenance(options: CalibrationOptions) -> Provenance:
     versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")}
     versions["python"] = platform.python_version()
     return Provenance(versions, {"hold_out": options.seed}, repr(options))
+
+
+def _count_fitted_poses(fit: Identification, data: Measurements) -> int:
+    """Return the number of poses that the fit uses: those with measured values; where actuators are
+    redundant, all that are not excluded.
+    """
+    if fit.robot.program.sigma is not None:
+        return data.n_poses - len(fit.excluded_poses)
+    is_measured = np.zeros(data.n_poses, dtype=bool)
+    for rows in data.observations:
+        counted = (rows.weight > 0.0) & rows.present.any(axis=1)
+        is_measured[rows.rows[counted]] = True
+    return int(is_measured.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +154,10 @@ class CalibrationReport:
     def headline(self) -> str:
         """The verdict in one sentence."""
         fit = self.identification
-        fitted = self.split.fitted.n_poses - len(fit.excluded_poses)
-        verdict = self.verdict.value
+        fitted, verdict = _count_fitted_poses(fit, self.split.fitted), self.verdict.value
         return (
             f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "
-            f"from {fitted} poses."
+            f"from {fitted} {'pose' if fitted == 1 else 'poses'}."
         )
 
     def __str__(self) -> str:

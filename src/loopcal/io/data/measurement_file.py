@@ -31,7 +31,7 @@ from loopcal.io.data.pose_rows import read_pose_rows
 from loopcal.io.data.pose_use import read_held_out
 from loopcal.io.robot.robot_file import check_format, require_robot
 from loopcal.mechanism import Mechanism
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
@@ -142,19 +142,37 @@ def _join_tables(
         check_strokes(data, robot, allow=allow_outside_stroke)
         places = [places for of_file in read for _, places in of_file]
         check_duplicates(data, allow=allow_duplicates, places=places)
-    return data
+    is_named = _find_named_poses(kinds, read, poses.members, len(poses.labels))
+    return data if is_named.all() else data.take(is_named)
 
 
 def _leave_out_unfilled(read: list[FileRows]) -> list[FileRows]:
     """Return the rows of each file, none of a file in which nothing was measured yet.
 
-    Such a file, the sheet of a plan, only contributes its poses, readings and uses to the others.
-    If no file has a measured value, all rows are kept.
+    Such a file, the sheet of a plan, only contributes readings and uses of poses that the others
+    name. If no file has a measured value, all rows are kept.
     """
     is_filled = [any(rows.n_residuals for rows, _ in of_file) for of_file in read]
     if not any(is_filled):
         return read
     return [of_file if filled else [] for of_file, filled in zip(read, is_filled, strict=True)]
+
+
+def _find_named_poses(
+    kinds: Sequence[Sequence[object]],
+    read: Sequence[FileRows],
+    members: Sequence[Sequence[tuple[int, ...]]],
+    count: int,
+) -> BoolArray:
+    """Return which poses (count,) another file than an unfilled sheet names.
+
+    The other poses of a sheet were planned, not measured: their uses and readings say nothing.
+    """
+    is_named = np.zeros(count, dtype=bool)
+    for of_file, left, of_rows in zip(kinds, read, members, strict=True):
+        if left or not of_file:
+            is_named[[pose for poses in of_rows for pose in poses]] = True
+    return is_named
 
 
 def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
