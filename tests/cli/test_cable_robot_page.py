@@ -12,7 +12,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
 from tests.cable_robot import NAMES, TRUTH, format_samples, load_real_samples
-from tests.cli.printed_tables import read_table_rows
+from tests.cli.printed_tables import read_report, read_table_rows
 
 REAL = (
     "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm "
@@ -51,6 +51,8 @@ def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, cap
         for block in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
         for row in read_table_rows(block)
     ] == printed
+    assert main([*commands[1].split(), "--force"]) == 0
+    assert read_report(page) == read_report(capsys.readouterr().out)
     result = json.loads(Path("run/result.json").read_text())
     assert result["verdict"] == "undecided"
     codes = {finding["code"] for finding in result["findings"]}
