@@ -57,14 +57,15 @@ def test_line_with_a_large_sigma_does_not_affect_the_predicted_pose(cable, sigma
     )  # [rad]: three lines agree
 
 
-def test_pose_with_too_few_readings_is_left_out_and_reported(cable):
+def test_pose_with_too_few_readings_is_estimated_with_its_rows_and_reported(cable):
+    """Four lines hold the platform in three freedoms; two readings and a position leave two."""
     robot, _, data = cable
     two = change_reading(change_reading(data, np.inf, np.nan), np.inf, np.nan, line=2)
     result = validate(robot, two, before=robot)
-    assert result.poses == ("1", "2", "4", "5", "6", "7", "8")
+    assert result.poses == ("1", "2", "3", "4", "5", "6", "7", "8")
     assert result.unreachable == ()
-    (missing,) = [f for f in result.findings if f.code == "validation.missing-readings"]
-    assert tuple(missing.data["names"]) == ("pose 3",)
+    (estimated,) = [f for f in result.findings if f.code == "validation.poses-estimated"]
+    assert tuple(estimated.data["names"]) == ("pose 3",)
 
 
 def test_equal_sigmas_predict_the_forward_kinematics(cable):

@@ -699,6 +699,7 @@ add(
     8,
     "I",
     target="position",
+    hold_out=2,
     candidates=50,
 )
 

@@ -58,8 +58,8 @@ class PoseFit:
     Attributes
     ----------
     solution : of n poses. is_determined : (n,) poses that the data determine.
-    absorbed : (n,) number of residuals that each pose takes up; poses that rows link are counted
-        at the first of them. left : (n,) number of residuals of its linked poses that are left.
+    absorbed : (n,) number of residuals of rows that each pose takes up, which are its unknowns less
+        its recorded uncertain readings; poses that rows link are counted at the first of them. left : (n,) number of residuals of its linked poses that are left.
     reading_residuals : (n, actuators) true minus recorded readings in units of their sigma, zero
         where exact or not taken.
     """
@@ -97,8 +97,11 @@ def fit_poses(
     assert estimates is not None
     assert problem.member is not None
     states, member = estimates.states, problem.member
+    assert data.reading_sigma is not None
+    uncertain = (np.isfinite(data.reading_sigma) & (data.reading_sigma > 0.0)).sum(axis=1)
+    first = np.unique(member, return_index=True)[1]
     absorbed = np.zeros(data.n_poses, dtype=np.int64)
-    absorbed[np.unique(member, return_index=True)[1]] = estimates.rank[0]
+    absorbed[first] = np.maximum(estimates.rank[0] - np.bincount(member, uncertain), 0)
     return PoseFit(
         make_solution(robot, states.state, states.q[0]),
         ~estimates.is_undetermined[0],
