@@ -10,6 +10,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from loopcal.findings import Finding
 
 
 class LoopcalError(Exception):
@@ -20,10 +24,17 @@ class LoopcalError(Exception):
         """Code of the finding behind this error, or behind the error that caused it; None where
         both were made from sentences.
         """
-        code = getattr(self.args[0], "code", None) if self.args else None
-        if code is None and isinstance(self.__cause__, LoopcalError):
-            return self.__cause__.code
-        return code
+        return getattr(self.finding, "code", None)
+
+    @property
+    def finding(self) -> Finding | None:
+        """The finding behind this error, or behind the error that caused it; None where both were
+        made from sentences.
+        """
+        content = self.args[0] if self.args else None
+        if not hasattr(content, "code") and isinstance(self.__cause__, LoopcalError):
+            return self.__cause__.finding
+        return content if hasattr(content, "code") else None
 
 
 class UnitError(LoopcalError):

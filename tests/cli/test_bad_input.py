@@ -216,7 +216,7 @@ DATA_CASES = {
     "a reading outside the stroke": (
         "b,1,",
         "b,80,",
-        "q1 reads 80 mm, outside its stroke of -75 to 75 mm",
+        "data.csv:6): q1 reads 80 mm, 5 mm outside its stroke of -75 to 75 mm",
     ),
     "no noise": ("# noise: {z: 1 um}\n", "", "no noise is stated for 'z'"),
     "noise without a unit": ("1 um", "1", "'1' has no unit; add one of m, mm"),

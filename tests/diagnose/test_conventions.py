@@ -536,5 +536,5 @@ def test_every_interpretation_changes_the_values_and_keeps_their_shape() -> None
         (way.slip, *way.details.items())
         for way in list_reading_interpretations(data, robot.actuators)
     ]
-    # units, signs of all and each, orders, gear factors of all and each, rows
-    assert len(set(ways)) == len(ways) == 6 + 4 + 5 + 4 * 4 + 2
+    # units of all and each, signs of all and each, orders, gear factors of all and each, rows
+    assert len(set(ways)) == len(ways) == 4 * 6 + 4 + 5 + 4 * 4 + 2

@@ -21,6 +21,8 @@ HINTS = {
     "data.outside-stroke": "use --allow-outside-stroke to accept it",
     "conventions.other-interpretation": "use --allow-implausible to accept the data as written",
     "conventions.stated-values-contradicted": "use --allow-implausible to accept the statement",
+    "conventions.strokes-contradicted": "use --allow-outside-stroke to accept them",
+    "conventions.strokes-explained": "use --allow-outside-stroke to accept them",
     "conventions.target-never-moves": "use --allow-still to accept it",
     "outliers.some": "use --drop POSE, or --loss huber",
     "files.output-exists": "use --force to replace it",

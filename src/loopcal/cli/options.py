@@ -14,6 +14,7 @@ from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
     from loopcal.diagnose import ConventionCheck
+    from loopcal.findings import Finding
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
@@ -217,6 +218,22 @@ def read_checked_measurements(
     return data
 
 
+def _refuse_explained_strokes(
+    stated: Finding, paths: Sequence[Path], robot: Mechanism, allowed: Mapping[str, bool]
+) -> None:
+    """Refuse readings outside their strokes, described by `data.outside-stroke`, if another unit,
+    order, sign or zero explains them.
+    """
+    from loopcal.diagnose import explain_outside_strokes
+    from loopcal.io import load_measurements
+
+    data = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
+    explained = explain_outside_strokes(robot, data, stated.data)
+    if explained is not None:
+        text = f"{' and '.join(map(str, paths))}: {explained}"
+        raise DataError(text) from DataError(explained)
+
+
 def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None:
     """Print a note where a check of these files leaves a doubt."""
     from loopcal.cli import terminal
@@ -256,7 +273,12 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
             code = "workflow.robot-of-other-name"
             note = report_finding(code, file=str(path), stated=stated, used=robot.name)
             terminal.print_note(str(note))
-    data = load_measurements(paths, robot, **allowed)
+    try:
+        data = load_measurements(paths, robot, **allowed)
+    except DataError as error:
+        if error.finding is not None and error.finding.code == "data.outside-stroke":
+            _refuse_explained_strokes(error.finding, paths, robot, allowed)
+        raise
     for file in list_unfilled_files(paths, data):
         terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
     return data

@@ -5,6 +5,7 @@ from loopcal.diagnose.conventions import IMPLAUSIBLE as IMPLAUSIBLE
 from loopcal.diagnose.conventions import ConventionCheck as ConventionCheck
 from loopcal.diagnose.conventions import check_conventions as check_conventions
 from loopcal.diagnose.conventions import compare_conventions as compare_conventions
+from loopcal.diagnose.conventions import explain_outside_strokes as explain_outside_strokes
 from loopcal.diagnose.conventions import find_moved_setups as find_moved_setups
 from loopcal.diagnose.cross_validation import CrossValidation as CrossValidation
 from loopcal.diagnose.cross_validation import build_regularization_path as build_regularization_path

@@ -6,6 +6,8 @@ from loopcal.measure.data_checks import check_actuators as check_actuators
 from loopcal.measure.data_checks import check_duplicates as check_duplicates
 from loopcal.measure.data_checks import check_strokes as check_strokes
 from loopcal.measure.data_checks import check_targets_move as check_targets_move
+from loopcal.measure.data_checks import describe_outside_strokes as describe_outside_strokes
+from loopcal.measure.data_checks import find_outside_strokes as find_outside_strokes
 from loopcal.measure.data_checks import has_static_targets as has_static_targets
 from loopcal.measure.evaluation import EvaluatedRows as EvaluatedRows
 from loopcal.measure.evaluation import evaluate_measurements as evaluate_measurements

@@ -5,7 +5,7 @@ Each check raises a `DataError` made from a finding of the catalog, unless the c
 `allow=True`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple, cast
 
@@ -22,8 +22,9 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
 STATIC_SIGMAS, MOVING_SIGMAS = 10.0, 100.0
-"""Values within the first number of standard deviations count as static; the check refuses them if
-the robot moves the target by more than the second number.
+"""Values of a target within the first number of standard deviations count as static; the check
+refuses them if the robot moves the target by more than the second number. A single column is static
+if all its numbers are equal.
 """
 
 CONSTANT_SHARE = 0.1
@@ -60,7 +61,61 @@ def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
         )
 
 
-def check_strokes(measurements: Measurements, robot: Mechanism, *, allow: bool = False) -> None:
+def find_outside_strokes(readings: FloatArray, robot: Mechanism) -> FloatArray:
+    """Return by how much readings (n, a) are outside their strokes (n, a) [m or rad]; 0 inside."""
+    strokes = [actuator.stroke or (-np.inf, np.inf) for actuator in robot.actuators]
+    low, high = np.array(strokes).T
+    return np.nan_to_num(np.maximum(np.maximum(low - readings, readings - high), 0.0))
+
+
+def describe_outside_strokes(
+    measurements: Measurements, robot: Mechanism, places: Mapping[int, str] | None = None
+) -> dict[str, Any] | None:
+    """Describe the readings outside their strokes for a finding; None without any.
+
+    Parameters
+    ----------
+    measurements, robot : see `check_strokes`.
+    places : place of each pose by its index, such as `data.csv:12`.
+
+    Returns
+    -------
+    dict
+        The reading that is farthest outside, as a share of its stroke, and the number and the
+        actuators of all of them.
+    """
+    beyond = find_outside_strokes(measurements.readings, robot)
+    if not beyond.any():
+        return None
+    widths = np.array([np.ptp(actuator.stroke or (0.0, 1.0)) for actuator in robot.actuators])
+    pose, column = (int(i) for i in np.unravel_index(np.argmax(beyond / widths), beyond.shape))
+    actuator = robot.actuators[column]
+    assert actuator.stroke is not None
+    shown = find_unit(robot.units[actuator.dimension])
+    numbers = (measurements.readings[pose, column], *actuator.stroke)
+    reading, lower, upper = (f"{number / shown.factor_to_si:.7g}" for number in numbers)
+    outside = np.flatnonzero(beyond.any(axis=0)).tolist()
+    return {
+        "pose": measurements.labels[pose],
+        "place": (places or {}).get(pose, ""),
+        "actuator": actuator.name,
+        "actuators": tuple(robot.actuators[j].name for j in outside),
+        "reading": reading,
+        "beyond": robot.to_quantity(float(beyond[pose, column]), actuator.dimension),
+        "lower": lower,
+        "upper": upper,
+        "unit": str(shown),
+        "count": int(np.count_nonzero(beyond)),
+    }
+
+
+def check_strokes(
+    measurements: Measurements,
+    robot: Mechanism,
+    *,
+    allow: bool = False,
+    places: Mapping[int, str] | None = None,
+) -> None:
     """Refuse readings outside the stroke of their actuator.
 
     Parameters
@@ -69,38 +124,18 @@ def check_strokes(measurements: Measurements, robot: Mechanism, *, allow: bool =
     robot : Mechanism
     allow : bool
         True accepts them.
+    places : int -> str, optional
+        Place of each pose by its index, such as `data.csv:12`, for the message.
 
     Raises
     ------
     DataError
-        `data.outside-stroke`, with the first of these readings and their number.
+        `data.outside-stroke`, with the farthest of these readings and their number.
     """
     check_actuators(measurements, robot)
-    if allow:
-        return
-    strokes = [actuator.stroke or (-np.inf, np.inf) for actuator in robot.actuators]
-    low, high = np.array(strokes).T
-    outside = np.argwhere((measurements.readings < low) | (measurements.readings > high))
-    if len(outside):
-        pose, column = (int(i) for i in outside[0])
-        actuator = robot.actuators[column]
-        shown = find_unit(robot.units[actuator.dimension])
-        reading, lower, upper = (
-            f"{number / shown.factor_to_si:.7g}"
-            for number in (measurements.readings[pose, column], *strokes[column])
-        )
-        raise DataError(
-            report_finding(
-                "data.outside-stroke",
-                pose=measurements.labels[pose],
-                actuator=actuator.name,
-                reading=reading,
-                lower=lower,
-                upper=upper,
-                unit=str(shown),
-                count=len(outside),
-            )
-        )
+    described = None if allow else describe_outside_strokes(measurements, robot, places)
+    if described is not None:
+        raise DataError(report_finding("data.outside-stroke", **described))
 
 
 def check_duplicates(
@@ -181,7 +216,8 @@ def check_targets_move(
     Raises
     ------
     DataError
-        `conventions.target-never-moves`, with the target, its range and the expected range.
+        `conventions.target-never-moves`, with the target, its range and the expected range;
+        `conventions.column-never-changes`, with a column of equal numbers.
     """
     if allow:
         return
@@ -200,6 +236,17 @@ def check_targets_move(
                 Quantity(float(range_[worst]) / shown.factor_to_si, shown.symbol)
                 for range_ in (static.range, expected)
             )
+            if static.target not in kind.target_columns:
+                value = float(rows.measured[static.present][0, static.columns[0]])
+                raise DataError(
+                    report_finding(
+                        "conventions.column-never-changes",
+                        column=static.target,
+                        kind=kind.name,
+                        value=Quantity(value / shown.factor_to_si, shown.symbol),
+                        expected=planned,
+                    )
+                )
             raise DataError(
                 report_finding(
                     "conventions.target-never-moves",
@@ -288,7 +335,7 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
             sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
         )
         for session in np.unique(rows.session):
-            for target, indices in kind.target_columns.items():
+            for target, indices in _list_columns(kind).items():
                 columns = list(indices)
                 present = (rows.session == session) & ~np.any(
                     np.isnan(rows.measured[:, columns]), axis=1
@@ -296,8 +343,18 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
                 if np.count_nonzero(present) < 3:
                     continue
                 range_ = np.ptp(rows.measured[present][:, columns], axis=0)
-                if np.all(range_ < STATIC_SIGMAS * noise[columns]):
+                limit = STATIC_SIGMAS * noise[columns] if target in kind.target_columns else 1e-15
+                if np.all(range_ < limit):
                     yield _StaticTarget(rows, target, present, columns, range_, noise[columns])
+
+
+def _list_columns(kind: Kind) -> dict[str, tuple[int, ...]]:
+    """Return the columns of each target, then each column of several by itself."""
+    columns = dict(kind.target_columns)
+    if 1 < len(kind.columns) == len(kind.noise_columns):
+        for j, column in enumerate(kind.columns):
+            columns.setdefault(column.name, (j,))
+    return columns
 
 
 def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:

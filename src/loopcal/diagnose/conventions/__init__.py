@@ -11,6 +11,9 @@ from loopcal.diagnose.conventions.reading_interpretations import (
 )
 from loopcal.diagnose.conventions.setup_parameters import MovedSetups as MovedSetups
 from loopcal.diagnose.conventions.setup_parameters import find_moved_setups as find_moved_setups
+from loopcal.diagnose.conventions.stroke_explanation import (
+    explain_outside_strokes as explain_outside_strokes,
+)
 from loopcal.diagnose.conventions.value_interpretations import (
     list_interpretations as list_interpretations,
 )

@@ -25,7 +25,7 @@ from loopcal.diagnose.conventions.equal_interpretations import (
     find_equal_orders,
 )
 from loopcal.diagnose.conventions.interpretations import Interpretation
-from loopcal.diagnose.conventions.judgement import BETTER
+from loopcal.diagnose.conventions.judgement import BETTER, list_rms_residuals
 from loopcal.diagnose.conventions.misfit import (
     Comparison,
     compare_with_robot,
@@ -38,20 +38,20 @@ from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.diagnose.conventions.selection import (
     ALLOWED,
     EQUALLY,
+    GROSS,
     Search,
     Selection,
     search_interpretations,
     shares_poses,
 )
+from loopcal.diagnose.conventions.setup_interpretations import SetupInterpretation
 from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_contradiction
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, forward
-from loopcal.typing import FloatArray
-from loopcal.units import Dimension
 
 IMPLAUSIBLE = 10.0
 """Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
@@ -66,11 +66,6 @@ fewer, frames and parameters alone explain nearly anything.
 MOST_POSES, RUNS = 120, 4
 """Number of poses of large data sets by which interpretations are judged, and number of runs of
 neighbors (rows may be shifted by one) that contain them.
-"""
-
-GROSS = 100.0
-"""Misfit above which data that contradict stated setup parameters are refused. Below it, robots far
-beyond their tolerances look the same, and it is a warning.
 """
 
 
@@ -224,7 +219,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     description = {
         "robot": robot.name,
         "misfit": misfit,
-        "residuals": () if stated is None else _rms_residuals(stated),
+        "residuals": () if stated is None else list_rms_residuals(stated),
         "reached": reach.n_reached if stated is None else None,
         "poses": reach.n_tested,
     }
@@ -263,14 +258,13 @@ def _report_unexplained(
 
 
 def _count_equations(stated: Comparison | None, search: Search) -> int:
-    """Return the number of equations beyond those of unknown frames: of the data as written, or
-    else of the interpretation.
+    """Return the number of equations beyond those of unknown frames: of the data as written or of
+    the interpretation, whichever has fewer.
     """
     chosen = None if search.selection is None else search.selection.comparison
-    comparison = chosen if stated is None else stated
-    if comparison is None or comparison.linearization is None:
-        return FEWEST_TO_REFUSE
-    return int(comparison.linearization.equations[0])
+    compared = [c.linearization for c in (stated, chosen) if c is not None]
+    counts = [int(one.equations[0]) for one in compared if one is not None]
+    return min(counts, default=FEWEST_TO_REFUSE)
 
 
 def _select_known_readings(data: Measurements, redundant: bool) -> Measurements | None:
@@ -305,15 +299,19 @@ def _thin_out(data: Measurements) -> Measurements:
 
 
 def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> ConventionCheck:
-    """Refuse data that fit far better in another interpretation."""
+    """Refuse data that fit far better in another interpretation; warn where a robot far beyond its
+    tolerances looks the same as a setup item that is not declared unknown.
+    """
     interpretation, alternatives = chosen.interpretation, chosen.alternatives
+    is_setup = isinstance(interpretation, SetupInterpretation)
     finding = report_finding(
         "conventions.other-interpretation",
+        Severity.WARNING if is_setup and not misfit > GROSS else Severity.REFUSAL,
         **description,
         interpretation=interpretation.describe(),
         alternatives=tuple(other.describe() for other in alternatives),
         other_misfit=chosen.misfit,
-        other_residuals=_rms_residuals(chosen.comparison),
+        other_residuals=list_rms_residuals(chosen.comparison),
         is_consistent=chosen.misfit <= ALLOWED,
     )
     return ConventionCheck(misfit, interpretation, chosen.misfit, alternatives, finding)
@@ -330,7 +328,7 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
         names=against.names,
         misfit=misfit,
         other_misfit=against.misfit,
-        residuals=_rms_residuals(against.comparison),
+        residuals=list_rms_residuals(against.comparison),
         is_consistent=against.misfit <= ALLOWED,
     )
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
@@ -366,21 +364,3 @@ def _report_far_rows(stated: Comparison) -> Finding:
         rows=sum(len(o) for o in stated.data.observations),
         poses=tuple(dict.fromkeys(stated.excluded)),
     )
-
-
-def _rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
-    """Return root mean squares of the first interpretation's residuals by dimension, in units of
-    the robot's file, without far rows.
-    """
-    robot = comparison.problem.free.robot
-    square: dict[Dimension, list[FloatArray]] = {}
-    for s, r in zip(comparison.problem.rows, comparison.residuals(), strict=True):
-        present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
-        for j, column in enumerate(s.kind.noise_columns):
-            square.setdefault(column.dimension, []).append(r.raw[0, present[:, j], j] ** 2)
-    residuals = []
-    for dimension, squares in square.items():
-        values = np.concatenate(squares)
-        if len(values):
-            residuals.append(robot.to_quantity(float(np.sqrt(values.mean())), dimension))
-    return tuple(residuals)

@@ -18,10 +18,12 @@ from loopcal.diagnose.conventions.misfit import (
     select_reached,
 )
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.findings import Quantity
 from loopcal.measure import Measurements
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import forward_trials
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
 
 BETTER = 5.0
 """Factor by which another interpretation must fit better before data are refused: true data of a
@@ -40,6 +42,26 @@ def judge_data(
         return None
     effort = THOROUGH if start is None else QUICK
     return exclude_far_rows(compare_with_robot(free, reach.data, (), effort, start))
+
+
+def compute_rms_residuals(comparison: Comparison) -> dict[Dimension, float]:
+    """Return root mean squares [m or rad] of the first interpretation's residuals by dimension,
+    without far rows.
+    """
+    square: dict[Dimension, list[FloatArray]] = {}
+    for s, r in zip(comparison.problem.rows, comparison.residuals(), strict=True):
+        present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
+        for j, column in enumerate(s.kind.noise_columns):
+            square.setdefault(column.dimension, []).append(r.raw[0, present[:, j], j] ** 2)
+    joined = {dimension: np.concatenate(squares) for dimension, squares in square.items()}
+    return {d: float(np.sqrt(values.mean())) for d, values in joined.items() if len(values)}
+
+
+def list_rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Return these root mean squares in units of the robot's file."""
+    robot = comparison.problem.free.robot
+    sizes = compute_rms_residuals(comparison)
+    return tuple(robot.to_quantity(size, dimension) for dimension, size in sizes.items())
 
 
 def guess_frames(

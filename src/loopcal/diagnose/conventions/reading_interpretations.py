@@ -45,6 +45,10 @@ def list_reading_interpretations(
             for factor in FACTORS.get(dimension, ()):
                 details = describe_unit("readings", dimension, factor)
                 yield Interpretation("unit", details, source, None, scale_chosen(chosen, factor))
+    for j, actuator in enumerate(actuators if len(actuators) > 1 else ()):
+        for factor in FACTORS.get(actuator.dimension, ()):
+            details = describe_unit(f"readings of {actuator.name}", actuator.dimension, factor)
+            yield Interpretation("unit", details, "", None, scale_columns([j], factor))
     for rule in (_list_signs(actuators), _list_orders(actuators), _list_gears(actuators, home)):
         for slip, details, change in rule:
             yield Interpretation(slip, details, "", None, change)

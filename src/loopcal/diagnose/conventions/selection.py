@@ -15,18 +15,28 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.diagnose.conventions.interpretations import Interpretation, combine
-from loopcal.diagnose.conventions.judgement import BETTER, guess_frames, is_informative, judge_data
+from loopcal.diagnose.conventions.judgement import (
+    BETTER,
+    compute_rms_residuals,
+    guess_frames,
+    is_informative,
+    judge_data,
+)
 from loopcal.diagnose.conventions.misfit import (
     MOST_EXCLUDED,
     QUICK,
     THOROUGH,
     Comparison,
+    compare_with_robot,
     compute_misfits,
+    exclude_far_rows,
     select_reached,
 )
 from loopcal.diagnose.conventions.reading_interpretations import list_reading_interpretations
-from loopcal.diagnose.conventions.refinement import refine_misfit
+from loopcal.diagnose.conventions.refinement import explains_after_fit, refine_misfit
+from loopcal.diagnose.conventions.setup_interpretations import list_setup_interpretations
 from loopcal.diagnose.conventions.value_interpretations import list_interpretations
+from loopcal.diagnose.conventions.zero_interpretations import find_zero_interpretations
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.measure import Measurements
 from loopcal.mechanism import compute_readings, find_directly_reachable
@@ -35,6 +45,11 @@ from loopcal.typing import FloatArray, IntArray
 FAR_BETTER = 10.0
 """Factor by which it must fit better if tolerances and noise do not explain the rest, as of a robot
 far from nominal in data with a wrong unit.
+"""
+
+GROSS = 100.0
+"""Misfit above which data that contradict stated setup parameters are refused. Below it, robots far
+beyond their tolerances look the same, and it is a warning.
 """
 
 ALLOWED = 4.0
@@ -125,13 +140,35 @@ def search_interpretations(
     best = _select_best(free, data, written, singles, misfit, ALLOWED)
     count = 0
     if best is None and pairs:
+        parameters = _test_parameters(free, data, written, misfit)
+        tried |= Counter(test.interpretation.slip for test in parameters)
+        best = _select_best(free, data, written, parameters, misfit, ALLOWED)
+    if best is None and pairs:
         tested = list(_test_pairs(free, data, written, singles, misfit))
         count = len(tested)
         best = _select_best(free, data, written, tested, misfit, ALLOWED)
     if best is None:
         limit = misfit / FAR_BETTER if np.isfinite(misfit) else LARGEST
         best = _select_best(free, data, written, singles, misfit, limit)
+        if best is not None and best.misfit > ALLOWED and not _is_robot_far(stated, best):
+            best = None
     return Search(best, tried, count)
+
+
+def _is_robot_far(stated: Comparison | None, chosen: Selection) -> bool:
+    """Return whether an interpretation that leaves a misfit is true for a robot far from nominal.
+
+    Such a robot explains the data in this interpretation, and not as they are written; or the
+    residuals of the given robot become far smaller, not only their misfit.
+    """
+    if stated is not None:
+        before = compute_rms_residuals(stated)
+        after = compute_rms_residuals(chosen.comparison)
+        if any(FAR_BETTER * size < before.get(dimension, 0.0) for dimension, size in after.items()):
+            return True
+    if not explains_after_fit(chosen.comparison, ALLOWED):
+        return False
+    return stated is None or not explains_after_fit(stated, ALLOWED)
 
 
 def shares_poses(data: Measurements) -> bool:
@@ -228,15 +265,19 @@ def _drop_same(
     """Return the interpretations without those that make the same data as an earlier one."""
     kept: list[Interpretation] = []
     tables: list[list[FloatArray]] = []
+    setups: list[list[tuple[str, ...]]] = []
     for interpretation in interpretations:
         changed = interpretation.apply(data)
         table = [changed.readings, *(o.measured for o in changed.observations)]
+        setup = [o.kind.unknown for o in changed.observations]
         if not any(
-            all(np.allclose(a, b, equal_nan=True) for a, b in zip(table, other, strict=True))
-            for other in tables
+            setup == other_setup
+            and all(np.allclose(a, b, equal_nan=True) for a, b in zip(table, other, strict=True))
+            for other, other_setup in zip(tables, setups, strict=True)
         ):
             kept.append(interpretation)
             tables.append(table)
+            setups.append(setup)
     return kept
 
 
@@ -286,6 +327,44 @@ def _test_readings(
         comparison = judge_data(free, listed[i].apply(data))
         judged[i] = np.inf if comparison is None else comparison.misfit
     return _list_tests(listed, screened, judged)
+
+
+def _test_parameters(
+    free: FreeParameters, data: Measurements, reached: Measurements | None, misfit: float
+) -> list[_Test]:
+    """Test interpretations that have parameters of their own: setup items that are not declared
+    unknown, and other zeros of the readings.
+    """
+    few = _select_few(data)
+    zeros = find_zero_interpretations(free, data, few, not misfit > GROSS)
+    tests = [_test_one(free, data, few, zero, misfit) for zero in zeros]
+    for count in (1, 2) if reached is not None else ():
+        if all(test.misfit > ALLOWED for test in tests):
+            few = _select_few(reached)
+            setups = list_setup_interpretations(reached, count)
+            tests += [_test_one(free, reached, few, setup, misfit) for setup in setups]
+    return tests
+
+
+def _test_one(
+    free: FreeParameters,
+    data: Measurements,
+    few: IntArray,
+    interpretation: Interpretation,
+    misfit: float,
+) -> _Test:
+    """Test one interpretation by a few poses and, if that is promising, by all rows."""
+    changed = interpretation.apply(data)
+    screened = judged = np.inf
+    reach = select_reached(free, changed.take(few))
+    if reach.is_enough:
+        quick = exclude_far_rows(compare_with_robot(free, reach.data, (), QUICK))
+        screened = float(np.nan_to_num(quick.misfit, nan=np.inf))
+    if screened <= PROMISING * misfit / BETTER:
+        comparison = judge_data(free, changed)
+        if comparison is not None and np.isfinite(comparison.misfit):
+            judged = refine_misfit(comparison)[0]
+    return _Test(interpretation, screened, judged)
 
 
 def _list_tests(

@@ -61,6 +61,8 @@ TRIED: Mapping[str, str] = {
     "reversed-readings": "order of actuators/orders of actuators",
     "permuted-readings": "order of actuators/orders of actuators",
     "shifted-readings": "shift by one row/shifts by one row",
+    "reading-zero": "zero of readings/zeros of readings",
+    "undeclared-setup": "unknown setup item/unknown setup items",
 }
 """Kind of a slip -> its name for one, and for several."""
 

@@ -139,11 +139,21 @@ def _join_tables(
             read_stated_values(settings, poses.labels),
             read_held_out(tables, poses),
         )
-        check_strokes(data, robot, allow=allow_outside_stroke)
         places = [places for of_file in read for _, places in of_file]
+        check_strokes(data, robot, allow=allow_outside_stroke, places=_place_poses(data, places))
         check_duplicates(data, allow=allow_duplicates, places=places)
     is_named = _find_named_poses(kinds, read, poses.members, len(poses.labels))
     return data if is_named.all() else data.take(is_named)
+
+
+def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[int, str]:
+    """Return the place of the first row of each pose, such as `data.csv:12`."""
+    first: dict[int, str] = {}
+    for rows, of_rows in zip(data.observations, places, strict=True):
+        for poses, place in zip(rows.rows.reshape(len(rows), -1).tolist(), of_rows, strict=True):
+            for pose in poses:
+                first.setdefault(pose, place)
+    return first
 
 
 def _leave_out_unfilled(read: list[FileRows]) -> list[FileRows]:
