@@ -226,7 +226,9 @@ def test_invalid_file_is_refused_in_one_sentence_with_its_line(
 
 def test_readings_outside_the_stroke_and_duplicates_are_refused_by_default(tmp_path, robot) -> None:
     path = write(tmp_path, GOOD.replace("b,1,", "b,90,"))
-    with pytest.raises(DataError, match=r"pose 'b' \(.*data.csv:6\): q1 reads 90 mm, 15 mm outside"):
+    with pytest.raises(
+        DataError, match=r"pose 'b' \(.*data.csv:6\): q1 reads 90 mm, 15 mm outside"
+    ):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
     path = write(tmp_path, GOOD.replace("b,1,1,1,1,1,1,201.1", "b,0,0,0,0,0,0,200"))
