@@ -153,3 +153,23 @@ def test_screen_and_run_folder_name_value_and_rule(
     assert sentence in " ".join(capsys.readouterr().out.split())
     stored = json.loads((tmp_path / "run" / "result.json").read_text())["fit"]["regularization"]
     assert stored["rule"] == rule
+
+
+def test_weak_ridges_of_right_data_agree_with_the_noise():
+    """The penalty is no prior: with it, 240 equations counted as 240 degrees of freedom, and three
+    of four right data sets had residuals that were too small."""
+    robot, codes, ratios = lc.load_robot("hexapod-42"), [], []
+    sensor = lc.Sensor(lc.Pose(), lc.Gaussian(np.array([5e-5] * 3 + [1e-5] * 3)))
+    for seed in range(12):
+        truth = robot.with_values(lc.sample_truth(robot, 1, seed)[0])
+        coordinates = lc.sample_workspace(robot, 15, seed).coordinates
+        data = lc.simulate(truth, coordinates, lc.Instrument((sensor,)), seed)
+        test = lc.identify(robot, data, lc.Ridge(1e-6)).residual_test
+        least = lc.identify(robot, data, lc.LeastSquares()).residual_test
+        assert test.decisive.square == pytest.approx(least.chi_square, rel=1e-3)
+        assert test.decisive.degrees == pytest.approx(least.degrees, abs=0.1)
+        assert least.residuals is None
+        codes.append(test.finding.code)
+        ratios.append(test.finding.data["ratio"])
+    assert codes.count("noise.consistent") >= 11
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)

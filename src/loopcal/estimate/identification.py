@@ -253,7 +253,8 @@ def _assemble(
     """
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
     noise, weighs = name_noise(options, data), options.loss is not None
-    test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged)
+    is_prior = isinstance(_method(options), MAP)
+    test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged, is_prior)
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = _test_prior(free, fit, _method(options))
     d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))

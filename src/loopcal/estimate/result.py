@@ -217,10 +217,10 @@ class Identification:
         """
         test, cost = self.residual_test, self.history.cost
         if self.converged:
-            rank, value = f"Rank {self.rank} of {len(self.names)}.", f"{test.chi_square:.5g}"
+            rank, (square, degrees, _) = f"Rank {self.rank} of {len(self.names)}.", test.decisive
             if test.weighted:
-                return f"{rank} The squares of the weighted residuals add up to {value}."
-            return f"{rank} Chi-square {value} with {test.degrees:.4g} degrees of freedom."
+                return f"{rank} The squares of the weighted residuals add up to {square:.5g}."
+            return f"{rank} Chi-square {square:.5g} with {degrees:.4g} degrees of freedom."
         if not cost[-1] < cost[0]:
             return ""
         fell = f"The sum of squared residuals, each divided by its sigma, fell from {cost[0]:.3g}"

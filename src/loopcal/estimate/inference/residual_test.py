@@ -8,6 +8,7 @@ estimated.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,14 @@ DOUBT = 1e-2
 """Probability below which a test does not accept either."""
 
 
+class SquareTest(NamedTuple):
+    """A sum of squares, its degrees of freedom, and the probability of a larger one."""
+
+    square: float
+    degrees: float
+    p_value: float
+
+
 @dataclass(frozen=True)
 class ResidualTest:
     """The residuals of a fit against the noise.
@@ -49,6 +58,8 @@ class ResidualTest:
         residuals: then the intervals are wider by this factor.
     intervals : whether intervals are given at all.
     converged, weighted : whether the iteration converged, and whether a loss chose the weights.
+    residuals : the test of the residuals alone, where the penalty is no prior but a ridge: with it,
+        `chi_square` has no chi-square distribution. None elsewhere.
     """
 
     chi_square: float
@@ -60,11 +71,17 @@ class ResidualTest:
     intervals: bool
     converged: bool = True
     weighted: bool = False
+    residuals: SquareTest | None = None
+
+    @property
+    def decisive(self) -> SquareTest:
+        """The test that decides: that of the residuals alone, or with the prior."""
+        return self.residuals or SquareTest(self.chi_square, self.degrees, self.p_value)
 
     @property
     def failed(self) -> bool:
         """Whether the residuals exceed the stated noise beyond doubt."""
-        return self.noise == "given" and self.p_value < SIGNIFICANCE
+        return self.noise == "given" and self.decisive.p_value < SIGNIFICANCE
 
     @property
     def finding(self) -> Finding:
@@ -75,17 +92,18 @@ class ResidualTest:
             return self._estimated
         if self.weighted:
             return report_finding("noise.weighted")
-        if self.degrees < 0.5:
+        square, degrees, p_value = self.decisive
+        if degrees < 0.5:
             return report_finding("noise.no-degrees-of-freedom")
         code = "noise.consistent"
-        if self.p_value < SIGNIFICANCE:
+        if p_value < SIGNIFICANCE:
             code = "noise.residuals-too-large"
-        elif self.p_value < DOUBT:
+        elif p_value < DOUBT:
             code = "noise.doubtful"
-        elif self.p_value > 1.0 - SIGNIFICANCE:
+        elif p_value > 1.0 - SIGNIFICANCE:
             code = "noise.residuals-too-small"
-        ratio = float(np.sqrt(self.chi_square / self.degrees))
-        return report_finding(code, ratio=ratio, degrees=self.degrees, p_value=self.p_value)
+        ratio = float(np.sqrt(square / degrees))
+        return report_finding(code, ratio=ratio, degrees=degrees, p_value=p_value)
 
     @property
     def _estimated(self) -> Finding:
@@ -103,12 +121,14 @@ def run_residual_test(
     noise: str,
     weighted: bool = False,
     converged: bool = True,
+    is_prior: bool = True,
 ) -> ResidualTest:
     """Test the residuals of a fit (t = 1).
 
     chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used. Each equation is a degree
     of freedom, less one for each direction used without penalty: m - rank for least squares, m for
-    MAP.
+    MAP. The penalty of a ridge is no prior. Then the residuals alone are tested: with filter
+    factors f_i their expected sum of squares is m - sum f_i (2 - f_i), but for the bias.
 
     Parameters
     ----------
@@ -118,6 +138,7 @@ def run_residual_test(
         distribution.
     converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor
         intervals.
+    is_prior : whether the penalty is knowledge of the parameters, as with MAP.
     """
     if not converged:
         nan = np.nan
@@ -129,16 +150,29 @@ def run_residual_test(
     used = np.isfinite(penalty)
     m = float(decomposition.rows[0])
     degrees = m - float((used & (penalty == 0.0)).sum())
-    dof = m - float(decomposition.filter_factors(penalty).sum())
-    p_value, scale, intervals = np.nan, 1.0, True
+    f = decomposition.filter_factors(penalty)
+    dof = m - float(f.sum())
+    p_value, scale, intervals, alone = np.nan, 1.0, True, None
+    p_own = _compute_tail(degrees, chi_square)
+    tested = SquareTest(chi_square, degrees, p_own)
+    if not is_prior and (finite > 0.0).any() and not weighted:
+        spare = m - float((f * (2.0 - f)).sum())
+        tested = alone = SquareTest(left, spare, _compute_tail(spare, left))
     if noise == "estimated":
         intervals = dof >= FEWEST_DEGREES
         scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
     elif not weighted:
-        p_value = float(compute_chi_square_tail(degrees, chi_square)) if degrees > 0 else np.nan
-        if p_value < SIGNIFICANCE:
-            scale = max(1.0, float(np.sqrt(chi_square / degrees)))
-    return ResidualTest(chi_square, degrees, p_value, dof, noise, scale, intervals, True, weighted)
+        p_value = p_own
+        if tested.p_value < SIGNIFICANCE:
+            scale = max(1.0, float(np.sqrt(tested.square / tested.degrees)))
+    return ResidualTest(
+        chi_square, degrees, p_value, dof, noise, scale, intervals, True, weighted, alone
+    )
+
+
+def _compute_tail(degrees: float, square: float) -> float:
+    """Return the probability of a larger sum of squares; NaN without degrees of freedom."""
+    return float(compute_chi_square_tail(degrees, square)) if degrees > 0 else np.nan
 
 
 def coverage_factor(test: ResidualTest, level: float = LEVEL) -> float:
