@@ -170,7 +170,7 @@ def test_import_of_distances_in_another_unit_shows_no_warnings_of_numpy(
         for line in text.splitlines()
     ]
     Path("printer.cfg").write_text("\n".join(lines) + "\n")
-    assert main("import printer.cfg -o p.yaml --data p.csv".split()) == 0
+    assert main(IMPORT.split()) == 0
 
 
 def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root) -> None:

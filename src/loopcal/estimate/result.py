@@ -314,6 +314,7 @@ class Identification:
             "chi_square": test.chi_square,
             "degrees": test.degrees,
             "p_value": test.p_value,
+            "residuals_alone": None if test.residuals is None else test.residuals._asdict(),
             "noise": test.noise,
             "sigma_scale": test.sigma_scale if self.converged else None,
             "prior_conflict": self.prior_conflict,

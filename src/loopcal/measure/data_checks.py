@@ -34,8 +34,8 @@ from nominal then predicts a small change of a large motion.
 """
 
 LARGEST_TILT = 0.25
-"""Largest rotation of the base [rad], and displacement in sizes of the robot, with which values count
-as constant by design. End stops that are wrong by millimeters tilt the bed of a printer.
+"""Largest rotation of the base [rad], and displacement in sizes of the robot, with which values
+count as constant by design. End stops that are wrong by millimeters tilt the bed of a printer.
 """
 
 

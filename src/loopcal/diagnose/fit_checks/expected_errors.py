@@ -122,8 +122,9 @@ def _unpredicted(code: str, **data: Any) -> CalibrationGain:
 
 
 def _rms_errors(factor: FloatArray, size: float) -> tuple[float, float]:
-    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k); 0 where
-    they are rounding, such as the orientation of a delta of this size [m].
+    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k).
+
+    They are 0 where they are rounding, such as the orientation of a delta of this size [m].
     """
     square = (factor**2).sum(axis=2)
     orientation = float(np.sqrt(square[:, :3].sum(axis=1).mean()))
