@@ -59,7 +59,8 @@ class PoseFit:
     ----------
     solution : of n poses. is_determined : (n,) poses that the data determine.
     absorbed : (n,) number of residuals of rows that each pose takes up, which are its unknowns less
-        its recorded uncertain readings; poses that rows link are counted at the first of them. left : (n,) number of residuals of its linked poses that are left.
+        its recorded uncertain readings; poses that rows link are counted at the first of them.
+    left : (n,) number of residuals of its linked poses that are left.
     reading_residuals : (n, actuators) true minus recorded readings in units of their sigma, zero
         where exact or not taken.
     """
