@@ -217,6 +217,11 @@ def test_values_that_cannot_be_compared_are_refused_or_undecided(tmp_path) -> No
     arm, tower = "arm1.length", "tower3.angle"
     with pytest.raises(EstimationError, match=r"stored value of arm1.length is .* keeps it at"):
         compare_with_values(fit, {"radius": 0.1, arm: 0.9})
+    near = 1e3 * float(robot.values[robot.parameters.index(arm)]) + 0.05
+    with pytest.raises(
+        EstimationError, match=rf"{arm} is {near:.9g} mm, .* at {near - 0.05:.9g} mm"
+    ):
+        compare_with_values(fit, {arm: 1e-3 * near})
     with pytest.raises(EstimationError, match="another frame"):
         compare_with_values(fit, {tower: truth[robot.parameters.index(tower)] + 0.02})
     with pytest.raises(EstimationError, match=r"'radiu' is not a parameter.*radius"):

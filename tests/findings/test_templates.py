@@ -52,3 +52,11 @@ def test_only_templates_with_conditions_or_phrases_depend_on_data():
     assert depends_on_data("{n:if|some}")
     assert depends_on_data("{motion()}")
     assert not depends_on_data("{n:count pose} of {robot!r}")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1484.5, "1484 mm"), (999.7, "1000 mm"), (-23456.0, "-23456 mm"), (0.0123456, "0.0123 mm")],
+)
+def test_quantities_of_thousands_have_no_power_of_ten(value, text) -> None:
+    assert str(Quantity(value, "mm")) == text

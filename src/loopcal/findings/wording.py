@@ -40,7 +40,9 @@ class Quantity(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
-        """Return three significant digits and the unit."""
+        """Return three significant digits and the unit; whole numbers below a million."""
+        if 999.5 <= abs(self.value) < 1e6:
+            return f"{self.value:.0f} {self.unit}".rstrip()
         return f"{round_to_digits(self.value)} {self.unit}".rstrip()
 
 
