@@ -22,5 +22,5 @@ def read_report(text: str) -> str:
 
     The number of findings that only the full report has is left out.
     """
-    report = text[text.index("Undecided: ") :].split("```")[0]
+    report = text[text.index("Undecided: ") :].partition("```")[0]
     return re.sub(r"\(\d+ more findings", "(more findings", report)
