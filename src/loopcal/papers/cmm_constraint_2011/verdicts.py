@@ -154,7 +154,7 @@ def _judge_fifty(words: Wording, results: Results) -> tuple[Verdict, ...]:
         "aligned": (ALIGNED, LS),
         "prior": (ALIGNED, PRIOR),
     }
-    changes = {
+    changes: dict[str, Any] = {
         name: [_format_change(fifty, *how) for fifty in (one, five)] for name, how in frames.items()
     }
     falls = [
@@ -197,6 +197,10 @@ def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
         for n, c in results.draws[0].weights.items()
     }
     noises = [row.noise / MM for row in forms.rows]
+    medians: dict[str, Any] = {
+        name: max(row.median for row in forms.rows if row.noise / MM == noise)
+        for name, noise in (("loud", max(noises)), ("calm", min(noises)))
+    }
     return (
         words.judge(
             "prior", draws=priors, sure=100 * SURE, count=len(results.cells),
@@ -212,8 +216,7 @@ def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
             "forms", covariance=forms.covariance, compared=sum(row.converged for row in forms.rows),
             largest=max((row.largest for row in forms.rows if row.converged), default=np.nan),
             fits=sum(row.machines for row in forms.rows), noise=max(noises), least=min(noises),
-            **{name: max(row.median for row in forms.rows if row.noise / MM == noise)
-               for name, noise in (("loud", max(noises)), ("calm", min(noises)))},
+            **medians,
         ),
         words.judge(
             "converged", hardest=forms.hardest, noise=forms.hardest.noise / MM,
