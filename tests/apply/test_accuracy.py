@@ -123,7 +123,7 @@ def test_rotation_of_the_platform_frame_is_left_out_and_reported(fit_5):
     assert np.isfinite(result.sd).all()
     assert result.reference.code == "accuracy.frame"
     assert result.reference.data["fitted"] == ("platform",)
-    assert "after the best rigid fit of the platform frame" in result.frame
+    assert "after the best rigid fit of the platform frame over the measured poses" in result.frame
 
 
 def make_base_unobservable(fit, extra=None):

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.diagnose import NO_MOTION, ErrorFrame, choose_error_frame, twist_weights
 from loopcal.diagnose.error_frames import FITTED, RELATIVE, solve_home
+from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
@@ -203,6 +204,9 @@ def _covariance(
     if sigma.any():
         factors.append(H @ (S.readings[0] * sigma))
     root = np.concatenate(factors, axis=2)
+    # such as at the pose to which errors are relative
+    is_rounding = np.linalg.norm(root, axis=2) < ROUNDING * twist_weights(robot)[[3, 3, 3, 0, 0, 0]]
+    root[is_rounding] = 0.0
     covariance = root @ root.swapaxes(1, 2)
     if is_infinite.any():
         unknown = posterior.directions[:, is_infinite]

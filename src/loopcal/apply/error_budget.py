@@ -168,7 +168,7 @@ def _compute_effects(fit: Identification, solution: Solution, frame: str) -> Pos
         H @ chosen.relate(D, solution.T),
         H @ chosen.own_errors(solution.T),
         H @ (S.readings[0] * sigma),
-        chosen.describe(),
+        chosen.describe(axes=""),
     )
 
 

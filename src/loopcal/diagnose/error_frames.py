@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,7 @@ from loopcal.mechanism import (
 )
 from loopcal.typing import FloatArray
 
+Over = Literal["measured", "home", "predicted"]
 FITTED, BASE, RELATIVE = "fitted", "base", "relative"
 """Frames that exist for every calibration; the others are the names of its instruments' frames."""
 
@@ -62,6 +64,8 @@ class ErrorFrame:
     fitted : frames of which motions are fitted: (), ("base",), ("platform",) or both.
     undetermined : frames that the measurements do not determine, and that are not fitted.
     origin : name of the pose to which others are relative; "" in other frames.
+    over : the poses over which frames are fitted: "measured", "home" (poses about home) or
+        "predicted" (the poses whose errors are stated).
     """
 
     name: str
@@ -71,6 +75,7 @@ class ErrorFrame:
     fitted: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
     origin: str = ""
+    over: Over = "measured"
 
     def relate(self, twists: FloatArray, T: FloatArray) -> FloatArray:
         """Return twists (n, 6, p) of poses T (n, 4, 4) by the parameters, relative to the frame."""
@@ -81,16 +86,25 @@ class ErrorFrame:
         return -frame_twists(T, self.size) @ self.own
 
     def describe(self, point: str = "tool", axes: str = "base") -> Finding:
-        """Return point, axes and frame in words."""
+        """Return point, axes and frame in words; without axes for errors that are distances."""
         return report_finding(
             "accuracy.frame",
             point=point,
             axes=axes,
             frame=self.name,
             fitted=self.fitted,
+            over=self.over,
             undetermined=self.undetermined,
             origin=self.origin,
         )
+
+
+class ReferencePoses(NamedTuple):
+    """Poses over which frames are fitted: T (m, 4, 4), twists (m, 6, p), and which they are."""
+
+    T: FloatArray
+    twists: FloatArray
+    over: Over
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +154,7 @@ def fit_unfixed_frames(posterior: Posterior) -> FrameFit:
     """Return the fit of the motions of frames that a calibration does not determine, over its
     measured poses.
     """
-    T, _ = reference_poses(posterior)
+    T = reference_poses(posterior).T
     return fit_frames(posterior.robot, T, list_unfixed_motions(posterior))
 
 
@@ -205,7 +219,7 @@ class FollowedMotion:
 def refer_errors(
     robot: Mechanism,
     frame: str,
-    reference: tuple[FloatArray, FloatArray],
+    reference: ReferencePoses,
     motions: FloatArray,
     followed: FollowedMotion | None = None,
 ) -> ErrorFrame:
@@ -213,11 +227,11 @@ def refer_errors(
 
     Parameters
     ----------
-    reference : poses (m, 4, 4) over which frames are fitted, and their twists (m, 6, p).
+    reference : poses over which frames are fitted.
     motions : (12, k) that the measurements do not determine; those that `followed` leaves are
         fitted, unless the frame is "base".
     """
-    T, twists = reference
+    T, twists, over = reference
     p = twists.shape[2]
     nothing = FollowedMotion(
         np.zeros((MOTIONS, MOTIONS)), np.zeros((MOTIONS, p)), np.zeros((MOTIONS, 0))
@@ -230,10 +244,10 @@ def refer_errors(
     if frame == BASE or not moved:
         undetermined = moved if frame == BASE else ()
         return ErrorFrame(
-            frame, robot.size, begin.by_parameters, begin.own, (), undetermined, begin.name
+            frame, robot.size, begin.by_parameters, begin.own, (), undetermined, begin.name, over
         )
     by_parameters, own = begin.by_parameters + extra, begin.own - fit(M @ begin.own)
-    return ErrorFrame(frame, robot.size, by_parameters, own, moved, (), begin.name)
+    return ErrorFrame(frame, robot.size, by_parameters, own, moved, (), begin.name, over)
 
 
 def follow_pose(
@@ -285,8 +299,8 @@ def list_unfixed_motions(posterior: Posterior) -> FloatArray:
     return u[:, s > FIT_TOLERANCE]
 
 
-def reference_poses(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-    """Return the poses (m, 4, 4) over which frames are fitted, and their twists (m, 6, p).
+def reference_poses(posterior: Posterior) -> ReferencePoses:
+    """Return the poses over which frames are fitted.
 
     They are the measured poses; poses about home where a run folder does not name these.
     """
@@ -297,7 +311,8 @@ def reference_poses(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     reached = state.status[0] == Status.CONVERGED
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
     usable = reached & np.isfinite(D).all(axis=(1, 2))
-    return state.T[0, usable], D[usable][:, :, posterior.places] * posterior.unit
+    twists = D[usable][:, :, posterior.places] * posterior.unit
+    return ReferencePoses(state.T[0, usable], twists, "measured" if is_named else "home")
 
 
 def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:

@@ -154,7 +154,7 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         before=problem.predict_errors(np.zeros(0, dtype=np.int64)),
         random=_predict_random(problem, n, criterion, rng),
         after=after,
-        frame=problem.prediction.frame.describe(),
+        frame=problem.prediction.frame.describe(axes=""),
     )
     quality = DesignQuality(
         _compute_figures(problem, rows[chosen]),

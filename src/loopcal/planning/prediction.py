@@ -20,6 +20,7 @@ from loopcal.diagnose.error_frames import (
     BASE,
     FITTED,
     RELATIVE,
+    ReferencePoses,
     check_frame,
     follow_pose,
     refer_errors,
@@ -105,7 +106,9 @@ def linearize_prediction(
         home = observe_poses(free, solve_home(free.robot).q)
         own = np.zeros((6, 0))
         followed = follow_pose(free.robot, home.T[0, 0], home.twists[0, 0], own, "home")
-    chosen = refer_errors(free.robot, frame, (T, twists), unfixed, followed)
+    chosen = refer_errors(
+        free.robot, frame, ReferencePoses(T, twists, "predicted"), unfixed, followed
+    )
     if chosen.undetermined and free.assumed.any():
         missing = int(free.assumed.sum())
         raise EstimationError(

@@ -108,7 +108,7 @@ def estimate_calibration_gain(
         "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
         position=_quantities(fit.robot, Dimension.LENGTH, *pairs[0]),
         orientation=_quantities(fit.robot, Dimension.ANGLE, *pairs[1]),
-        **chosen_frame.describe().data,
+        **chosen_frame.describe(axes="").data,
     )
     return CalibrationGain(
         position_before, position_after, angle_before, angle_after, is_worthwhile, finding

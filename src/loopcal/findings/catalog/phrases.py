@@ -229,11 +229,21 @@ def error_sources(data: Data) -> str:
             continue
         total, sources = data[name]
         parts = [f"{words[key]} {_quantity(sources[key])}" for key in words if key in sources]
-        sentences.append(f"{name} {_quantity(total)}, from {list_names(parts)}")
-    if not sentences:
-        return "none"
-    missing = "" if data["repeatability_stated"] else " (repeatability of the actuators not stated)"
-    return "; ".join(sentences) + missing
+        sentences.append(f"{name} {_quantity(total)} ({', '.join(parts)})")
+    return "; ".join(sentences) or "none"
+
+
+FITTED_POSES = {
+    "measured": "the measured poses",
+    "home": "poses about home",
+    "predicted": "the workspace",
+}
+"""Poses over which frames are fitted -> words."""
+
+
+def fitted_poses(data: Data) -> str:
+    """Return over which poses frames are fitted."""
+    return FITTED_POSES[data["over"]]
 
 
 def _quantity(value: Any) -> str:
