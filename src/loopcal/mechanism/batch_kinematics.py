@@ -194,11 +194,10 @@ def _follow_path(
     alive = np.arange(len(trial))
     for count in PATH_STEPS:
         zero = np.zeros(len(alive), int)
-        current = begun = select_rows(first, (len(trial), 1), alive, zero)
-        for step in range(1, count + 1):
-            q = origin[alive] + (target[alive] - origin[alive]) * (step / count)
-            solved = engine.solve(robot.program, displacements[alive], q, current)
-            current = _clear_sign(robot, solved)
+        begun = select_rows(first, (len(trial), 1), alive, zero)
+        path = origin[alive], target[alive]
+        leave = count == PATH_STEPS[-1]
+        current = _take_steps(robot, displacements[alive], path, begun, count, leave)
         result = replace_rows(result, alive, zero, current)
         alive = alive[_find_wrong_rows(robot, current, begun)[:, 0]]
         if not len(alive):
@@ -210,6 +209,41 @@ def _follow_path(
     other = closed & (result.closure_sign != first.closure_sign)
     status = np.where(other, np.int8(Status.OTHER_MODE), status)
     return replace_rows(state, trial, pose, replace(result, status=status))
+
+
+def _take_steps(
+    robot: Mechanism,
+    e: FloatArray,
+    path: tuple[FloatArray, FloatArray],
+    begin: State,
+    count: int,
+    leave: bool,
+) -> State:
+    """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
+
+    With `leave`, a row that fails on the way goes to the end at once: there the path leaves the
+    reach of the robot, and each further step would use all its iterations.
+    """
+    origin, target = path
+    current, moving = begin, np.arange(len(target))
+    for step in range(1, count + 1):
+        zero = np.zeros(len(moving), int)
+        q = origin[moving] + (target[moving] - origin[moving]) * (step / count)
+        solved = engine.solve(
+            robot.program, e[moving], q, select_rows(current, (len(target), 1), moving, zero)
+        )
+        current = replace_rows(current, moving, zero, _clear_sign(robot, solved))
+        if leave and step < count:
+            failed = moving[current.status[moving, 0] != Status.CONVERGED]
+            if len(failed):
+                zero = np.zeros(len(failed), int)
+                state = select_rows(current, (len(target), 1), failed, zero)
+                solved = engine.solve(robot.program, e[failed], target[failed], state)
+                current = replace_rows(current, failed, zero, _clear_sign(robot, solved))
+                moving = np.setdiff1d(moving, failed)
+                if not len(moving):
+                    break
+    return current
 
 
 def _inverse_with_shared_drives(
