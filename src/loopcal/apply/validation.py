@@ -137,7 +137,7 @@ class Validation:
 
     @property
     def frame(self) -> str:
-        """In which frame the errors are, in words: "absolute", or the setup that was fitted."""
+        """In which frame the errors are, in words: the stated one, or the setup that was fitted."""
         return describe_frame(self.after, (*self.alignment["kept"], *self.alignment["fitted"]))
 
     def improvement(self, index: str = "position", statistic: str = "rms") -> float:

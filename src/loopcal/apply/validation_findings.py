@@ -99,7 +99,7 @@ def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
     if setup:
         return f"after the best fit of {list_names(setup, 6)}"
     if {"position", "orientation"} & errors.quantities.keys():
-        return "absolute (stated frame)"
+        return "in the stated frame"
     return "without any frame"
 
 
