@@ -26,11 +26,14 @@ from loopcal.estimate.inference.posterior import Posterior, compute_posterior
 from loopcal.estimate.trial_posteriors import compute_trial_posterior
 from loopcal.io import load_robot
 from loopcal.measure import (
-    KINDS,
+    Component,
+    Distance,
     Gaussian,
     Instrument,
     Kind,
     Measurements,
+    Pose,
+    Position,
     Sensor,
     Trials,
     sample_truth,
@@ -92,14 +95,12 @@ class Setup:
 
 def list_setups() -> tuple[Setup, ...]:
     """Return the five set-ups."""
-    tracked = KINDS["position"](
-        targets=("a", "b", "c"), places=TARGETS, unknown=("frame",), frame="tracker"
-    )
-    unknown = KINDS["position"](
+    tracked = Position(targets=("a", "b", "c"), places=TARGETS, unknown=("frame",), frame="tracker")
+    unknown = Position(
         targets=("a", "b", "c"), places=TARGETS, unknown=("frame", "targets"), frame="tracker"
     )
     bars = tuple(
-        KINDS["distance"](
+        Distance(
             anchor=np.array(place),
             anchor_name=f"ball{i}",
             targets=("a", "b"),
@@ -108,9 +109,9 @@ def list_setups() -> tuple[Setup, ...]:
         )
         for i, place in enumerate(ANCHORS, 1)
     )
-    probe = KINDS["component"](("z",))
+    probe = Component(("z",))
     return (
-        Setup("full pose in a known frame", "hexapod-42", (KINDS["pose"](),), 40),
+        Setup("full pose in a known frame", "hexapod-42", (Pose(),), 40),
         Setup("tracker with an unknown frame", "hexapod-42", (tracked,), 40),
         Setup("three unknown targets, unknown tracker frame", "hexapod-42", (unknown,), 40),
         Setup("ball bars from three unknown points to two", "hexapod-42", bars, 60),

@@ -146,6 +146,7 @@ def test_few_poses_and_noise_are_not_called_larger():
     exact = simulate(robot, hexapod_poses(40, 1), TARGETS, 3)
     calibrated = calibrate(robot, exact, CalibrationOptions(hold_out=0.25))
     assert "gates.errors-grew" not in list_codes(calibrated.findings)
+    assert calibrated.validation is not None
     assert all(change.is_noise for change in calibrated.validation.changes().values())
 
 

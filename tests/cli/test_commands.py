@@ -291,8 +291,8 @@ def test_simulate_draws_uniform_noise_with_the_stated_sigma(run, tmp_path) -> No
     assert 0.99 * limit < np.abs(noise).max() < limit + 1e-9  # [m], digits of the file
     assert noise.std() == pytest.approx(1e-6, rel=0.08)  # 5 sd of the sd of 600 values
     assert np.abs(gaussian).max() > 1.3 * limit
-    weights = [data.observations[0].weight for data in (uniform, normal)]
-    np.testing.assert_array_equal(*weights)  # the file states the sigma
+    weights = (uniform.observations[0].weight, normal.observations[0].weight)
+    np.testing.assert_array_equal(weights[0], weights[1])  # the file states the sigma
     code, _, err = run("simulate hexapod-42 --fill normal.csv --distribution uniform -o x.csv")
     assert code == 1
     assert "--distribution" in err

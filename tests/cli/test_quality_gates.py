@@ -77,9 +77,8 @@ def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
     folder_with_wrong_cell, capsys, monkeypatch, hold_out
 ) -> None:
     def raise_data_error(*_):
-        counts = {"poses": 10, "before": 10, "after": 0}
         code = "residuals.calibrated-out-of-reach"
-        raise DataError(report_finding(code, robot="hexapod-42", **counts))
+        raise DataError(report_finding(code, robot="hexapod-42", poses=10, before=10, after=0))
 
     monkeypatch.setattr("loopcal.workflow.calibration.validate", raise_data_error)
     assert (

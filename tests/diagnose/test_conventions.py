@@ -479,10 +479,14 @@ def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None
     order.
     """
     from loopcal.measure import Observations
-    from loopcal.papers.hexapod_42.published import MM, load_nominal_machine, read_published
+    from loopcal.papers.hexapod_42.published import (
+        MM,
+        TO_PRINTED,
+        load_nominal_machine,
+        read_published,
+    )
     from loopcal.papers.hexapod_42.steps import ORDER, Study, to_measurements
     from loopcal.papers.hexapod_42.study import round_to_degrees
-    from loopcal.papers.hexapod_42.verdicts import TO_PRINTED
 
     printed, robot = read_published(), load_nominal_machine()
     study = Study(robot, robot, round_to_degrees(printed.nominal_poses), ORDER)

@@ -375,11 +375,12 @@ def test_outlier_search_reports_progress():
 def test_cyclic_outlier_search_is_not_converged_and_lists_its_suspects():
     """Blocks 0 and 1 mask each other: each is suspected while the other is excluded."""
 
-    def ask(aside: np.ndarray) -> PartialFit:
+    def ask(excluded: np.ndarray) -> PartialFit:
         distance = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
-        distance[0 if aside[1] else 1] = 100.0
+        distance[0 if excluded[1] else 1] = 100.0
         one = np.ones(6, dtype=np.int64)
-        return PartialFit(aside, Influence(np.full(6, 0.1), one, distance, one, distance), 1.0, 4)
+        influence = Influence(np.full(6, 0.1), one, distance, one, distance)
+        return PartialFit(excluded, influence, 1.0, 4)
 
     whole = ask(np.zeros(6, dtype=bool))
     visited = search_suspects(ask, whole, whole, 0.01, 3)

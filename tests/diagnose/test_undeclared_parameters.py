@@ -18,6 +18,7 @@ from loopcal.measure import (
     Gaussian,
     Inclination,
     Instrument,
+    Measurements,
     Pose,
     Position,
     Sensor,
@@ -33,7 +34,7 @@ STATION = geometry.make_pose(
 )
 
 
-def write_in_frame(name: str, kind, frame) -> object:
+def write_in_frame(name: str, kind, frame) -> Measurements:
     """Return data of a kind whose instrument stands at `frame`, without stating it."""
     measured = simulate_data(name, replace(kind, T_base_frame=frame), n=20)
     rows = measured.observations[0]
@@ -82,6 +83,7 @@ def test_readings_of_the_other_direction_from_another_zero_are_named(name, colum
     check = compare_conventions(robot, change_readings(simulate_data(name, Pose(), 20), reverse))
     assert check.is_refused
     assert check.other_misfit <= ALLOWED
+    assert check.interpretation is not None
     slips = {one.slip for one in (check.interpretation, *check.alternatives)}
     assert slips & {"reading-zero", "reading-sign"}
 

@@ -5,6 +5,7 @@ and named, and the p value of a right answer is uniform.
 
 import json
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -166,7 +167,7 @@ def test_p_value_of_a_right_answer_is_uniform_and_a_wrong_one_is_rejected(option
 
 def test_stated_sigma_that_is_wrong_decides_unless_it_is_estimated() -> None:
     """A sigma three times too small rejects right answers; estimated noise does not."""
-    accepted = {"given": 0, "estimated": 0}
+    accepted: dict[Literal["given", "estimated"], int] = {"given": 0, "estimated": 0}
     for robot, data, truth in simulate_printers(3.0, 30):
         for basis in accepted:
             options = FitOptions(method=LeastSquares(), noise=basis)

@@ -10,7 +10,7 @@ import pytest
 import loopcal as lc
 from loopcal.diagnose import find_frame_motions, identifiability
 from loopcal.errors import EstimationError, LoopcalError
-from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate import Identification, LeastSquares, identify
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import forward_trials
@@ -27,7 +27,7 @@ WRONG = {
 @pytest.fixture(scope="module")
 def data():
     robot = lc.load_robot("cable-4")
-    instrument = lc.Instrument((lc.Sensor(lc.Component(("z",)), lc.Gaussian([1e-3])),))
+    instrument = lc.Instrument((lc.Sensor(lc.Component(("z",)), lc.Gaussian(np.array([1e-3]))),))
     return lc.simulate(robot, lc.sample_workspace(robot, 6, 1).coordinates, instrument, 1)
 
 
@@ -82,7 +82,8 @@ def test_every_entry_point_answers_in_words(wrong, data, readings_alone, poses):
             result = answer()
         except LoopcalError:
             continue
-        fit = getattr(result, "identification", result)
+        fit = result.identification if isinstance(result, lc.CalibrationReport) else result
+        assert isinstance(fit, Identification)
         assert fit.converged
         (note,) = [f for f in fit.findings if f.code == "fit.poses-open-at-start"]
         assert note.data["poses"] == open_poses.poses

@@ -27,7 +27,7 @@ def data():
     robot = lc.load_robot("3-prs")
     truth = robot.with_values(lc.sample_truth(robot, 1, 1)[0])
     kind = lc.Component(("x", "y", "z", "phi", "theta"), "tilt-torsion")
-    instrument = lc.Instrument((lc.Sensor(kind, lc.Gaussian([2e-4] * 3 + [5e-4] * 2)),))
+    instrument = lc.Instrument((lc.Sensor(kind, lc.Gaussian(np.array([2e-4] * 3 + [5e-4] * 2))),))
     coordinates = lc.sample_workspace(robot, 15, 2).coordinates
     return robot, lc.simulate(truth, coordinates, instrument, 3)
 
@@ -52,6 +52,7 @@ def test_score_and_value_of_gcv_are_the_minimum_of_its_formula(data):
     robot, measured = data
     fit = identify(robot, measured, Ridge(GCV()))
     chosen = fit.regularization
+    assert chosen is not None
     assert (chosen.parameter, chosen.rule) == ("lam", "GCV")
     s, c, rest = rows_at(fit.robot, measured)
     m = measured.n_rows
@@ -70,6 +71,7 @@ def test_truncation_reports_the_directions_that_remain(data):
     robot, measured = data
     fit = identify(robot, measured, TruncatedSVD(TruncationGCV()))
     chosen = fit.regularization
+    assert chosen is not None
     assert (chosen.parameter, chosen.rule) == ("k", "TruncationGCV")
     assert chosen.effective == chosen.value <= chosen.rank == fit.rank == 32
     s, c, rest = rows_at(fit.robot, measured)
@@ -93,6 +95,7 @@ def test_every_rule_is_reported(data, method, parameter, value, rule):
     robot, measured = data
     fit = identify(robot, measured, method)
     chosen = fit.regularization
+    assert chosen is not None
     assert (chosen.parameter, chosen.rule) == (parameter, rule)
     assert value is None or chosen.value == value
     assert (chosen.score is None) == (rule == "fixed")
@@ -119,6 +122,7 @@ def test_a_minimum_at_the_end_of_the_range_is_a_warning():
     for seed in range(8):
         measured = lc.simulate(robot, lc.sample_workspace(robot, 20, 2).coordinates, _pose(), seed)
         chosen = identify(robot, measured, Ridge(MarginalLikelihood())).regularization
+        assert chosen is not None
         at_limit.append(chosen.is_at_limit)
         if chosen.is_at_limit:
             assert chosen.finding.code == "fit.regularization-at-limit"
@@ -127,7 +131,7 @@ def test_a_minimum_at_the_end_of_the_range_is_a_warning():
 
 
 def _pose() -> lc.Instrument:
-    return lc.Instrument((lc.Sensor(lc.Pose(), lc.Gaussian([1e-2] * 6)),))
+    return lc.Instrument((lc.Sensor(lc.Pose(), lc.Gaussian(np.full(6, 1e-2))),))
 
 
 @pytest.mark.parametrize(

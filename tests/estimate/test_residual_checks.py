@@ -119,7 +119,9 @@ def test_orientation_that_a_delta_cannot_have_neither_decides_nor_appears():
     """Its expected errors are rounding, 1e-16 degrees before and a third of that after."""
     robot = lc.load_robot("linear-delta")
     for sigma, is_worthwhile in ((1e-5, True), (0.05, False)):
-        instrument = lc.Instrument((lc.Sensor(lc.Component(("z",)), lc.Gaussian([sigma])),))
+        instrument = lc.Instrument(
+            (lc.Sensor(lc.Component(("z",)), lc.Gaussian(np.array([sigma]))),)
+        )
         coordinates = lc.sample_workspace(robot, 20, 1).coordinates
         data = simulate(robot, coordinates, instrument, 1)
         gain = estimate_calibration_gain(identify(robot, data), data)

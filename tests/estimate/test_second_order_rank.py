@@ -138,7 +138,7 @@ def test_residuals_do_not_change_the_rank_of_other_kinds(kind):
     the rank of one without residuals."""
     assert not kind.mixes_components
     robot = lc.load_robot("hexapod-42")
-    sigma = [1e-5] * len(kind.noise_columns)
+    sigma = np.full(len(kind.noise_columns), 1e-5)
     instrument = lc.Instrument((lc.Sensor(kind, lc.Gaussian(sigma)),))
     wrong = robot.with_values(lc.sample_truth(robot, 1, 1)[0])
     exact, far = (identifiability(robot, _simulate(r, instrument)).rank for r in (robot, wrong))

@@ -198,7 +198,7 @@ def fit_targets(name, unknown, drop=()):
     """Return the codes of findings on the setup of a robot with two targets in a tracker frame."""
     robot, _, poses = make_machine(name, 25)
     places = np.array([[0.06, 0.0, 0.01], [-0.03, 0.05, 0.02]])
-    kind = lc.KINDS["position"](targets=("a", "b"), places=places, unknown=unknown, frame="tracker")
+    kind = lc.Position(targets=("a", "b"), places=places, unknown=unknown, frame="tracker")
     instrument = Instrument((make_sensor(kind, Gaussian, 20 * UM),))
     data = simulate(robot, poses, instrument, 1)
     if drop:

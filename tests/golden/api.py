@@ -591,7 +591,7 @@ def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Rep
     return {
         "names": [c.name for c in result.candidates],
         "parameters": [list(c.parameters) for c in result.candidates],
-        "scores": [c.validation.score for c in result.candidates],
+        "scores": [c.score for c in result.candidates],
         "chosen": result.chosen.name,
         "best": result.best.name,
     }

@@ -45,12 +45,16 @@ class Randomizer:
             return self._randomize_array(np.array(value)).item()
         if isinstance(value, str):
             return self._randomize_text(value)
+        if type(value) is list:
+            return [self.randomize(x) for x in value]
+        if type(value) is tuple:
+            return tuple(map(self.randomize, value))
         if is_dataclass(value) and not isinstance(value, type):
             stored = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
             return replace(value, **{key: self.randomize(x) for key, x in stored.items()})
         if isinstance(value, Mapping):
             return {key: self.randomize(x) for key, x in value.items()}
-        return type(value)(map(self.randomize, value)) if type(value) in (tuple, list) else value
+        return value
 
     def _randomize_array(self, value: np.ndarray) -> np.ndarray:
         rng, spread = self.rng, self.spread

@@ -425,8 +425,13 @@ def test_tables_state_accuracy_after_commanding(results) -> None:
         table = make_medians(draws)
         place = table.columns.index("phi and theta after commanding [deg]")
         rows = {row[0]: row for row in table.rows}
-        assert rows[TRUE][place] < 1e-9
-        assert rows[BEFORE][place] > 10.0 * rows[PRIOR][place] > 0.0
+        errors = {name: row[place] for name, row in rows.items()}
+        exact, before, prior = errors[TRUE], errors[BEFORE], errors[PRIOR]
+        assert isinstance(exact, float)
+        assert isinstance(before, float)
+        assert isinstance(prior, float)
+        assert exact < 1e-9
+        assert before > 10.0 * prior > 0.0
         floor = rows[TRUE][place - 1]
         assert rows[PRIOR][place - 1] == pytest.approx(floor, rel=0.1)
         assert rows[HINDSIGHT][place] is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -137,7 +138,9 @@ def report_left_out(data: Measurements, compared: PredictionComparison) -> list[
         "validation.poses-estimated": estimated,
     }
     named = {code: [data.labels[i] for i in np.flatnonzero(out)] for code, out in cases.items()}
-    extra = {"validation.poses-estimated": {"absorbed": int(compared.absorbed.sum())}}
+    extra: dict[str, dict[str, Any]] = {
+        "validation.poses-estimated": {"absorbed": int(compared.absorbed.sum())}
+    }
     return [
         report_finding(code, names=tuple(f"pose {name}" for name in names), **extra.get(code, {}))
         for code, names in named.items()

@@ -257,19 +257,18 @@ def follow_pose(
     its twists (6, p) by the parameters, and like its own errors (6, k).
     """
     M = frame_twists(T, robot.size)
-    motions = [np.linalg.solve(M[:, :6], columns) for columns in (M, twists, own)]
-    return FollowedMotion(*(_as_base_motion(motion) for motion in motions), name)
+    by_frames, by_parameters, by_own = (
+        _as_base_motion(M[:, :6], columns) for columns in (M, twists, own)
+    )
+    return FollowedMotion(by_frames, by_parameters, by_own, name)
 
 
 def _follow_instrument(posterior: Posterior, frame: InstrumentFrame) -> FollowedMotion:
     """Return the motions of the base that move it like the frame of an instrument."""
     of_frame = frame_twists(frame.T, posterior.robot.size)[:, :6]
-    moved = [
-        np.linalg.solve(of_frame, twists)
-        for twists in (frame.by_parameters * posterior.unit, frame.own)
-    ]
+    by_parameters = _as_base_motion(of_frame, frame.by_parameters * posterior.unit)
     by_frames = np.diag(np.repeat([1.0, 0.0], 6))
-    return FollowedMotion(by_frames, *(_as_base_motion(motion) for motion in moved))
+    return FollowedMotion(by_frames, by_parameters, _as_base_motion(of_frame, frame.own))
 
 
 def solve_home(robot: Mechanism) -> Solution:
@@ -305,8 +304,10 @@ def reference_poses(posterior: Posterior) -> ReferencePoses:
     They are the measured poses; poses about home where a run folder does not name these.
     """
     robot, frames = posterior.robot, posterior.frames
-    is_named = frames is not None and len(frames.readings) > 0
-    readings = frames.readings if is_named else probe_readings(robot)
+    if frames is not None and len(frames.readings) > 0:
+        readings = frames.readings
+    else:
+        readings = probe_readings(robot)
     state = forward_trials(robot, robot.values[None], readings[None])
     reached = state.status[0] == Status.CONVERGED
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
@@ -331,6 +332,9 @@ def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tupl
     return ("base", "platform")
 
 
-def _as_base_motion(motion: FloatArray) -> FloatArray:
-    """Return a motion (6, ..) of the base as one of both frames (12, ..)."""
+def _as_base_motion(by_base: FloatArray, twists: FloatArray) -> FloatArray:
+    """Return the motions of both frames (12, k) that are motions of the base only, and that give
+    twists (6, k); `by_base` (6, 6) are the twists by motions of the base.
+    """
+    motion = np.asarray(np.linalg.solve(by_base, twists), dtype=np.float64)
     return np.concatenate([motion, np.zeros_like(motion)])

@@ -179,6 +179,7 @@ def probe_readings(robot: Mechanism) -> FloatArray:
         for a in robot.actuators
     ]
     drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (PROBES, len(home))) * spread
+    readings, reached = home[None], np.ones(1, dtype=bool)
     for share in SHARES:
         readings = home + share * drawn
         reached = find_directly_reachable(robot, robot.values[None], readings[None])[0]

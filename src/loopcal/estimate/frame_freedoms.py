@@ -190,7 +190,7 @@ def _describe_unknown(
             match = np.flatnonzero(path[0] == place)
             if len(match):
                 rows[i] = root[0, match[0]]
-        triangle = np.linalg.qr(rows.T, mode="r")
+        triangle = np.asarray(np.linalg.qr(rows.T, mode="r"))
         own[:, : len(triangle)] = triangle.T
     slope = elimination.slope[0, places] / free.tolerance
     T = setup.place_frame(stated, values)

@@ -59,6 +59,7 @@ def simulate_contacts(
     q, T = _command(robot, commanded, sheet)
     values = _place_surfaces(sheet, T)
     limit = EXACT * min(float(np.min(sensor.noise.sigma)) for sensor in instrument.sensors)
+    largest = np.inf
     for _ in range(STEPS):
         rows = evaluate_measurements(sheet, T[None], values[None])
         shift, largest = _correct_positions(sheet, rows, noise)

@@ -314,7 +314,7 @@ def _is_rigid_motion(
     motions[3:, :3, 3] = h * np.eye(3)
     noise = np.zeros((6, len(T), len(kind.noise_columns)))
     moved = kind.measure(motions[:, None] @ T, noise)
-    at = np.ix_(static.present, static.columns)
+    at = np.ix_(np.flatnonzero(static.present), np.array(static.columns))
     slope = np.stack([(values[at] - predicted[at]).ravel() / h for values in moved], axis=1)
     change = predicted[at] - static.rows.measured[at]
     motion = np.linalg.lstsq(slope, -change.ravel(), rcond=1e-6)[0]

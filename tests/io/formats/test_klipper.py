@@ -176,6 +176,7 @@ def test_record_without_a_part_is_refused_with_its_line(tmp_path, kind, part, nu
         read(tmp_path, text)
     assert refused.value.code == "files.probe-part-missing"
     assert f"without '{kind}{number}{part}'" in str(refused.value)
+    assert refused.value.line is not None
     line = text.splitlines()[refused.value.line - 1]
     assert line.startswith(f"{kind}{number}")
 
@@ -189,6 +190,7 @@ def test_gap_in_the_records_is_refused_with_its_line(tmp_path, kind, number) -> 
         read(tmp_path, text)
     assert refused.value.code == "files.probe-left-out"
     assert f"there is no '{kind}{number}'" in str(refused.value)
+    assert refused.value.line is not None
     assert text.splitlines()[refused.value.line - 1].startswith(f"{kind}{number + 1}")
 
 

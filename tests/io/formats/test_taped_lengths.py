@@ -56,6 +56,7 @@ def fit_samples(folder: Path, samples: dict[str, Any], sigma: float, **options: 
     """Return the fit of some samples; sigma of lines and positions in mm."""
     noise = {"sigma_line": sigma * 1e-3, "sigma_position": sigma * 1e-3}
     robot, imported = read(folder, samples, **noise, **options)
+    assert imported.measurements is not None
     return lc.identify(robot, imported.measurements)
 
 

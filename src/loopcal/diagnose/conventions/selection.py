@@ -338,7 +338,9 @@ def _test_parameters(
     few = _select_few(data)
     zeros = find_zero_interpretations(free, data, few, not misfit > GROSS)
     tests = [_test_one(free, data, few, zero, misfit) for zero in zeros]
-    for count in (1, 2) if reached is not None else ():
+    if reached is None:
+        return tests
+    for count in (1, 2):
         if all(test.misfit > ALLOWED for test in tests):
             few = _select_few(reached)
             setups = list_setup_interpretations(reached, count)

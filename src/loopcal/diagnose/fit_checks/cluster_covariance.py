@@ -321,6 +321,6 @@ def _pose_effects(
     return D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
 
 
-def _not_compared(code: str, **data: int) -> ClusterCheck:
+def _not_compared(code: str, **data: Any) -> ClusterCheck:
     """Return the reason why there is no comparison."""
     return ClusterCheck("", 0, NO_RATIO, NO_RATIO, ("", np.nan), report_finding(code, **data))

@@ -90,7 +90,7 @@ class HeldOutBlocks:
             kept = ~excluded[numbers]
             rows = np.concatenate([H[kept], residual[kept][..., None]], axis=2)
             stacked.append(rows.reshape(-1, k + 1))
-        triangle = np.linalg.qr(np.concatenate(stacked), mode="r")
+        triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
         R = triangle[:k, :k]
         return R, -np.linalg.solve(R, triangle[:k, k])
 
@@ -235,7 +235,8 @@ def compare_blocks(
     """Return the influence of blocks H (b, m, k) for the factor and solution of `inside` (b,) and
     other blocks.
     """
-    half = np.linalg.solve(triangle.T, np.swapaxes(H, -1, -2)).swapaxes(-1, -2)
+    half = np.asarray(np.linalg.solve(triangle.T, np.swapaxes(H, -1, -2)), dtype=np.float64)
+    half = np.swapaxes(half, -1, -2)
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 

@@ -73,9 +73,9 @@ def describe_regularization(
         value = float(np.atleast_1d(np.asarray(stated(decomposition)))[0])
         rule = getattr(stated, "__name__", type(stated).__name__)
         if callable(measure := getattr(stated, "score", None)):
-            score = float(measure(decomposition, np.full(1, value))[0])
+            score = float(np.asarray(measure(decomposition, np.full(1, value)))[0])
         if callable(is_limit := getattr(stated, "is_limit", None)):
-            is_at_limit = bool(is_limit(decomposition, np.full(1, value))[0])
+            is_at_limit = bool(np.asarray(is_limit(decomposition, np.full(1, value)))[0])
     else:
         value = float(np.max(stated))
     return Regularization(

@@ -101,7 +101,8 @@ def remove_null_space(
     factor, reference : (t, p + 1, p + 1) upper triangular, of rows [A | b] with the same columns.
     """
     p = factor.shape[-1] - 1
-    finite = np.isfinite(reference).all(axis=(1, 2)) & np.isfinite(factor).all(axis=(1, 2))
+    finite = np.isfinite(reference).all(axis=(1, 2))
+    finite = np.asarray(finite & np.isfinite(factor).all(axis=(1, 2)))
     _, s, vt = np.linalg.svd(np.where(finite[:, None, None], reference[:, :p, :p], 0.0))
     determined = are_nonzero(s, tolerance)
     changed = np.flatnonzero(finite & ~determined.all(axis=1))

@@ -19,7 +19,7 @@ m residuals (often c), u nuisance parameters of the kind, j joints that it sense
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from functools import cached_property
 from typing import Any, ClassVar, Self, cast
 
@@ -63,6 +63,7 @@ class Kind(ABC):
         Setup items that are unknown.
     """
 
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every kind is a dataclass
     name: ClassVar[str]
     poses_per_row: ClassVar[int] = 1
     changes_with_pose: ClassVar[bool] = True

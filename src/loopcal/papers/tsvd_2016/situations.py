@@ -146,7 +146,7 @@ def run_situation(measured: Study, progress: Callable[[str], None] = lambda _: N
     p, t = len(measured.robot.parameters), len(measured.trials)
     ks = np.arange(p, p // 3, -1)
     penalty = np.concatenate([penalize_truncated(ks, p), penalize_ridge(LAMBDAS, p)])
-    settings = np.concatenate([ks, LAMBDAS])
+    settings = np.concatenate([ks.astype(np.float64), LAMBDAS])
     curves, counts, values, early = [], [], [], []
     for first in range(0, t, TOGETHER):
         progress(f"{measured.name}, {measured.freedoms}-DOF, machine {first + 1} of {t}")
