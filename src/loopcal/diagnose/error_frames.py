@@ -305,15 +305,15 @@ def reference_poses(posterior: Posterior) -> ReferencePoses:
     """
     robot, frames = posterior.robot, posterior.frames
     if frames is not None and len(frames.readings) > 0:
-        readings = frames.readings
+        readings, where = frames.readings, "measured"
     else:
-        readings = probe_readings(robot)
+        readings, where = probe_readings(robot), "home"
     state = forward_trials(robot, robot.values[None], readings[None])
     reached = state.status[0] == Status.CONVERGED
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
     usable = reached & np.isfinite(D).all(axis=(1, 2))
     twists = D[usable][:, :, posterior.places] * posterior.unit
-    return ReferencePoses(state.T[0, usable], twists, "measured" if is_named else "home")
+    return ReferencePoses(state.T[0, usable], twists, where)
 
 
 def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:
