@@ -15,7 +15,7 @@ def test_unreachable_readings_take_few_solutions_and_stay_marked(monkeypatch) ->
         calls.append(1)
         return solve(*args, **options)
 
-    monkeypatch.setattr(batch_kinematics.engine, "solve", counted)
+    monkeypatch.setattr(engine, "solve", counted)
     far = 0.45 * np.array([[1.0, 1.0, 1.0, -1.0, -1.0, -1.0], [-1.0, 1.0, -1.0, 1.0, -1.0, 1.0]])
     assert not forward(robot, far).converged.any()
     first, last = batch_kinematics.PATH_STEPS
