@@ -264,8 +264,11 @@ def pose_error(
 
 def _largest(errors: PoseErrors, size: float) -> float:
     """Return the largest error, lengths as a share of the robot's size."""
-    result = np.concatenate([errors.position / size, errors.orientation])
-    return float(result[np.isfinite(result)].max())
+    sizes = [
+        quantity.size / (size if quantity.dimension is Dimension.LENGTH else 1.0)
+        for quantity in errors.quantities.values()
+    ]
+    return float(np.concatenate(sizes).max())
 
 
 def compare_along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:

@@ -96,7 +96,8 @@ def test_noise_free_rows_of_one_kind_recover_the_robot_up_to_its_gauge(case):
     result = recover_machine(case)
     assert not result.refused
     assert result.machine == 0, "only motions of frames stay open"
-    assert result.before > 1e4 * EXACT
+    # 1e4 while an error was the norm over both targets of a row: it is that of one target now
+    assert result.before > 5e3 * EXACT
     assert result.seen < EXACT
     assert result.pose < EXACT
     assert result.parameters < EXACT
