@@ -306,7 +306,7 @@ def collect() -> dict:
             "correct data sets",
             "too few rows",
             "median misfit",
-            "misfit above 10 (alternatives compared)",
+            "misfit above 10",
             "refused",
         ],
         "formats": [".0f", "d", "d", ".2g", "d", "d"],
