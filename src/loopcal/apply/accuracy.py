@@ -200,9 +200,8 @@ def _covariance(
     is_infinite = np.isinf(posterior.variance)
     known = posterior.directions[:, ~is_infinite] * np.sqrt(posterior.variance[~is_infinite])
     factors = [D @ known, H @ frame.own_errors(solution.T)]
-    sigma = np.array([a.sigma or 0.0 for a in robot.actuators])
-    if sigma.any():
-        factors.append(H @ (S.readings[0] * sigma))
+    if robot.stated_sigma.any():
+        factors.append(H @ (S.readings[0] * robot.stated_sigma))
     root = np.concatenate(factors, axis=2)
     # such as at the pose to which errors are relative
     is_rounding = np.linalg.norm(root, axis=2) < ROUNDING * twist_weights(robot)[[3, 3, 3, 0, 0, 0]]
@@ -241,14 +240,7 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
     """
     R = T[:, :3, :3]
     arm = R @ robot.tool[:3, 3] if point == "tool" else np.zeros((len(T), 3))
-    H = np.zeros((len(T), 6, 6))
-    H[:, :3, :3] = H[:, 3:, 3:] = np.eye(3)
-    H[:, 3:, :3] = -geometry.hat(arm)
-    if axes == "platform":
-        turn = np.zeros_like(H)
-        turn[:, :3, :3] = turn[:, 3:, 3:] = R.swapaxes(1, 2)
-        H = turn @ H
-    return H
+    return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,16 +23,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal import geometry
-from loopcal.diagnose.error_frames import FITTED, RELATIVE, choose_error_frame, solve_home
+from loopcal.diagnose.error_frames import FITTED, RELATIVE
 from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
+from loopcal.diagnose.tool_errors import ToolErrors, linearize_tool_errors, locate_measured_poses
 from loopcal.errors import MechanismError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import factor_known_setup, linearize_fit
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.mechanism import Solution, differentiate_pose, forward, sample_workspace
+from loopcal.mechanism import Solution, sample_workspace
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -114,22 +114,11 @@ def compute_error_budget(
     solution, is_workspace = _choose_poses(fit, data)
     if not len(solution.q):
         return None
-    effects = _compute_effects(fit, solution, frame)
+    effects = linearize_tool_errors(fit.posterior, solution, frame)
     angle, position = _split(effects, _split_covariance(fit, data), is_relative=frame == RELATIVE)
     n = len(solution.q)
     finding = _word(fit, (position, angle), n, is_workspace, effects.reference)
     return ErrorBudget(position, angle, n, is_workspace, finding)
-
-
-class PoseEffects(NamedTuple):
-    """Twists (n, 6, ..) of the tool point in a frame: by the parameters in the units of the
-    posterior, by independent errors of the frame itself, and by the readings in their sigmas.
-    """
-
-    by_parameters: FloatArray
-    by_frame: FloatArray
-    by_readings: FloatArray
-    reference: Finding
 
 
 class CovarianceRoots(NamedTuple):
@@ -147,29 +136,10 @@ def _choose_poses(fit: Identification, data: Measurements) -> tuple[Solution, bo
     where it states no workspace; and which of the two.
     """
     try:
-        solution, is_workspace = sample_workspace(fit.robot, POSES, SEED).solution, True
+        solution = sample_workspace(fit.robot, POSES, SEED).solution
     except MechanismError:
-        readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
-        readings = readings[np.isfinite(readings).all(axis=1)]
-        chosen = np.unique(np.linspace(0, len(readings) - 1, min(POSES, len(readings))).astype(int))
-        solution, is_workspace = forward(fit.robot, readings[chosen]), False
-    return solution.take(np.flatnonzero(solution.converged)), is_workspace
-
-
-def _compute_effects(fit: Identification, solution: Solution, frame: str) -> PoseEffects:
-    """Return what parameters, frame and readings do to the tool point at poses."""
-    robot, posterior = fit.robot, fit.posterior
-    chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")
-    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    D = S.parameters[0][..., posterior.places] * posterior.unit
-    H = geometry.transport_matrix(solution.T[:, :3, :3] @ robot.tool[:3, 3])
-    sigma = np.array([actuator.sigma or 0.0 for actuator in robot.actuators])
-    return PoseEffects(
-        H @ chosen.relate(D, solution.T),
-        H @ chosen.own_errors(solution.T),
-        H @ (S.readings[0] * sigma),
-        chosen.describe(axes=""),
-    )
+        return locate_measured_poses(fit, data, POSES), False
+    return solution.take(np.flatnonzero(solution.converged)), True
 
 
 def _split_covariance(fit: Identification, data: Measurements) -> CovarianceRoots:
@@ -194,7 +164,7 @@ def _split_covariance(fit: Identification, data: Measurements) -> CovarianceRoot
 
 
 def _split(
-    effects: PoseEffects, roots: CovarianceRoots, *, is_relative: bool
+    effects: ToolErrors, roots: CovarianceRoots, *, is_relative: bool
 ) -> tuple[ErrorSources, ErrorSources]:
     """Return the sources of the errors of orientation and position.
 

@@ -193,7 +193,7 @@ def choose_error_frame(
             "use another pose, or another frame"
         )
     S = differentiate_pose(robot, robot.values[None], origin.q[None], origin.state)
-    sigma = np.array([actuator.sigma or 0.0 for actuator in robot.actuators])
+    sigma = robot.stated_sigma
     twists = S.parameters[0, 0][:, posterior.places] * posterior.unit
     by_readings = (S.readings[0, 0] * sigma)[:, sigma > 0.0]
     followed = follow_pose(robot, origin.T[0], twists, by_readings, origin_name)

@@ -100,19 +100,18 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
         and readings follow from them, so that no reading can be kept; see
         docs/theory/uncertain-readings.md.
     """
-    stated = [actuator.sigma for actuator in robot.actuators]
     if given is None:
-        if not any(stated):
+        if not robot.stated_sigma.any():
             return None
-        given = np.tile([sigma or 0.0 for sigma in stated], (n, 1))
+        given = np.tile(robot.stated_sigma, (n, 1))
     _check_size(robot, given)
     if robot.program.sigma is not None and np.any(given == 0.0):
         name = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
-            f"the readings of {name} are stated to be exact, but {robot.name!r} has {len(stated)} "
-            f"actuators for {len(robot.freedoms)} degrees of freedom; readings of redundant "
-            "actuators cannot be exact: state a sigma above 0 for each, a small one for very good "
-            "encoders"
+            f"the readings of {name} are stated to be exact, but {robot.name!r} has "
+            f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom; "
+            "readings of redundant actuators cannot be exact: state a sigma above 0 for each, a "
+            "small one for very good encoders"
         )
     return given if np.any(given != 0.0) else None
 

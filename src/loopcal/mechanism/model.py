@@ -184,6 +184,11 @@ class Mechanism:
         return Quantity(value / unit.factor_to_si, unit.symbol)
 
     @property
+    def stated_sigma(self) -> FloatArray:
+        """Standard deviations (a,) of the readings [SI]; 0 where the robot states none."""
+        return np.array([actuator.sigma or 0.0 for actuator in self.actuators])
+
+    @property
     def freedoms(self) -> tuple[str, ...]:
         """Freedoms of the platform."""
         return self.assembly.freedoms

@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal import geometry
-from loopcal.diagnose.error_frames import FITTED, choose_error_frame, solve_home
+from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.independent_units import (
     FEWEST_CLUSTERS,
     Clusters,
     divide_into_clusters,
 )
 from loopcal.diagnose.fit_checks.influence import TESTABLE
+from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.linearization import Linearization
@@ -36,7 +36,6 @@ from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.mechanism import differentiate_pose, forward
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.tree_elimination import fold_at
 from loopcal.typing import BoolArray, FloatArray
@@ -309,14 +308,8 @@ def _pose_effects(
     """Return changes of orientation (3 n, p) and of the tool's position (3 n, p) of the measured
     poses, in a frame, by deviations in tolerances.
     """
-    robot, posterior = fit.robot, fit.posterior
-    readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
-    solution = forward(robot, readings)
-    solution = solution.take(np.flatnonzero(solution.converged))
-    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")
-    H = geometry.transport_matrix(solution.T[:, :3, :3] @ robot.tool[:3, 3])
-    D = H @ chosen.relate(S.parameters[0][..., posterior.places] * posterior.unit, solution.T)
+    posterior = fit.posterior
+    D = linearize_tool_errors(posterior, locate_measured_poses(fit, data), frame).by_parameters
     D, p = D * (fit.tolerance / posterior.unit), len(posterior.unit)
     return D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
 

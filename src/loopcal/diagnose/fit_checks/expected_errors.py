@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from loopcal import geometry
-from loopcal.diagnose.error_frames import FITTED, choose_error_frame, solve_home
+from loopcal.diagnose.error_frames import FITTED
+from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
-from loopcal.mechanism import Mechanism, Status, differentiate_pose, forward_trials
+from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -82,23 +82,15 @@ def estimate_calibration_gain(
         return _unpredicted("model.gain-needs-tolerances", missing=int(free.assumed.sum()))
     if fit.residual_test.failed:
         return _unpredicted("model.gain-needs-consistent-noise")
-    readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
-    chosen = np.linspace(0, len(readings) - 1, min(MOST_POSES, len(readings))).astype(int)
-    readings, values = readings[None, np.unique(chosen)], fit.robot.values[None]
-    state = forward_trials(fit.robot, values, readings)
-    reached = np.asarray(state.status == Status.CONVERGED)[0]
-    parameters = differentiate_pose(fit.robot, values, readings, state).parameters
+    solution = locate_measured_poses(fit, data, MOST_POSES)
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
     posterior = fit.posterior
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
     factor = posterior.directions * np.sqrt(variance)
-    if not reached.any() or np.isnan(factor).any():
+    if not len(solution.q) or np.isnan(factor).any():
         return _unpredicted("model.gain-without-intervals")
-    T = state.T[0, reached]
-    chosen_frame = choose_error_frame(posterior, frame, solve_home(fit.robot), "home")
-    H = geometry.transport_matrix(T[:, :3, :3] @ fit.robot.tool[:3, 3])
-    D = parameters[0, reached][..., free.places] * posterior.unit
-    D, own = H @ chosen_frame.relate(D, T), H @ chosen_frame.own_errors(T)
+    effects = linearize_tool_errors(posterior, solution, frame)
+    D, own = effects.by_parameters, effects.by_frame
     size = fit.robot.size
     angle_before, position_before = _rms_errors(D * (free.tolerance / posterior.unit), size)
     angle_after, position_after = _rms_errors(np.concatenate([D @ factor, own], axis=2), size)
@@ -108,7 +100,7 @@ def estimate_calibration_gain(
         "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
         position=_quantities(fit.robot, Dimension.LENGTH, *pairs[0]),
         orientation=_quantities(fit.robot, Dimension.ANGLE, *pairs[1]),
-        **chosen_frame.describe(axes="").data,
+        **effects.reference.data,
     )
     return CalibrationGain(
         position_before, position_after, angle_before, angle_after, is_worthwhile, finding

@@ -105,8 +105,7 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
     sigma = None
     if any(states_reading_noise(table, robot) for table in tables):
         stated = np.stack([files[i].sigma[row] for i, row in origin.values()])
-        usual = [actuator.sigma or 0.0 for actuator in robot.actuators]
-        sigma = np.where(np.isnan(stated), usual, stated)
+        sigma = np.where(np.isnan(stated), robot.stated_sigma, stated)
     return PoseRows(tuple(origin), readings, sigma, _number_blocks(files, list(origin)), members)
 
 
