@@ -13,6 +13,9 @@ from loopcal.diagnose.cross_validation import cross_validate as cross_validate
 from loopcal.diagnose.cross_validation import score_leave_one_out as score_leave_one_out
 from loopcal.diagnose.error_frames import ErrorFrame as ErrorFrame
 from loopcal.diagnose.error_frames import choose_error_frame as choose_error_frame
+from loopcal.diagnose.fit_checks.adjusted_uncertainty import (
+    adjust_uncertainty as adjust_uncertainty,
+)
 from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
 from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
 from loopcal.diagnose.fit_checks.blunders import Blunder as Blunder

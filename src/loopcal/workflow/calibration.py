@@ -11,6 +11,7 @@ from loopcal.diagnose import (
     ConventionCheck,
     MeasurementSuggestion,
     ModelChoice,
+    adjust_uncertainty,
     check_conventions,
     check_start_values,
     choose_model,
@@ -110,6 +111,7 @@ def calibrate(
         raise DataError(report_finding("data.no-held-out-value"))
     held_out = 0 if split.held_out is None else split.held_out.n_poses
     result = _fit(robot, split.fitted, options, count, held_out)
+    result = replace(result, fit=adjust_uncertainty(result.fit, split.fitted))
     return _report(result, split, conventions, options, count)
 
 
