@@ -295,7 +295,7 @@ def _assemble(
         free_parameters=free,
         covariance=d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance,
         posterior=compute_posterior(
-            corrected, free.places, free.tolerance, d, penalty, variance, frames
+            corrected, free.places, free.tolerance, d, penalty, variance, frames, test.noise_degrees
         ),
         spectrum=Spectrum(
             int(plain.rank[0]), float(plain.condition[0]), plain.singular_values[0], d.tolerance

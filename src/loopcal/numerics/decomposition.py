@@ -198,6 +198,17 @@ class Decomposition(TrialBatch):
         total = np.where(cut, 1.0, square + finite)
         return np.where(cut, np.inf, (sigma2 * square + finite) / total**2)
 
+    def noise_roots(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
+        """Return a square root (t, p, p) of the part of the covariance that the noise of the rows
+        causes, in z / scale: V diag(sigma s_i / (s_i^2 + penalty_i)), zero in directions that are
+        not used.
+        """
+        s = self.singular_values
+        total = s**2 + penalty
+        gain = np.divide(s, total, out=np.zeros_like(s), where=np.isfinite(total) & (total > 0.0))
+        sigma = np.sqrt(np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(s),)))
+        return self.directions * (sigma[:, None] * gain)[:, None, :]
+
     def covariance(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
         """Return the covariance (t, p, p) of the deviation, in the units of the columns.
 

@@ -28,6 +28,30 @@ STORED = {"unit": "unit", "directions": "directions", "variance": "variance", "s
 """Arrays of a run folder (after `PREFIX`), and the attributes that they hold."""
 
 
+NOISE = "noise"
+"""Source of the part of the covariance that the noise of the rows causes."""
+
+PARTS = ("source", "degrees", "root", "part")
+"""Arrays of a run folder (after `PREFIX`) with the parts of the covariance: the source and the
+degrees of freedom of each, the roots beside each other, and the number of the part of each column.
+"""
+
+
+class CovariancePart(NamedTuple):
+    """A part of the covariance of the parameters whose size was estimated from data.
+
+    Attributes
+    ----------
+    source : what causes it: "noise", or the code of the finding with which it was added.
+    root : (p, k) [SI], the part is root root'.
+    degrees : degrees of freedom of its estimated size; infinite where it is known.
+    """
+
+    source: str
+    root: FloatArray
+    degrees: float
+
+
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Free parameters of a robot with their uncertainty.
@@ -41,6 +65,8 @@ class Posterior:
         known.
     frames : which frames the measurements determine; None where it is not known, as in run folders
         of earlier versions.
+    parts : the parts of the covariance whose size was estimated from data, with their degrees of
+        freedom; what they leave of the covariance counts as known.
     """
 
     robot: Mechanism
@@ -50,6 +76,7 @@ class Posterior:
     variance: FloatArray
     determined: BoolArray
     frames: MeasuredFrames | None = None
+    parts: tuple[CovariancePart, ...] = ()
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -68,12 +95,53 @@ class Posterior:
         """(p,) estimates [SI]."""
         return self.robot.values[self.places]
 
+    @property
+    def root(self) -> FloatArray:
+        """(p, k) square root of the covariance [SI], of the k directions of finite variance; NaN
+        without intervals.
+        """
+        is_finite = ~np.isinf(self.variance)
+        return (
+            self.unit[:, None] * self.directions[:, is_finite] * np.sqrt(self.variance[is_finite])
+        )
+
+    def count_degrees(self, effect: FloatArray) -> FloatArray:
+        """Return the effective degrees of freedom (..,) of the size of errors.
+
+        The square of the size of an error `effect` times the deviation of the parameters is the sum
+        of the squares of its c components. Its parts u_i^2 have nu_i degrees of freedom, each with
+        one common factor, so that (Welch-Satterthwaite, JCGM 100 G.4)
+
+            degrees = u^4 / sum(u_i^4 / nu_i)
+
+        Parameters
+        ----------
+        effect : (.., c, p) [per SI].
+
+        Returns
+        -------
+        At least the smallest nu_i; infinite where no part has an effect.
+        """
+        total = _sum_squares(effect @ self.root)
+        spread = np.zeros_like(total)
+        for part in self.parts:
+            spread += _sum_squares(effect @ part.root) ** 2 / part.degrees
+        return np.divide(total**2, spread, out=np.full_like(total, np.inf), where=spread > 0.0)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `posterior_from_arrays` reads."""
         own = {
             PREFIX + name: np.asarray(getattr(self, attribute))
             for name, attribute in STORED.items()
         }
+        parts = self.parts
+        content = (
+            np.array([part.source for part in parts], dtype=np.str_),
+            np.array([part.degrees for part in parts]),
+            np.concatenate([np.zeros((len(self.unit), 0)), *(part.root for part in parts)], axis=1),
+            np.repeat(np.arange(len(parts)), [part.root.shape[1] for part in parts]),
+        )
+        own |= {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
         return own if self.frames is None else {**own, **self.frames.arrays()}
 
 
@@ -85,6 +153,7 @@ def compute_posterior(
     penalty: FloatArray,
     noise: float = 1.0,
     frames: MeasuredFrames | None = None,
+    degrees: float = np.inf,
 ) -> Posterior:
     """Return the posterior of trial 0 of a decomposition.
 
@@ -92,17 +161,22 @@ def compute_posterior(
     ----------
     robot : at the estimate. places, tolerance : (p,) of the free parameters.
     decomposition, penalty : of the fit; columns scaled by tolerance.
-    noise : variance of the whitened rows. frames : which frames the measurements determine.
+    noise : variance of the whitened rows; NaN without intervals.
+    frames : which frames the measurements determine.
+    degrees : degrees of freedom of the noise variance; infinite where it is known.
     """
     directions, variance, determined = decomposition.knowledge(penalty, noise)
+    unit = tolerance * decomposition.scale
+    by_noise = unit[:, None] * decomposition.noise_roots(penalty, noise)[0]
     return Posterior(
         robot=robot,
         places=places,
-        unit=tolerance * decomposition.scale,
+        unit=unit,
         directions=directions,
         variance=variance,
         determined=determined,
         frames=frames,
+        parts=(CovariancePart(NOISE, by_noise, degrees),),
     )
 
 
@@ -149,5 +223,29 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         raise EstimationError(
             report_finding("prior.other-count", identified=len(unit), free=len(places))
         )
-    frames = frames_from_arrays(arrays)
-    return Posterior(robot, places, unit, directions, variance, determined.astype(bool), frames)
+    return Posterior(
+        robot,
+        places,
+        unit,
+        directions,
+        variance,
+        determined.astype(bool),
+        frames_from_arrays(arrays),
+        _parts_from_arrays(arrays),
+    )
+
+
+def _parts_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[CovariancePart, ...]:
+    """Return the parts of the covariance; none for run folders of earlier versions."""
+    if any(PREFIX + name not in arrays for name in PARTS):
+        return ()
+    sources, degrees, roots, number = (arrays[PREFIX + name] for name in PARTS)
+    return tuple(
+        CovariancePart(str(source), roots[:, number == i], float(degrees[i]))
+        for i, source in enumerate(sources.tolist())
+    )
+
+
+def _sum_squares(values: FloatArray) -> FloatArray:
+    """Return the sum of squares over the last two axes."""
+    return np.asarray((values**2).sum(axis=(-2, -1)))

@@ -84,6 +84,11 @@ class ResidualTest:
         return self.noise == "given" and self.decisive.p_value < SIGNIFICANCE
 
     @property
+    def noise_degrees(self) -> float:
+        """Degrees of freedom of the noise variance in the intervals; infinite where it is known."""
+        return self.dof if self.noise == "estimated" and self.intervals else np.inf
+
+    @property
     def finding(self) -> Finding:
         """The result of the test."""
         if not self.converged:
