@@ -31,6 +31,7 @@ class Parameter:
     dimension : length [m], angle [rad] or ratio [1].
     nominal : value by design [SI].
     tolerance : standard deviation of the true value about the nominal one [SI]; None if unknown.
+        An error that it has in common with others is not included, see `CommonError`.
     free : False keeps it at its nominal value.
     scope : the rows that share a value: those of the machine, a session, a group or a pose.
     """
@@ -44,10 +45,33 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class CommonError:
+    """An error that several parameters share, such as that of one batch of arms or of a common zero.
+
+    Each of them deviates by its own error, of its own tolerance, plus the same common error.
+
+    Attributes
+    ----------
+    name : e.g. `batch of rods`. parameters : names of those that share it, of one dimension.
+    tolerance : standard deviation of the common error [SI].
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+    tolerance: float
+
+
+@dataclass(frozen=True)
 class ParameterTable:
-    """Parameters in a fixed order; arrays over it are (p,) and read-only."""
+    """Parameters in a fixed order; arrays over it are (p,) and read-only.
+
+    Attributes
+    ----------
+    entries : the parameters. common : errors that several of them share.
+    """
 
     entries: tuple[Parameter, ...]
+    common: tuple[CommonError, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self._places) < len(self.entries):
@@ -84,9 +108,32 @@ class ParameterTable:
 
     @cached_property
     def tolerance(self) -> FloatArray:
-        """Tolerances (p,) as standard deviations [SI], NaN if none is stated."""
+        """Tolerances (p,) as standard deviations [SI], NaN if none is stated.
+
+        They are those of the whole deviation: sqrt(own^2 + sum of common^2).
+        """
         # None becomes NaN
-        return _freeze(np.array([p.tolerance for p in self.entries], dtype=float))
+        own = np.array([p.tolerance for p in self.entries], dtype=float)
+        if not self.common:
+            return _freeze(own)
+        return _freeze(np.asarray(np.sqrt(own**2 + (self.common_effects**2).sum(axis=1))))
+
+    @cached_property
+    def common_effects(self) -> FloatArray:
+        """(p, k) standard deviations [SI] of the k common errors in each parameter; 0 elsewhere."""
+        effects = np.zeros((len(self), len(self.common)))
+        for i, error in enumerate(self.common):
+            effects[[self.index(name) for name in error.parameters], i] = error.tolerance
+        return _freeze(effects)
+
+    def correlation(self) -> FloatArray:
+        """Return the correlations (p, p) of the deviations: those that common errors cause."""
+        share = (
+            self.common_effects / np.where(np.isnan(self.tolerance), 1.0, self.tolerance)[:, None]
+        )
+        correlation = np.asarray(share @ share.T)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
 
     @cached_property
     def free(self) -> BoolArray:
@@ -103,7 +150,7 @@ class ParameterTable:
     def with_free(self, names: Iterable[str]) -> ParameterTable:
         """Return the same table with only these parameters free."""
         chosen = {self.names[self.index(name)] for name in names}
-        return ParameterTable(tuple(replace(p, free=p.name in chosen) for p in self.entries))
+        return replace(self, entries=tuple(replace(p, free=p.name in chosen) for p in self.entries))
 
 
 def _freeze(array: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -9,11 +9,12 @@ import numpy as np
 
 from loopcal.estimate.inference.posterior import ScaledNoise, scale_variances
 from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
-from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -53,14 +54,13 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
         excluded poses.
     """
     problem, linearization = _linearize(fit, data, is_setup_known=False)
-    method, p = fit.method, problem.parameters
-    d = decompose(
+    method = fit.method
+    d = decompose_for(
+        method,
         linearization.factor,
         linearization.equations,
         linearization.deviation,
-        method.scale(p),
         fit.spectrum.tolerance,
-        method.unpenalized(p),
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     scaled = scale_variances(d, penalty, fit.residual_test, method)

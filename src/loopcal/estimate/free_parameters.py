@@ -34,6 +34,8 @@ class FreeParameters:
     places : (p,) positions of the free parameters in the robot's table.
     nominal, tolerance : (p,) [SI].
     assumed : (p,) True where the tolerance is the default one.
+    correlation : (p, p) of the deviations z by the tolerances; None where they are independent,
+        because the robot states no common errors.
     """
 
     robot: Mechanism
@@ -41,6 +43,7 @@ class FreeParameters:
     nominal: FloatArray
     tolerance: FloatArray
     assumed: BoolArray
+    correlation: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.places)
@@ -69,6 +72,18 @@ class FreeParameters:
     def deviation(self, values: FloatArray) -> FloatArray:
         """Return the deviations z (t, p) of all values (t, p of the robot) [SI]."""
         return (values[:, self.places] - self.nominal) / self.tolerance
+
+    def correlation_root(self) -> FloatArray:
+        """Return the Cholesky factor (p, p) of the correlation of the deviations z."""
+        return (
+            np.eye(len(self)) if self.correlation is None else np.linalg.cholesky(self.correlation)
+        )
+
+    def prior_rows(self) -> FloatArray:
+        """Return independent rows (k, p) of unit variance by deviations z, that the stated
+        tolerances amount to: the inverse of the Cholesky factor.
+        """
+        return np.asarray(np.linalg.inv(self.correlation_root())[~self.assumed])
 
     def display(self) -> tuple[FloatArray, tuple[str, ...]]:
         """Return the factor to SI (p,) and the symbol of the unit in which each one is shown: that
@@ -104,7 +119,8 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     dimensions = table.dimensions
     fallback = np.array([default.get(dimensions[i], DEFAULT_TOLERANCE) for i in places])
     tolerance = np.where(assumed, fallback, table.tolerance[places])
-    return FreeParameters(robot, places, table.nominal[places], tolerance, assumed)
+    correlation = table.correlation()[np.ix_(places, places)] if table.common else None
+    return FreeParameters(robot, places, table.nominal[places], tolerance, assumed, correlation)
 
 
 def free_only(robot: Mechanism, names: Iterable[str]) -> Mechanism:

@@ -100,7 +100,7 @@ def identify(
     problem = problem_of(free, data, options.nuisance)
     check_rows(problem, data, robot)
     options = choose_noise(options, data, count_spare_equations(problem))
-    method = adapt_method(options.method or default, free.assumed, options.noise)
+    method = adapt_method(options.method or default, free.assumed, options.noise, free.correlation)
     options = replace(options, method=method)
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
@@ -194,7 +194,7 @@ def identify_trials(
     problem = problem_of_trials(free, trials)
     values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
-    method = adapt_method(options.method, free.assumed, options.noise)
+    method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
     fit = _descend(problem, z, None, replace(options, method=method))
     return IdentifiedTrials(
         free.values(fit.deviation),

@@ -92,6 +92,8 @@ class Trials:
 def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
     """Draw true parameter values from the tolerances: `nominal + tolerance * standard normal`.
 
+    A common error of several parameters is drawn once and added to each of them.
+
     Parameters
     ----------
     robot : Mechanism
@@ -106,12 +108,13 @@ def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     table = robot.parameters
-    tolerance = np.where(table.free, np.nan_to_num(table.tolerance, nan=0.0), 0.0)
+    own = np.array([entry.tolerance or 0.0 for entry in table.entries])
+    effects = np.column_stack([np.diag(own), table.common_effects]) * table.free[:, None]
     draws = [
-        make_random_stream(seed, trial, TRUTH).standard_normal(len(table))
+        make_random_stream(seed, trial, TRUTH).standard_normal(effects.shape[1])
         for trial in range(n_trials)
     ]
-    return table.nominal + tolerance * np.array(draws).reshape(n_trials, len(table))
+    return table.nominal + np.array(draws).reshape(n_trials, effects.shape[1]) @ effects.T
 
 
 def simulate_trials(

@@ -14,7 +14,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.platform_coordinates import COORDINATES, check_coordinates
-from loopcal.parameters import Parameter
+from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import SI_SYMBOLS, Dimension
 
@@ -189,6 +189,7 @@ class Assembly:
     parameters, maps, shared : the unknowns and their maps.
     stored_parameters : names of the parameters that the controller of the machine stores, so that a
         calibration can be entered there; empty where they are not known.
+    common_errors : errors that several parameters share.
     """
 
     name: str
@@ -204,6 +205,7 @@ class Assembly:
     workspace: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""
     stored_parameters: tuple[str, ...] = ()
+    common_errors: tuple[CommonError, ...] = ()
 
 
 def check_assembly(assembly: Assembly) -> None:

@@ -56,7 +56,7 @@ def build(
         freedoms that are too many or too few), coordinates that cannot be controlled.
     """
     check_assembly(assembly)
-    table = ParameterTable(assembly.parameters)
+    table = ParameterTable(assembly.parameters, assembly.common_errors)
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.actuators)

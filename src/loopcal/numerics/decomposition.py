@@ -85,7 +85,9 @@ class Decomposition(TrialBatch):
     Where some columns are never penalized, V holds two groups of columns: those of unpenalized
     parameters alone, and those of the others, each with the best change of the unpenalized ones.
     U stays orthonormal, and V'z of the second group depends on the penalized parameters alone, so
-    that all formulas hold; V itself is oblique, and its inverse is kept as `dual`.
+    that all formulas hold; V itself is oblique, and its inverse is kept as `dual`. V is oblique as
+    well where unknowns are correlated: with z / scale = L u its
+    columns are L times those of the decomposition for u.
 
     Attributes
     ----------
@@ -283,6 +285,12 @@ class Decomposition(TrialBatch):
         effect = np.linalg.norm(self.singular_values[trial][:, None] * (dual @ vt.T), axis=0)
         return vt.T, variance, effect > self.tolerance * self.singular_values[trial].max()
 
+    def mixed(self, root: FloatArray) -> Decomposition:
+        """Return the decomposition for z / scale = root u, where this is the one for u."""
+        inverse = self.directions.swapaxes(-1, -2) if self.dual is None else self.dual
+        dual = np.linalg.solve(root.T, inverse.swapaxes(-1, -2)).swapaxes(-1, -2)
+        return replace(self, directions=root @ self.directions, dual=dual)
+
     def divided(self, sigma: FloatArray) -> Decomposition:
         """Return the decomposition of the rows divided by sigma (t,)."""
         s, c, outside = (
@@ -310,6 +318,7 @@ def decompose(
     scale: FloatArray | None = None,
     tolerance: float = RANK_TOLERANCE,
     unpenalized: BoolArray | None = None,
+    root: FloatArray | None = None,
 ) -> Decomposition:
     """Decompose a triangular factor of rows [A | b].
 
@@ -324,6 +333,8 @@ def decompose(
         on z / scale.
     tolerance : relative rank tolerance.
     unpenalized : (p,), optional. Columns that no penalty may touch.
+    root : (p, p), optional. Symmetric root L of the correlation of z / scale, so that the penalty
+        acts on u = L^-1 z / scale. It must not mix unpenalized columns with others.
     """
     p = factor.shape[-1] - 1
     triangle, last = factor[:, :p, :p], factor[:, :p, p]
@@ -331,19 +342,24 @@ def decompose(
         last = np.matmul(triangle, about[:, :, None])[:, :, 0] - last
     if scale is not None:
         triangle = triangle * scale
+    if root is not None:
+        triangle = triangle @ root
     factors = np.ones(p) if scale is None else scale
     outside = factor[:, p, p] ** 2
     if unpenalized is not None and unpenalized.any() and not unpenalized.all():
-        return _split(triangle, last, outside, rows, factors, tolerance, unpenalized)
-    u, s, vt = np.linalg.svd(triangle)
-    projections = np.matmul(last[:, None, :], u)[:, 0]
-    # One memory layout, whichever trials are taken later: products round by the layout of their
-    # factors.
-    directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
-    marked = np.ones(s.shape, dtype=bool) if unpenalized is not None and unpenalized.all() else None
-    return Decomposition(
-        s, directions, projections, outside, rows, factors, tolerance, unpenalized=marked
-    )
+        d = _split(triangle, last, outside, rows, factors, tolerance, unpenalized)
+    else:
+        u, s, vt = np.linalg.svd(triangle)
+        projections = np.matmul(last[:, None, :], u)[:, 0]
+        # One memory layout, whichever trials are taken later: products round by the layout of
+        # their factors.
+        directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
+        is_all = unpenalized is not None and unpenalized.all()
+        marked = np.ones(s.shape, dtype=bool) if is_all else None
+        d = Decomposition(
+            s, directions, projections, outside, rows, factors, tolerance, unpenalized=marked
+        )
+    return d if root is None else d.mixed(root)
 
 
 def _split(

@@ -140,8 +140,9 @@ def combine_prior(
     measured : (p, p) factor of earlier measurements, their nuisance parameters eliminated (the
         instrument was set up anew since).
     """
-    o, p = len(groups.nuisance), len(free)
-    stated = PriorInformation(np.eye(o + p)[o:][~free.assumed], o)
+    o = len(groups.nuisance)
+    rows = free.prior_rows()
+    stated = PriorInformation(np.concatenate([np.zeros((len(rows), o)), rows], axis=1), o)
     prior = stated.with_rows(groups.nuisance_prior)
     if measured is None:
         return prior

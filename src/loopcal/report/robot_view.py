@@ -30,6 +30,7 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
         *format_list([(f.severity.value, str(f)) for f in inspection.findings]),
         _build_actuator_table(inspection),
         _build_parameter_table(robot),
+        *([_build_common_error_table(robot)] if robot.parameters.common else []),
     ]
 
 
@@ -69,3 +70,16 @@ def _build_parameter_table(robot: Mechanism) -> Table:
         (word_column("unit"), lambda row: str(units[row[0].dimension])),
         (word_column(""), lambda row: "free" if row[0].free else "fixed"),
     )
+
+
+def _build_common_error_table(robot: Mechanism) -> Table:
+    """Return the errors that several parameters share in addition to their own."""
+    units, table = units_of(robot), robot.parameters
+    rows = []
+    for error in table.common:
+        unit = units[table.entries[table.index(error.parameters[0])].dimension]
+        names = " ".join(error.parameters)
+        rows.append((error.name, format_in(unit, error.tolerance, 3), str(unit), names))
+    words = (word_column(title) for title in ("unit", "parameters"))
+    columns = (word_column("name"), Column("tolerance (1 sd)"), *words)
+    return Table("Common errors", columns, tuple(rows))

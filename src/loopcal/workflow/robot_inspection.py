@@ -54,6 +54,10 @@ class RobotInspection:
                 }
                 for i, p in enumerate(table.entries)
             ],
+            "common_errors": [
+                {"name": c.name, "parameters": c.parameters, "tolerance": c.tolerance}
+                for c in table.common
+            ],
             "notes": [str(finding) for finding in robot.findings],
             "findings": self.findings,
         }

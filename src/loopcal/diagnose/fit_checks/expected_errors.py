@@ -92,7 +92,9 @@ def estimate_calibration_gain(
     effects = linearize_tool_errors(posterior, solution, frame)
     D, own = effects.by_parameters, effects.by_frame
     size = fit.robot.size
-    angle_before, position_before = _rms_errors(D * (free.tolerance / posterior.unit), size)
+    angle_before, position_before = _rms_errors(
+        (D * (free.tolerance / posterior.unit)) @ free.correlation_root(), size
+    )
     angle_after, position_after = _rms_errors(np.concatenate([D @ factor, own], axis=2), size)
     pairs = ((position_before, position_after), (angle_before, angle_after))
     is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)

@@ -17,11 +17,11 @@ import numpy as np
 
 from loopcal.diagnose.fit_checks.influence import Influence, compute_influence
 from loopcal.estimate.linearization import Start
+from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.minimization.robust_descent import estimate_scale_of
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.numerics.chi_square import compute_chi_square_quantile, compute_chi_square_tail
-from loopcal.numerics.decomposition import decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 MOST_ROUNDS = 20
@@ -154,11 +154,8 @@ def fit_without(
     """
     weight = (~excluded).astype(np.float64)
     kept = problem.weighted(weight[member]).linearize(deviation, start)
-    method, p, tolerance = fit.method, problem.parameters, fit.spectrum.tolerance
-    d = decompose(
-        kept.factor, kept.equations, deviation, method.scale(p), tolerance, method.unpenalized(p)
-    )
-    penalty = np.array(method.penalty(d), dtype=np.float64)
+    d = decompose_for(fit.method, kept.factor, kept.equations, deviation, fit.spectrum.tolerance)
+    penalty = np.array(fit.method.penalty(d), dtype=np.float64)
     solved = d.deviation(d.solution(penalty))
     influence = compute_influence(problem, kept, member, d, penalty, weight, solved)
     inside, scale = (influence.degrees > 0) & ~excluded, 1.0

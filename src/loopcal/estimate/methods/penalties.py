@@ -20,7 +20,7 @@ docs/theory/estimation.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
 from loopcal.estimate.methods.prior_conflict import InflatedTolerances
-from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 Rule = Callable[[Decomposition], FloatArray | IntArray]
@@ -50,6 +50,12 @@ class Method(Protocol):
 
     def scale(self, parameters: int) -> FloatArray | None:
         """Return factors (p,) for the tolerance-scaled columns; None for ones."""
+        return None
+
+    def root(self, parameters: int) -> FloatArray | None:
+        """Return the root (p, p) of the correlation of the scaled columns; None where the method
+        takes them as independent.
+        """
         return None
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
@@ -193,6 +199,8 @@ class MAP(Method):
     noise : "given": the rows are divided by their true sigma. "estimated": by their true sigma up
         to one common factor. The factor is estimated from the part of the data that no parameters
         can explain, so that data and prior get their right weights.
+    correlation : (p, p) of the deviations from nominal; `identify` enters the one of the common
+        errors that the robot states. None takes the tolerances as independent.
 
     Raises
     ------
@@ -202,6 +210,7 @@ class MAP(Method):
     inflation: float | Rule = 1.0
     free: tuple[bool, ...] = ()
     noise: Literal["given", "estimated"] = "given"
+    correlation: FloatArray | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not callable(self.inflation) and not 0.0 < self.inflation < np.inf:
@@ -217,6 +226,13 @@ class MAP(Method):
     def unpenalized(self, parameters: int) -> BoolArray | None:
         """Return which parameters are not penalized."""
         return np.array(self.free) if any(self.free) else None
+
+    def root(self, parameters: int) -> FloatArray | None:
+        """Return the symmetric root of the correlation."""
+        if self.correlation is None:
+            return None
+        square, vectors = np.linalg.eigh(self.correlation)
+        return np.asarray((vectors * np.sqrt(square)) @ vectors.T)
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return sigma^2 / inflation^2, with sigma = 1 where the noise is given."""
@@ -249,17 +265,48 @@ def _penalize(decomposition: Decomposition, lam: FloatArray) -> FloatArray:
     return np.where(decomposition.unpenalized, free, penalty)
 
 
+def decompose_for(
+    method: Method,
+    factor: FloatArray,
+    equations: IntArray,
+    deviation: FloatArray,
+    tolerance: float = RANK_TOLERANCE,
+) -> Decomposition:
+    """Decompose the factor of linearized rows in the coordinates that a method penalizes.
+
+    Parameters
+    ----------
+    factor : (t, p + 1, p + 1), columns scaled by tolerance. equations : (t,) that were folded.
+    deviation : (t, p) where the rows were linearized. tolerance : relative rank tolerance.
+    """
+    p = deviation.shape[1]
+    return decompose(
+        factor,
+        equations,
+        deviation,
+        method.scale(p),
+        tolerance,
+        method.unpenalized(p),
+        method.root(p),
+    )
+
+
 def adapt_method(
-    method: Method | None, assumed: BoolArray, noise: Literal["given", "estimated"]
+    method: Method | None,
+    assumed: BoolArray,
+    noise: Literal["given", "estimated"],
+    correlation: FloatArray | None = None,
 ) -> Method:
     """Return the method of a fit: the default where it is None; MAP with what it must know.
 
     Parameters
     ----------
     assumed : (p,) free parameters whose tolerance is not stated. noise : see `FitOptions`.
+    correlation : (p, p) of the deviations, where the robot states common errors.
     """
     method = MAP(InflatedTolerances()) if method is None else method
     if not isinstance(method, MAP):
         return method
     free = method.free or (tuple(assumed.tolist()) if assumed.any() else ())
-    return replace(method, free=free, noise=noise)
+    correlation = correlation if method.correlation is None else method.correlation
+    return replace(method, free=free, noise=noise, correlation=correlation)

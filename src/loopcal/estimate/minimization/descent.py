@@ -18,10 +18,10 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.methods.penalties import Method, decompose_for
 from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
 from loopcal.measure.array_checks import check_number, check_type
-from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
+from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
 from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -268,16 +268,11 @@ class _FilteredDescent:
 
     def decompose(self, linearized: Linearization) -> _Point:
         """Return the points of a linearization."""
-        p, method, z = self.problem.parameters, self.method, linearized.deviation
-        decomposition = decompose(
-            linearized.factor,
-            linearized.equations,
-            z,
-            method.scale(p),
-            self.tolerance,
-            method.unpenalized(p),
+        z = linearized.deviation
+        decomposition = decompose_for(
+            self.method, linearized.factor, linearized.equations, z, self.tolerance
         )
-        penalty = np.array(method.penalty(decomposition), dtype=np.float64)
+        penalty = np.array(self.method.penalty(decomposition), dtype=np.float64)
         return _Point(z, linearized.cost, decomposition, penalty, linearized.next_start)
 
     def propose(self, point: _Point, damping: FloatArray) -> FilteredStep:

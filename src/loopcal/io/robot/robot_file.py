@@ -180,14 +180,20 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
 
 
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
-    """Return the assembly of a record; an unknown name in a list of parameters is refused at its
-    line.
+    """Return the assembly of a record; an unknown name in a list of parameters, and a common error
+    that cannot be, are refused at their line.
     """
-    names = [parameter.name for parameter in record.expand().parameters]
+    parameters = record.expand().parameters
+    names = [parameter.name for parameter in parameters]
     for key in ("fixed", "stored_parameters"):
         for i, pattern in enumerate(getattr(record, key)):
             try:
                 match_parameter_names(pattern, names, key)
             except MechanismError as error:
                 raise file.error(str(error), (key, i)) from None
+    for i, common in enumerate(record.common_errors):
+        try:
+            common.resolve(parameters)
+        except MechanismError as error:
+            raise file.error(str(error), ("common_errors", i)) from None
     return record.assembly()

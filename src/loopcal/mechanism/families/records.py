@@ -17,8 +17,9 @@ from loopcal import geometry
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import Actuator, Assembly, Limb
 from loopcal.mechanism.families.error_models import ErrorModel
+from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
-from loopcal.units import Angle, Length, Ratio
+from loopcal.units import Angle, Dimension, Length, Ratio
 
 Point = tuple[Length, Length, Length]
 
@@ -95,6 +96,66 @@ def standard_deviation(
 
 
 @dataclass(frozen=True)
+class CommonErrorRecord:
+    """An error that several parameters share in addition to their own, such as that of one batch.
+
+    Attributes
+    ----------
+    name : of the common error. of : the parameters, by name or pattern, such as `arm*.length`.
+    length, angle, ratio : the tolerance of the common error, by the dimension of the parameters.
+    """
+
+    name: str
+    of: tuple[str, ...]
+    length: LengthTolerance | None = None
+    angle: AngleTolerance | None = None
+    ratio: RatioTolerance | None = None
+
+    def resolve(self, parameters: Sequence[Parameter]) -> CommonError:
+        """Return the common error of the parameters that match.
+
+        Raises
+        ------
+        MechanismError : no or several dimensions, a single parameter, or parameters of another
+            dimension or without a tolerance of their own.
+        """
+        stated = {d: getattr(self, d.value) for d in Dimension if getattr(self, d.value)}
+        if len(stated) != 1:
+            raise MechanismError(
+                f"common error {self.name!r} states {len(stated)} tolerances; give one, for example "
+                "`length: {sd: 0.1}`"
+            )
+        ((dimension, tolerance),) = stated.items()
+        sd = standard_deviation(tolerance, f"common error {self.name!r}")
+        assert sd is not None
+        names = [parameter.name for parameter in parameters]
+        matching = _match_all(self.of, names, "common_errors")
+        chosen = [parameter for parameter in parameters if parameter.name in matching]
+        for parameter in chosen:
+            self._check(parameter, dimension)
+        if len(chosen) < 2:
+            raise MechanismError(
+                f"common error {self.name!r} belongs to {chosen[0].name} alone; name two or more "
+                "parameters, or state the tolerance of that parameter"
+            )
+        return CommonError(self.name, tuple(parameter.name for parameter in chosen), sd)
+
+    def _check(self, parameter: Parameter, dimension: Dimension) -> None:
+        """Refuse a parameter that cannot have this common error."""
+        place = f"common error {self.name!r} of {parameter.name}"
+        if parameter.dimension is not dimension:
+            raise MechanismError(
+                f"{place} states a tolerance of {dimension.value}, but the parameter is of "
+                f"dimension {parameter.dimension.value}; use the key `{parameter.dimension.value}`"
+            )
+        if parameter.tolerance is None:
+            raise MechanismError(
+                f"{place}: the parameter has no tolerance of its own; state it, because no two "
+                "parts are exactly equal"
+            )
+
+
+@dataclass(frozen=True)
 class Workspace:
     """Ranges (low, high) of the controlled coordinates in which the machine works."""
 
@@ -134,6 +195,8 @@ class RobotRecord:
     tool : tool pose on the platform. workspace : where the machine works; poses are drawn from it.
     fixed : parameters that are not identified, by name or pattern, such as `arm*.length`.
     stored_parameters : parameters that the controller of the machine stores, by name or pattern.
+    common_errors : errors that several parameters share, such as those of one batch of parts or of
+        a common zero.
     """
 
     family: ClassVar[str] = ""
@@ -146,6 +209,7 @@ class RobotRecord:
     workspace: Workspace = field(default_factory=Workspace)
     fixed: tuple[str, ...] = ()
     stored_parameters: tuple[str, ...] = ()
+    common_errors: tuple[CommonErrorRecord, ...] = ()
 
     def expand(self) -> Assembly:
         """Return the generic description of this robot."""
@@ -178,12 +242,12 @@ class RobotRecord:
 
     def assembly(self) -> Assembly:
         """Return the expanded robot, with the parameters of `fixed` kept at their nominal values,
-        and the names of those that the controller stores.
+        the names of those that the controller stores, and the common errors of the others.
 
         Raises
         ------
         MechanismError
-            A name or pattern that matches no parameter.
+            A name or pattern that matches no parameter, or a common error that cannot be.
         """
         expanded = self.expand()
         names = [parameter.name for parameter in expanded.parameters]
@@ -193,7 +257,10 @@ class RobotRecord:
             replace(p, free=False) if p.name in fixed else p for p in expanded.parameters
         )
         present = tuple(name for name in names if name in stored)
-        return replace(expanded, parameters=parameters, stored_parameters=present)
+        common = tuple(record.resolve(parameters) for record in self.common_errors)
+        return replace(
+            expanded, parameters=parameters, stored_parameters=present, common_errors=common
+        )
 
 
 def _match_all(patterns: Iterable[str], names: Sequence[str], key: str) -> set[str]:
