@@ -46,7 +46,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class CommonError:
-    """An error that several parameters share, such as that of one batch of arms or of a common zero.
+    """An error that several parameters share: that of one batch of arms, or of a common zero.
 
     Each of them deviates by its own error, of its own tolerance, plus the same common error.
 

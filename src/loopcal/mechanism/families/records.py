@@ -122,7 +122,7 @@ class CommonErrorRecord:
         stated = {d: getattr(self, d.value) for d in Dimension if getattr(self, d.value)}
         if len(stated) != 1:
             raise MechanismError(
-                f"common error {self.name!r} states {len(stated)} tolerances; give one, for example "
+                f"common error {self.name!r} states {len(stated)} tolerances; give one, such as "
                 "`length: {sd: 0.1}`"
             )
         ((dimension, tolerance),) = stated.items()
