@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation detects rows that were used in the fit, also in other files, orders and units;
-repeated measurements are accepted.
+"""Rows that a calibration used are recognized in data for validation and recalibration, also in
+other files, orders and units; repeated measurements are accepted.
 """
 
 from dataclasses import replace
@@ -8,11 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply.reused_rows import collect_fitted_rows, find_reused_rows
+from loopcal.apply import report_reused_rows
 from loopcal.errors import DataError
+from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from, recalibrate
+from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.inference.posterior import posterior_from_arrays
 from loopcal.findings import Severity
-from loopcal.measure import Measurements
-from tests.estimate.problems import hexapod_data
+from loopcal.measure import Measurements, collect_fitted_rows, fitted_rows_from_arrays
+from loopcal.workflow import CalibrationOptions, calibrate
+from tests.estimate.problems import hexapod, hexapod_data
+from tests.findings.expectations import expect_refusal, list_codes
 
 FITTED = hexapod_data(20)
 STORED = collect_fitted_rows(FITTED)
@@ -40,7 +45,7 @@ def test_subset_of_fitted_rows_is_refused_in_another_order_and_after_rounding() 
     again = replace(some, observations=(replace(rows, measured=rows.measured * (1.0 + 1e-12)),))
     for data in (some, again):
         with pytest.raises(DataError) as refused:
-            find_reused_rows(STORED, data)
+            report_reused_rows(STORED, data)
         assert refused.value.code == "validation.rows-reused"
         assert refused.value.args[0].data["count"] == refused.value.args[0].data["total"] == 4
 
@@ -52,41 +57,134 @@ def test_repeated_and_new_measurements_are_accepted() -> None:
         0.1 * sigma * np.random.default_rng(0).standard_normal(rows.measured.shape)
     )  # a tenth of what a repeat has
     assert (
-        find_reused_rows(
+        report_reused_rows(
             STORED, replace(FITTED, observations=(replace(rows, measured=rows.measured + noise),))
         )
         is None
     )
-    assert find_reused_rows(STORED, OTHER) is None
-    assert find_reused_rows({}, FITTED) is None
+    assert report_reused_rows(STORED, OTHER) is None
+    assert report_reused_rows(None, FITTED) is None
 
 
 def test_few_fitted_rows_among_new_ones_are_reported() -> None:
-    result = find_reused_rows(STORED, join_measurements(FITTED.take(np.arange(3)), OTHER))
+    result = report_reused_rows(STORED, join_measurements(FITTED.take(np.arange(3)), OTHER))
     assert result is not None
     assert result.severity is Severity.WARNING
     assert result.data == {"count": 3, "total": 23, "poses": ("1", "2", "3")}
 
 
 def test_poses_excluded_from_the_fit_are_accepted() -> None:
-    assert (
-        find_reused_rows(collect_fitted_rows(FITTED, ("1", "2")), FITTED.take(np.arange(2))) is None
-    )
+    few = FITTED.take(np.arange(2))
+    fitted = collect_fitted_rows(exclude_poses(FITTED, ("1", "2")))
+    assert len(fitted) == 18
+    assert report_reused_rows(fitted, few) is None
     weight = np.ones(20)
     weight[:2] = 0.0
-    assert (
-        find_reused_rows(
-            collect_fitted_rows(FITTED.with_weights(weight)), FITTED.take(np.arange(2))
-        )
-        is None
-    )
+    assert report_reused_rows(collect_fitted_rows(FITTED.with_weights(weight)), few) is None
+    assert report_reused_rows(STORED, exclude_poses(FITTED, FITTED.labels)) is None
 
 
-def test_missing_values_match_missing_values_only() -> None:
+def replace_measured(data: Measurements, measured: np.ndarray) -> Measurements:
+    """Return measurements with other measured values."""
+    return replace(data, observations=(replace(data.observations[0], measured=measured),))
+
+
+@pytest.mark.parametrize("columns", [slice(0, 3), slice(3, 6)])
+def test_a_row_without_some_of_its_values_is_the_same_row(columns: slice) -> None:
+    """What both rows state decides: to leave out columns does not make new measurements."""
+    holes = np.array(FITTED.observations[0].measured)
+    holes[:, columns] = np.nan
+    assert STORED.find_in(replace_measured(FITTED, holes)).count == 20
+    assert collect_fitted_rows(replace_measured(FITTED, holes)).find_in(FITTED).count == 20
+    assert STORED.find_in(replace_measured(OTHER, OTHER.observations[0].measured)).count == 0
+
+
+def test_rounded_copies_are_the_same_rows_and_repeats_are_not() -> None:
+    """Rounding to a hundredth of sigma is no new measurement; of 20,000 repeats none is reused,
+    although one value of hundreds of them agrees as well.
+    """
     rows = FITTED.observations[0]
-    holes = np.array(rows.measured)
-    holes[:, 0] = np.nan
-    content = {"fitted_0_pose": np.concatenate([FITTED.readings, holes], axis=1)}
-    assert find_reused_rows(content, FITTED) is None
-    with pytest.raises(DataError, match="20 of 20"):
-        find_reused_rows(content | STORED, FITTED)
+    sigma = np.sqrt(np.einsum("rii->ri", rows.covariance))
+    step = 0.01 * sigma
+    rounded = np.round(rows.measured / step) * step
+    readings = np.round(FITTED.readings, 6)  # [m]
+    copy = replace(replace_measured(FITTED, rounded), readings=readings)
+    assert STORED.find_in(copy).count == 20
+    rng = np.random.default_rng(2)
+    for _ in range(1000):
+        noise = sigma * rng.standard_normal(sigma.shape)
+        repeat = replace_measured(FITTED, rows.measured + noise)
+        assert STORED.find_in(repeat).count == 0
+
+
+def test_readings_alone_are_rows_only_where_they_were_fitted() -> None:
+    bare = replace(FITTED, observations=())
+    assert STORED.find_in(bare) == ((), 0, 0)
+    fitted = collect_fitted_rows(bare, are_readings_fitted=True)
+    assert fitted.find_in(bare)[1:] == (20, 20)
+    assert fitted.find_in(replace(OTHER, observations=())).count == 0
+
+
+def test_rows_survive_a_run_folder() -> None:
+    back = fitted_rows_from_arrays(STORED.joined(collect_fitted_rows(OTHER)).arrays())
+    assert back is not None
+    assert (back.find_in(FITTED).count, back.find_in(OTHER).count) == (20, 20)
+    assert fitted_rows_from_arrays({"nominal": np.zeros(3)}) is None
+
+
+FIRST = identify(hexapod(), FITTED, LeastSquares())
+
+
+@pytest.mark.parametrize("free_limb", [None, "leg3"])
+@pytest.mark.parametrize(
+    ("data", "count"),
+    [
+        (FITTED, 20),
+        (FITTED.take(np.arange(19, -1, -1)), 20),
+        (FITTED.take(np.array([3])), 1),
+        (join_measurements(OTHER, FITTED), 20),
+        (join_measurements(OTHER, FITTED.take(np.array([2, 4]))), 2),
+    ],
+)
+def test_no_row_counts_twice(data: Measurements, count: int, free_limb: str | None) -> None:
+    """All of the rows, a subset or a superset of them, and some among others are refused."""
+    with expect_refusal("prior.rows-reused", DataError, count=count, total=data.n_poses) as found:
+        recalibrate(hexapod(), data, FIRST.posterior, free_limb)
+    assert len(found["poses"]) == count
+    with expect_refusal("prior.rows-reused", DataError):
+        identify(hexapod(), data, options=FitOptions(prior=prior_from(FIRST.posterior)))
+    if count == data.n_poses:
+        return
+    options = FitOptions(excluded_poses=found["poses"])
+    fit, _ = recalibrate(hexapod(), data, FIRST.posterior, free_limb, options=options)
+    assert fit.posterior.fitted_rows is not None
+    assert len(fit.posterior.fitted_rows) == 20 + data.n_poses - count
+
+
+def test_a_chain_of_recalibrations_knows_the_rows_of_the_first() -> None:
+    """A, then B with A as prior: the result refuses rows of both, also read from a run folder."""
+    second, _ = recalibrate(hexapod(), OTHER, FIRST.posterior)
+    stored = posterior_from_arrays(second.robot, second.arrays())
+    third = hexapod_data(12, 7)
+    for earlier in (second.posterior, stored):
+        for data in (FITTED.take(np.arange(5)), OTHER.take(np.arange(5)), FITTED):
+            with expect_refusal("prior.rows-reused", DataError, count=data.n_poses):
+                recalibrate(hexapod(), data, earlier)
+        fit, _ = recalibrate(hexapod(), third, earlier)
+        assert "prior.rows-unknown" not in list_codes(fit.findings)
+        assert fit.posterior.fitted_rows is not None
+        assert len(fit.posterior.fitted_rows) == 52
+
+
+def test_an_earlier_calibration_without_its_rows_is_reported() -> None:
+    fit, _ = recalibrate(hexapod(), OTHER, replace(FIRST.posterior, fitted_rows=None))
+    assert "prior.rows-unknown" in list_codes(fit.findings)
+    assert fit.posterior.fitted_rows is None  # its own rows are known, those before are not
+
+
+@pytest.mark.parametrize("hold_out", [0.0, 0.9])
+def test_calibrate_refuses_reused_rows_also_among_held_out_ones(hold_out: float) -> None:
+    data = join_measurements(FITTED.take(np.array([1])), OTHER)
+    options = CalibrationOptions(prior=FIRST.posterior, hold_out=hold_out)
+    with expect_refusal("prior.rows-reused", DataError, count=1, total=21, poses=("1",)):
+        calibrate(hexapod(), data, options)

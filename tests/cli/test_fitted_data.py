@@ -33,3 +33,56 @@ def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
     assert capsys.readouterr().err == ""
     assert main(["validate", "run", "mixed.csv"]) == 0
     assert capsys.readouterr().err.startswith("loopcal: note: The calibration used 2 of 12 rows")
+
+
+def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    """A blank line, another order and unit, a subset, a superset, two files of which one is old,
+    and rows of the prior's own prior.
+    """
+    monkeypatch.chdir(tmp_path)
+    lines = (EXAMPLE / "measurements.csv").read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
+    head, rows = lines[:first], lines[first:]
+
+    def write(name: str, chosen: list[str], header: list[str] = head) -> str:
+        Path(name).write_text("\n".join([*header, *chosen]) + "\n")
+        return name
+
+    def convert(line: str) -> str:
+        return ",".join(
+            repr(float(field) * 1e-3) if i in in_mm else field
+            for i, field in enumerate(line.split(","))
+        )
+
+    columns = head[-1].split(",")
+    in_mm = [i for i, name in enumerate(columns) if name.endswith("[mm]")]
+    assert in_mm
+    meters = [*head[:-1], head[-1].replace("[mm]", "[m]")]
+    old, new, third = rows[:20], rows[20:30], rows[30:]
+    write("old.csv", old), write("new.csv", new), write("third.csv", third)
+    copies = {
+        "blank.csv": ["", *old],
+        "order.csv": old[::-1],
+        "subset.csv": old[5:8],
+        "superset.csv": [*old, *new],
+    }
+    files = [[write(name, chosen)] for name, chosen in copies.items()]
+    files.append([write("meters.csv", [convert(line) for line in old], meters)])
+    files.append(["new.csv", "old.csv"])
+    assert main(["calibrate", "hexapod-42", "old.csv", "-o", "run"]) == 0
+    for names in files:
+        capsys.readouterr()
+        assert main(["calibrate", "hexapod-42", *names, "-o", "run2", "--prior", "run"]) == 1
+        err = capsys.readouterr().err
+        assert err.startswith("loopcal: The earlier calibration used "), (names, err)
+        assert "--drop POSE" in err
+    assert main(["calibrate", "hexapod-42", "new.csv", "-o", "run2", "--prior", "run"]) == 0
+    capsys.readouterr()
+    for name in ("subset.csv", "new.csv"):  # of the prior of the prior, and of the prior
+        assert main(["calibrate", "hexapod-42", name, "-o", "run3", "--prior", "run2"]) == 1
+        assert "count twice" in capsys.readouterr().err
+        assert main(["validate", "run2", name]) == 1
+        assert "The calibration used" in capsys.readouterr().err
+    assert main(["calibrate", "hexapod-42", "third.csv", "-o", "run3", "--prior", "run2"]) == 0

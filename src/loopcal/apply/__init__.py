@@ -12,8 +12,7 @@ from loopcal.apply.compensation import compensate as compensate
 from loopcal.apply.error_budget import ErrorBudget as ErrorBudget
 from loopcal.apply.error_budget import ErrorSources as ErrorSources
 from loopcal.apply.error_budget import compute_error_budget as compute_error_budget
-from loopcal.apply.reused_rows import collect_fitted_rows as collect_fitted_rows
-from loopcal.apply.reused_rows import find_reused_rows as find_reused_rows
+from loopcal.apply.reused_rows import report_reused_rows as report_reused_rows
 from loopcal.apply.validation import Validation as Validation
 from loopcal.apply.validation import validate as validate
 from loopcal.diagnose import NoiseFloor as NoiseFloor

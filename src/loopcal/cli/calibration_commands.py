@@ -123,7 +123,12 @@ def calibrate(
     """  # noqa: D301
     from loopcal import workflow
     from loopcal.io import load_robot, load_stored_values
-    from loopcal.io.runs.run_folder import build_document, load_prior, refuse_run_folder, save_run
+    from loopcal.io.runs.run_folder import (
+        build_document,
+        load_posterior,
+        refuse_run_folder,
+        save_run,
+    )
     from loopcal.io.runs.run_verdict import name_robot_file
     from loopcal.report.calibration_view import view_calibration
 
@@ -133,7 +138,7 @@ def calibrate(
         make_fit_options(options),
         hold_out,
         seed=seed,
-        prior=None if prior is None else load_prior(prior, data),
+        prior=None if prior is None else load_posterior(prior),
         compare_with=None if compare is None else load_stored_values(compare, machine),
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},
@@ -213,16 +218,15 @@ def validate(
       loopcal validate run more.csv --limit-position 0.02mm --limit-angle 0.01deg
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
-    from loopcal.apply import find_reused_rows
+    from loopcal.apply import report_reused_rows
     from loopcal.apply import validate as validate_robot
-    from loopcal.io.runs.run_folder import load_run_or_robot, refuse_fitted_files
+    from loopcal.io.runs.run_folder import load_run_or_robot
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
     measurements = read_checked_measurements(data, calibrated.robot, **flags)
     if not allow_fitted_data:
-        refuse_fitted_files(calibrated, data)
-        reused = find_reused_rows(calibrated.arrays, measurements)
+        reused = report_reused_rows(calibrated.fitted_rows, measurements)
         if reused is not None:
             terminal.print_note(str(reused))
     validation = validate_robot(

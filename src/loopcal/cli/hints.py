@@ -57,6 +57,7 @@ HINTS = {
     "noise.residuals-too-small": "use --noise estimated",
     "noise.too-few-degrees": "use --noise given",
     "prior.machine-changed": "use --free-limb LIMB",
+    "prior.rows-reused": "exclude poses with --drop POSE",
     "prior.tolerances-too-narrow": "use --method auto",
     "plan.frame-unbounded": "use --frame fitted",
     "plan.goal-missed": "use a smaller --hold-out, or --criterion I",
@@ -95,7 +96,6 @@ HINTS = {
     "workflow.next-check-held-out": "exclude a pose with --drop POSE",
     "compensation.not-converged": "use more --steps, or --mode readings",
     "validation.rows-reused": "use --allow-fitted-data to accept them",
-    "validation.file-reused": "use --allow-fitted-data to accept it",
     "validation.setup-moved": "use --refit NAME",
 }
 """Code -> advice, in the imperative."""

@@ -25,6 +25,11 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import compute_posterior, scale_variances
+from loopcal.estimate.inference.prior import (
+    collect_used_rows,
+    refuse_reused_rows,
+    report_unknown_rows,
+)
 from loopcal.estimate.inference.residual_test import run_residual_test
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.losses import Loss
@@ -99,6 +104,7 @@ def identify(
     data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
     problem = problem_of(free, data, options.nuisance)
     check_rows(problem, data, robot)
+    refuse_reused_rows(options.prior, data)
     options = choose_noise(options, data, count_spare_equations(problem))
     method = adapt_method(options.method or default, free.assumed, options.noise, free.correlation)
     options = replace(options, method=method)
@@ -112,11 +118,12 @@ def identify(
     if fit.status[0] != DescentStatus.CONVERGED and open_poses.are_most:
         raise EstimationError(open_poses.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
-    if not open_poses.poses:
-        return result
-    return replace(
-        result, findings=(*result.findings, open_poses.report("fit.poses-open-at-start"))
-    )
+    findings = [*result.findings, *report_unknown_rows(options.prior)]
+    if open_poses.poses:
+        findings.append(open_poses.report("fit.poses-open-at-start"))
+    rows = collect_used_rows(robot, data, options.prior)
+    posterior = replace(result.posterior, fitted_rows=rows)
+    return replace(result, posterior=posterior, findings=tuple(findings))
 
 
 @dataclass(frozen=True, eq=False)

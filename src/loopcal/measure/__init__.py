@@ -12,6 +12,9 @@ from loopcal.measure.data_checks import has_static_targets as has_static_targets
 from loopcal.measure.evaluation import EvaluatedRows as EvaluatedRows
 from loopcal.measure.evaluation import evaluate_measurements as evaluate_measurements
 from loopcal.measure.evaluation import whiten_rows as whiten_rows
+from loopcal.measure.fitted_rows import FittedRows as FittedRows
+from loopcal.measure.fitted_rows import collect_fitted_rows as collect_fitted_rows
+from loopcal.measure.fitted_rows import fitted_rows_from_arrays as fitted_rows_from_arrays
 from loopcal.measure.initial_values import guess_nuisance_values as guess_nuisance_values
 from loopcal.measure.initial_values import (
     guess_nuisance_values_batch as guess_nuisance_values_batch,

@@ -29,10 +29,11 @@ from loopcal.errors import DataError
 from loopcal.estimate import Change, Identification, identify, recalibrate
 from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.frame_freedoms import list_instrument_frames
+from loopcal.estimate.inference.prior import refuse_reused_rows
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.importance import sort_by_importance
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
@@ -93,6 +94,9 @@ def calibrate(
     instruments = (name for name, *_ in list_instrument_frames(data))
     check_frame(options.frame, (FITTED, BASE, RELATIVE, *instruments))
     kept = exclude_poses(data, options.fit.excluded_poses)
+    if options.prior is not None:
+        filled = exclude_poses(fill_in_reading_sigma(robot, data), options.fit.excluded_poses)
+        refuse_reused_rows(options.prior, filled)
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
     if options.has_limit and split.held_out is None:
         raise DataError(report_finding("workflow.limit-needs-held-out-poses"))

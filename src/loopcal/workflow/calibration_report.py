@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.apply import ErrorBudget, Validation, collect_fitted_rows
+from loopcal.apply import ErrorBudget, Validation
 from loopcal.diagnose import (
     ConventionCheck,
     FitExamination,
@@ -173,12 +173,11 @@ class CalibrationReport:
     __repr__ = __str__
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Return arrays to store: those of the fit, `initial` (values of all parameters before the
-        calibration [SI]), and the fitted rows, see `loopcal.apply.collect_fitted_rows`.
+        """Return arrays to store: those of the fit, and `initial`, the values of all parameters
+        before the calibration [SI].
         """
         fit = self.identification
-        rows = collect_fitted_rows(self.split.fitted, fit.excluded_poses)
-        return {**fit.arrays(), "initial": fit.initial.values, **rows}
+        return {**fit.arrays(), "initial": fit.initial.values}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON values by name, SI: dictionaries, lists, numbers and text.

@@ -19,6 +19,7 @@ from loopcal.estimate.inference.measured_frames import MeasuredFrames, frames_fr
 from loopcal.estimate.inference.residual_test import ResidualTest
 from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.findings import report_finding
+from loopcal.measure import FittedRows, fitted_rows_from_arrays
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -67,6 +68,8 @@ class Posterior:
         of earlier versions.
     parts : the parts of the covariance whose size was estimated from data, with their degrees of
         freedom; what they leave of the covariance counts as known.
+    fitted_rows : the measured rows that it comes from, so that they do not count twice; None where
+        they are not known.
     """
 
     robot: Mechanism
@@ -77,6 +80,7 @@ class Posterior:
     determined: BoolArray
     frames: MeasuredFrames | None = None
     parts: tuple[CovariancePart, ...] = ()
+    fitted_rows: FittedRows | None = None
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -142,7 +146,9 @@ class Posterior:
             np.repeat(np.arange(len(parts)), [part.root.shape[1] for part in parts]),
         )
         own |= {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
-        return own if self.frames is None else {**own, **self.frames.arrays()}
+        for value in (self.frames, self.fitted_rows):
+            own |= {} if value is None else value.arrays()
+        return own
 
 
 def compute_posterior(
@@ -232,6 +238,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         determined.astype(bool),
         frames_from_arrays(arrays),
         _parts_from_arrays(arrays),
+        fitted_rows_from_arrays(arrays),
     )
 
 

@@ -18,11 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal import engine
-from loopcal.errors import EstimationError, suggest_names
+from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.problem import Problem
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import FittedRows, Measurements, collect_fitted_rows
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import are_nonzero
@@ -45,6 +46,7 @@ class Prior:
     rows : (r, p) B [1 / SI].
     unfixed : (12, k) motions of frames that the earlier measurements do not determine, see
         `MeasuredFrames`; None where it is not known.
+    fitted_rows : the measured rows that it comes from; None where they are not known.
     """
 
     names: tuple[str, ...]
@@ -52,6 +54,7 @@ class Prior:
     unit: FloatArray
     rows: FloatArray
     unfixed: FloatArray | None = None
+    fitted_rows: FittedRows | None = None
 
     def __repr__(self) -> str:
         """Return the numbers of rows and parameters."""
@@ -169,7 +172,42 @@ def prior_from(earlier: Posterior) -> Prior:
     whitening = np.diag(1.0 / np.sqrt(np.where(known, earlier.variance, 1.0)))[known]
     rows = np.linalg.solve(earlier.directions.T, whitening.T).T / earlier.unit
     unfixed = None if earlier.frames is None else earlier.frames.unfixed
-    return Prior(earlier.names, np.array(earlier.estimate), earlier.unit, rows, unfixed)
+    estimate, fitted = np.array(earlier.estimate), earlier.fitted_rows
+    return Prior(earlier.names, estimate, earlier.unit, rows, unfixed, fitted)
+
+
+def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) -> None:
+    """Refuse measurements of which an earlier calibration has used rows: they would count twice.
+
+    Parameters
+    ----------
+    earlier : the calibration, or the prior made of it, if any. data : the new measurements.
+
+    Raises
+    ------
+    DataError : `prior.rows-reused`, with the labels of the poses to exclude.
+    """
+    if earlier is None or earlier.fitted_rows is None:
+        return
+    reused = earlier.fitted_rows.find_in(data)
+    if reused.count:
+        raise DataError(report_finding("prior.rows-reused", **reused._asdict()))
+
+
+def collect_used_rows(
+    robot: Mechanism, data: Measurements, prior: Prior | None
+) -> FittedRows | None:
+    """Return the measured rows of a fit and those of its prior; None where these are not known."""
+    rows = collect_fitted_rows(data, are_readings_fitted=robot.program.sigma is not None)
+    if prior is None:
+        return rows
+    return None if prior.fitted_rows is None else prior.fitted_rows.joined(rows)
+
+
+def report_unknown_rows(prior: Prior | None) -> list[Finding]:
+    """Return the finding that nobody knows which rows a prior comes from, where this is so."""
+    is_unknown = prior is not None and prior.fitted_rows is None
+    return [report_finding("prior.rows-unknown")] if is_unknown else []
 
 
 def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:

@@ -14,19 +14,19 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import DataError, FileError
-from loopcal.findings import Finding, report_finding
+from loopcal.errors import FileError
+from loopcal.findings import Finding
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
 from loopcal.io.core.text_file import as_path, read_text, sha256
-from loopcal.io.data.measurement_file import Paths, list_measurement_files, load_measurements
+from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
 from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
@@ -40,7 +40,7 @@ from loopcal.mechanism import Mechanism
 if TYPE_CHECKING:
     from loopcal.estimate import Posterior
     from loopcal.estimate.inference.fit_uncertainty import FitUncertainty
-    from loopcal.measure import Measurements
+    from loopcal.measure import FittedRows, Measurements
     from loopcal.workflow import CalibrationReport
 
 FORMAT = 1
@@ -199,6 +199,15 @@ class Run:
         return find_run_failure(self.path, self.result)
 
     @property
+    def fitted_rows(self) -> FittedRows | None:
+        """The rows that the run, and those that are its prior, were fitted to; None for a robot
+        file, and for run folders of older versions.
+        """
+        from loopcal.measure import fitted_rows_from_arrays
+
+        return fitted_rows_from_arrays(self.arrays)
+
+    @property
     def held_out(self) -> tuple[str, ...]:
         """Labels of the poses that were held out for validation."""
         return tuple((self.result.get("split") or {}).get("held_out", ()))
@@ -347,42 +356,6 @@ def load_posterior(path: str | Path) -> Posterior:
     return load_run(path).load_posterior()
 
 
-def load_prior(path: str | Path, data: Paths) -> Posterior:
-    """Read the posterior of an earlier run, as a prior for new measurements.
-
-    Raises
-    ------
-    FileError, EstimationError : see `load_posterior`.
-    DataError : the run was fitted to these measurements, which would count twice.
-    """
-    run = load_run(path)
-    _refuse_fitted_files(run, data, "files.prior-data-reused")
-    return run.load_posterior()
-
-
 def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
     """Read a run folder with its uncertainties, or a robot file (or shipped robot) without any."""
     return load_posterior(path) if Path(path).is_dir() else load_run_or_robot(path).robot
-
-
-def refuse_fitted_files(run: Run, data: Paths) -> None:
-    """Raise DataError where a file for validation is one that the run was fitted to.
-
-    `loopcal.apply.find_reused_rows` recognizes rows in other files.
-    """
-    _refuse_fitted_files(run, data, "validation.file-reused")
-
-
-def _refuse_fitted_files(run: Run, data: Paths, code: str) -> None:
-    """Raise DataError with the finding `code` for a file of measurements that a run was made from.
-
-    Files of other names are recognized by their content.
-    """
-
-    def list_data(files: Mapping[str, Any]) -> Iterator[Any]:
-        return (file for role, file in files.items() if role.partition("-")[0] == "data")
-
-    used = {file.get("sha256") for file in list_data(list_inputs(run.result))}
-    for file in list_data(list_measurement_files(data)):
-        if sha256(file) in used:
-            raise DataError(report_finding(code, file=str(file)))

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recognize rows that a calibration was fitted to in other measurements, by their numbers.
+
+A row is its readings and its measured values. A copy in another file, order or unit, without some
+of its columns, or rounded far below its noise is the same row. A repeated measurement differs by
+its noise: that all m values of a repeat agree by chance has a probability below 1e-6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.measure.kinds import ActuatorReadings
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.typing import BoolArray, FloatArray
+
+PREFIX = "fitted"
+"""First word of the names of the stored arrays."""
+
+SAME = 1e-8
+"""Share of what a column spans up to which two numbers are the same."""
+
+SAME_READING = 1e-5
+"""The same for readings of rows whose measured values decide."""
+
+CHANCE = 1e-6
+"""Probability that the m measured values of a repeat agree: each differs by less than the m-th root
+of it, in standard deviations of the noise.
+"""
+
+LARGEST = 1e-2
+"""Largest such difference."""
+
+
+class ReusedRows(NamedTuple):
+    """Rows of measurements that belong to a calibration.
+
+    Attributes
+    ----------
+    poses : labels of their poses. count : number of these rows. total : number of all rows.
+    """
+
+    poses: tuple[str, ...]
+    count: int
+    total: int
+
+
+class _Rows(NamedTuple):
+    """Rows of one kind: `content` (r, c) are `readings` columns of readings, then measured values
+    [SI]; `noise` (r, c) is the standard deviation of each number, zero where it is not known;
+    `poses` (r, l) are their poses.
+    """
+
+    kind: str
+    readings: int
+    content: FloatArray
+    noise: FloatArray
+    poses: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FittedRows:
+    """The rows that a calibration, and those before it that are its prior, were fitted to.
+
+    Attributes
+    ----------
+    groups : of each kind its name and (r, c) the readings and measured values [SI].
+    """
+
+    groups: tuple[tuple[str, FloatArray], ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return sum(len(content) for _, content in self.groups)
+
+    def __repr__(self) -> str:
+        """Return the number of rows and their kinds."""
+        kinds = ", ".join(dict.fromkeys(kind for kind, _ in self.groups))
+        return f"<FittedRows: {len(self)} rows{f' of {kinds}' if kinds else ''}>"
+
+    def joined(self, other: FittedRows) -> FittedRows:
+        """Return these rows and those of another calibration."""
+        return FittedRows((*self.groups, *other.groups))
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return the rows by name, `fitted_<i>_<kind>`, to be stored."""
+        return {f"{PREFIX}_{i}_{kind}": rows for i, (kind, rows) in enumerate(self.groups)}
+
+    def find_in(self, data: Measurements) -> ReusedRows:
+        """Return which rows of other measurements are among these; rows of weight 0 do not count.
+
+        Parameters
+        ----------
+        data : the other measurements.
+        """
+        labels: list[str] = []
+        total, kinds = 0, {kind for kind, _ in self.groups}
+        for rows in _list_rows(data):
+            if rows.kind == ActuatorReadings.name and rows.kind not in kinds:
+                continue
+            reused = np.zeros(len(rows.content), dtype=bool)
+            for kind, content in self.groups:
+                if kind == rows.kind and content.shape[1] == rows.content.shape[1]:
+                    reused |= _is_among(rows, content)
+            labels += ["/".join(data.labels[j] for j in poses) for poses in rows.poses[reused]]
+            total += len(reused)
+        return ReusedRows(tuple(dict.fromkeys(labels)), len(labels), total)
+
+
+def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -> FittedRows:
+    """Return the rows of measurements that a fit uses: those with a weight above 0.
+
+    Parameters
+    ----------
+    data : the fitted measurements.
+    are_readings_fitted : whether readings alone are fitted, as where actuators are redundant.
+    """
+    kept = (r for r in _list_rows(data) if are_readings_fitted or r.kind != ActuatorReadings.name)
+    return FittedRows(tuple((rows.kind, rows.content) for rows in kept))
+
+
+def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | None:
+    """Return the rows in the arrays of a run folder; None where an older version wrote it."""
+    names = [name for name in arrays if name.startswith(f"{PREFIX}_")]
+    if not names:
+        return None
+    return FittedRows(tuple((name.split("_", 2)[2], arrays[name]) for name in names))
+
+
+def _list_rows(data: Measurements) -> list[_Rows]:
+    """Return the rows of each kind that count, then the readings of poses without such rows."""
+    result, is_alone = [], np.ones(data.n_poses, dtype=bool)
+    for o in data.observations:
+        counts = (o.weight > 0.0) & np.isfinite(o.measured).any(axis=1)
+        counts |= (o.weight > 0.0) & (o.measured.shape[1] == 0)
+        is_alone[o.rows] = False
+        poses = o.rows.reshape(len(o), o.rows[0].size if len(o) else 1)[counts]
+        readings = data.readings[poses].reshape(len(poses), poses.shape[1] * data.readings.shape[1])
+        content = np.concatenate([readings, o.measured[counts]], axis=1)
+        noise = np.concatenate([np.zeros(readings.shape), _state_noise(o)[counts]], axis=1)
+        result.append(_Rows(o.kind.name, readings.shape[1], content, noise, poses))
+    if data.reading_sigma is not None:
+        is_alone &= np.isfinite(data.reading_sigma).any(axis=1)
+    alone = data.readings[is_alone]
+    poses = np.flatnonzero(is_alone)[:, None]
+    return [*result, _Rows(ActuatorReadings.name, 0, alone, np.zeros(alone.shape), poses)]
+
+
+def _state_noise(rows: Observations) -> FloatArray:
+    """Return the standard deviation (r, c) of each measured value; zero where the kind has other
+    residuals than values.
+    """
+    variance = np.einsum("rii->ri", rows.covariance)
+    if variance.shape != rows.measured.shape:
+        return np.zeros(rows.measured.shape)
+    return np.sqrt(np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0))
+
+
+def _is_among(rows: _Rows, fitted: FloatArray) -> BoolArray:
+    """Return which rows (r,) agree with one of the fitted rows (k, c) in all numbers that both
+    have, among them a measured value.
+    """
+    result = np.zeros(len(rows.content), dtype=bool)
+    if not len(fitted) or not len(result):
+        return result
+    filled = np.where(np.isnan(fitted), 0.0, fitted)
+    span = np.maximum(np.ptp(filled, axis=0), 1e-3 * np.abs(filled).max(axis=0))
+    span = np.where(span > 0.0, span, 1.0)
+    masks, mine = np.unique(np.isfinite(rows.content), axis=0, return_inverse=True)
+    others, theirs = np.unique(np.isfinite(fitted), axis=0, return_inverse=True)
+    for i, mask in enumerate(masks):
+        own = np.flatnonzero(mine.reshape(-1) == i)
+        for j, other in enumerate(others):
+            common = mask & other
+            stored = fitted[theirs.reshape(-1) == j]
+            result[own] |= _agree(rows, own, stored, common, span)
+    return result
+
+
+def _agree(
+    rows: _Rows, own: np.ndarray, stored: FloatArray, common: BoolArray, span: FloatArray
+) -> BoolArray:
+    """Return which of the rows `own` agree with a stored row in the `common` columns (c,)."""
+    from scipy.spatial import KDTree
+
+    m = int(common[rows.readings :].sum())
+    if m == 0 and rows.content.shape[1] > rows.readings:
+        return np.zeros(len(own), dtype=bool)
+    share = np.full(len(span), SAME)
+    if m > 0 and rows.readings > 0:
+        share[: rows.readings] = SAME_READING
+    noise = np.median(rows.noise[own], axis=0)
+    limit = np.maximum(share * span, min(CHANCE ** (1.0 / max(m, 1)), LARGEST) * noise)[common]
+    distance, _ = KDTree(stored[:, common] / limit).query(
+        rows.content[own][:, common] / limit, p=np.inf, distance_upper_bound=1.0
+    )
+    return np.isfinite(distance)
