@@ -100,7 +100,7 @@ def test_splitting_data_into_several_files_gives_the_same_calibration(folder, ca
     with np.load(folder / "both" / "arrays.npz") as arrays:
         np.testing.assert_array_equal(arrays["temperature_0_pose"], 20 + 0.1 * np.arange(20.0))
     assert main(["validate", "values", "poses.csv", "tracker.csv"]) == 1
-    assert "tracker.csv contains the measurements of this calibration" in capsys.readouterr().err
+    assert "The calibration used 20 of 20 rows" in capsys.readouterr().err
     assert (
         main(["validate", "both", "poses.csv", "values.csv"]) == 1
     )  # the same rows under another name
