@@ -305,7 +305,7 @@ def make_method(name: str, value: Any = None) -> Any:
     """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd,
     tsvd-gcv.
     """
-    from loopcal.estimate.methods.prior_conflict import InflatedTolerances
+    from loopcal.estimate.methods.inflated_tolerances import InflatedTolerances
 
     makers = {
         "ls": estimate.LeastSquares,

@@ -9,13 +9,13 @@ from loopcal.estimate.inference.posterior import Posterior as Posterior
 from loopcal.estimate.inference.prior import Prior as Prior
 from loopcal.estimate.inference.prior import prior_from as prior_from
 from loopcal.estimate.inference.residual_test import ResidualTest as ResidualTest
+from loopcal.estimate.methods.inflated_tolerances import InflatedTolerances as InflatedTolerances
 from loopcal.estimate.methods.losses import Huber as Huber
 from loopcal.estimate.methods.losses import Tukey as Tukey
 from loopcal.estimate.methods.penalties import MAP as MAP
 from loopcal.estimate.methods.penalties import LeastSquares as LeastSquares
 from loopcal.estimate.methods.penalties import Ridge as Ridge
 from loopcal.estimate.methods.penalties import TruncatedSVD as TruncatedSVD
-from loopcal.estimate.methods.prior_conflict import InflatedTolerances as InflatedTolerances
 from loopcal.estimate.methods.prior_conflict import PriorConflict as PriorConflict
 from loopcal.estimate.methods.regularization_rules import GCV as GCV
 from loopcal.estimate.methods.regularization_rules import MarginalLikelihood as MarginalLikelihood

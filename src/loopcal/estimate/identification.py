@@ -34,7 +34,6 @@ from loopcal.estimate.inference.residual_test import run_residual_test
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
-from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
 from loopcal.estimate.methods.regularization import describe_regularization
 from loopcal.estimate.minimization.closure_start import descend_from_closure, report_unused_closure
 from loopcal.estimate.minimization.descent import Descent, descend
@@ -56,6 +55,7 @@ from loopcal.estimate.poses.estimate import (
 )
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.estimate.poses.states import PoseSolution
+from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
@@ -118,6 +118,7 @@ def identify(
     if fit.status[0] != DescentStatus.CONVERGED and open_poses.are_most:
         raise EstimationError(open_poses.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
+    result = add_factor_uncertainty(result, fit)
     findings = [*result.findings, *report_unknown_rows(options.prior)]
     if open_poses.poses:
         findings.append(open_poses.report("fit.poses-open-at-start"))
@@ -263,7 +264,7 @@ def _assemble(
     is_prior = isinstance(_method(options), MAP)
     test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged, is_prior)
     solution = _solve_unweighted(problem, weighted, fit)
-    conflict = _test_prior(free, fit, _method(options))
+    conflict = run_prior_tests(free, fit, _method(options))
     d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
@@ -331,14 +332,6 @@ def _method(options: FitOptions) -> Method:
     """Return the method, which `adapt_method` has set."""
     assert options.method is not None
     return options.method
-
-
-def _test_prior(free: FreeParameters, fit: Descent, method: Method) -> PriorConflict | None:
-    """Return the test of the prior, where the method uses one."""
-    if not isinstance(method, MAP):
-        return None
-    sigma = float(method.sigma(fit.decomposition)[0])
-    return assess_prior_conflict(free, fit.decomposition, fit.penalty, sigma, fit.deviation[0])
 
 
 def _estimate_nuisance(

@@ -27,7 +27,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
-from loopcal.estimate.methods.prior_conflict import InflatedTolerances
+from loopcal.estimate.methods.inflated_tolerances import InflatedTolerances
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -236,10 +236,15 @@ class MAP(Method):
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return sigma^2 / inflation^2, with sigma = 1 where the noise is given."""
-        sigma = self.sigma(decomposition)
+        factor = self.sigma(decomposition) / self.compute_inflation(decomposition)
+        return _penalize(decomposition, factor**2)
+
+    def compute_inflation(self, decomposition: Decomposition) -> FloatArray:
+        """Return the factor (t,) on all tolerances."""
         rule = self.inflation
-        inflation = rule(decomposition.divided(sigma)) if callable(rule) else rule
-        return _penalize(decomposition, (sigma / inflation) ** 2)
+        if not callable(rule):
+            return np.full(len(decomposition.rows), rule)
+        return np.asarray(rule(decomposition.divided(self.sigma(decomposition))))
 
     def sigma(self, decomposition: Decomposition) -> FloatArray:
         """Return the factor (t,) on the stated sigmas.

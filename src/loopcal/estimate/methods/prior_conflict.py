@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test the stated tolerances against the data, and inflate them where the data contradict them.
+"""Test the stated tolerances against the data.
 
 With the prior z ~ N(0, 1) and unit noise the projections c_i = u_i'b are independent, c_i ~ N(0, 1
-+ s_i^2), and the most probable deviation is y_i = s_i c_i / (1 + s_i^2), so that
++ s_i^2), and the most probable deviation is z = V y, y_i = s_i c_i / (1 + s_i^2), of variance w_i =
+s_i^2 / (1 + s_i^2). Three tests ask whether the data are what such a prior predicts:
 
-    Q = z'z = sum y_i^2 = sum w_i chi2_i,   w_i = s_i^2 / (1 + s_i^2)
+    all deviations    Q = sum y_i^2 = sum w_i chi2_i, compared with the scaled chi-square of equal
+                      mean and variance (Satterthwaite): (sum w)^2 / sum w^2 degrees of freedom
+    worst direction   max |c_i| / sqrt(1 + s_i^2)
+    worst parameter   max |z_k| / sqrt(sum_i V_ki^2 w_i), which is |z_k| / sqrt(1 - v_k) with the
+                      share v_k of the prior variance that the data leave
 
-with independent chi2_i of one degree of freedom. Directions that the data do not determine have no
-weight. Q is compared with the scaled chi-square of equal mean and variance (Satterthwaite): (sum
-w)^2 / sum w^2 degrees of freedom. Where all s_i are large, Q is the sum of c_i^2 / (1 + s_i^2), the
-part of b'(I + AA')^-1 b within the range of A. The part outside the range contains no information
-on the prior; it is used for the noise. See docs/theory/uncertainty.md.
+The last two are normal; the probability of the largest of n is 1 - (1 - p)^n, and that of the most
+significant of the three tests 1 - (1 - p)^3 (Sidak). Directions that the data do not determine have
+no weight. The part of the data outside the range contains no information on the prior; it is used
+for the noise. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -22,12 +26,14 @@ from typing import ClassVar
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE
-from loopcal.estimate.methods.regularization_rules import MarginalLikelihood
+from loopcal.estimate.methods.inflated_tolerances import are_penalized, estimate_excess_noise
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
+
+LEVEL = 0.01
+"""Probability that any of the tests rejects tolerances that are right."""
 
 FAR = 2.0
 """Deviation from nominal, in tolerances, above which a parameter is named."""
@@ -35,27 +41,27 @@ FAR = 2.0
 NAMED = 3
 """Largest number of parameters that are named."""
 
+MAIN_PART = 0.3
+"""Part of a parameter in a direction, relative to the largest, above which it is named."""
+
+TESTABLE = 1e-6
+"""Share of the prior variance that data must explain for a parameter or direction to be tested."""
+
 
 @dataclass(frozen=True)
-class InflatedTolerances:
-    """Choose the factor on all tolerances: 1, or the one of largest marginal likelihood.
+class LargestDeviation:
+    """The test of the largest of several standard normal statistics.
 
-    The factor differs from 1 only where the data contradict the tolerances beyond doubt; it is
-    never below 1. Data that leave more than their noise outside the range of the parameters (wrong
-    sigma, wrong rows, incomplete model) count with the noise that they show, so that they do not
-    inflate the tolerances.
+    Attributes
+    ----------
+    statistic : the largest absolute value; 0 without a test. count : number of statistics.
+    p_value : probability of a larger one in any of them. names : of the parameters in question.
     """
 
-    def __call__(self, decomposition: Decomposition) -> FloatArray:
-        """Return the factor (t,)."""
-        rescaled = decomposition.divided(estimate_excess_noise(decomposition))
-        statistic, degrees = compute_prior_statistic(rescaled)
-        rejected = compute_chi_square_tail(degrees, statistic) < SIGNIFICANCE
-        inflation = np.ones_like(statistic)
-        if rejected.any():
-            lam = MarginalLikelihood()(rescaled.take(np.flatnonzero(rejected)))
-            inflation[rejected] = np.maximum(1.0 / np.sqrt(lam), 1.0)
-        return inflation
+    statistic: float
+    count: int
+    p_value: float
+    names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -65,8 +71,9 @@ class PriorConflict:
     Attributes
     ----------
     statistic, degrees, p_value : Q, its degrees of freedom and the probability of a larger Q.
-    inflation : factor by which the tolerances were inflated for the estimate.
-    conflict : whether the data contradict the tolerances.
+    direction, parameter : the tests of the worst direction and of the worst parameter.
+    joint_p_value : probability that the most significant of the three tests is more significant.
+    inflation : factor by which all tolerances were inflated for the estimate.
     farthest : names of the parameters farthest from nominal, and their deviations in tolerances.
     """
 
@@ -74,6 +81,9 @@ class PriorConflict:
         "statistic": "statistic",
         "degrees": "degrees",
         "p_value": "p_value",
+        "worst_direction": "direction",
+        "worst_parameter": "parameter",
+        "joint_p_value": "joint_p_value",
         "spread": "inflation",
         "conflict": "conflict",
         "farthest": "farthest",
@@ -83,9 +93,16 @@ class PriorConflict:
     statistic: float
     degrees: float
     p_value: float
+    direction: LargestDeviation
+    parameter: LargestDeviation
+    joint_p_value: float
     inflation: float
-    conflict: bool
     farthest: tuple[tuple[str, float], ...]
+
+    @property
+    def conflict(self) -> bool:
+        """Whether the data contradict the tolerances."""
+        return self.joint_p_value < LEVEL
 
     @property
     def finding(self) -> Finding:
@@ -93,16 +110,25 @@ class PriorConflict:
         if self.degrees < 0.5:
             return report_finding("prior.untested")
         if not self.conflict:
-            return report_finding("prior.consistent")
-        inflated = self.inflation > 1.0
+            return report_finding("prior.consistent", p_value=self.joint_p_value, level=LEVEL)
+        inflated, worst = self.inflation > 1.0, self._worst
         return report_finding(
             "prior.tolerances-inflated" if inflated else "prior.tolerances-too-narrow",
             ratio=float(np.sqrt(self.statistic / self.degrees)),
             names=tuple(name for name, _ in self.farthest),
             deviations=tuple(deviation for _, deviation in self.farthest),
+            worst=() if worst is None else worst.names,
+            worst_statistic=0.0 if worst is None else worst.statistic,
             inflation=self.inflation,
-            p_value=self.p_value,
+            p_value=self.joint_p_value,
+            level=LEVEL,
         )
+
+    @property
+    def _worst(self) -> LargestDeviation | None:
+        """The test of a parameter or direction that is more significant than the one of all."""
+        worst = min(self.parameter, self.direction, key=lambda test: test.p_value)
+        return worst if worst.p_value < self.p_value else None
 
     @property
     def sentence(self) -> str:
@@ -113,7 +139,7 @@ class PriorConflict:
 def assess_prior_conflict(
     free: FreeParameters,
     decomposition: Decomposition,
-    penalty: FloatArray,
+    inflation: float,
     sigma: float,
     deviation: FloatArray,
 ) -> PriorConflict:
@@ -121,25 +147,25 @@ def assess_prior_conflict(
 
     Parameters
     ----------
-    free : the parameters. decomposition, penalty : of the fit, columns scaled by tolerance.
+    free : the parameters. decomposition : of the fit, for the stated tolerances.
+    inflation : factor by which the method inflated all of them.
     sigma : factor on the stated sigmas. deviation : (p,) of the estimate, in tolerances.
     """
     scaled = decomposition.divided(np.full(1, sigma))
-    statistic, degrees = (
-        float(value[0])
-        for value in compute_prior_statistic(scaled.divided(estimate_excess_noise(scaled)))
-    )
-    penalized = np.isfinite(penalty[0]) & (penalty[0] > 0.0)
-    inflation = float(sigma / np.sqrt(penalty[0][penalized][0])) if penalized.any() else np.nan
+    scaled = scaled.divided(estimate_excess_noise(scaled))
+    statistic, degrees = (float(value[0]) for value in compute_prior_statistic(scaled))
     p_value = float(compute_chi_square_tail(degrees, statistic))
+    direction, parameter = _test_directions(free, scaled), _test_parameters(free, scaled)
     order = np.argsort(-np.abs(deviation))
     far = [i for i in order if abs(deviation[i]) > FAR and not free.assumed[i]][:NAMED]
     return PriorConflict(
         statistic=statistic,
         degrees=degrees,
         p_value=p_value,
+        direction=direction,
+        parameter=parameter,
+        joint_p_value=_correct(min(p_value, direction.p_value, parameter.p_value), 3),
         inflation=inflation,
-        conflict=p_value < SIGNIFICANCE,
         farthest=tuple((free.names[i], float(deviation[i])) for i in far),
     )
 
@@ -149,9 +175,7 @@ def compute_prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, F
 
     The sums are over the directions that a prior penalizes.
     """
-    unpenalized = decomposition.unpenalized
-    penalized = np.ones(1, dtype=bool) if unpenalized is None else ~unpenalized
-    square = np.where(penalized, decomposition.singular_values**2, 0.0)
+    square = np.where(are_penalized(decomposition), decomposition.singular_values**2, 0.0)
     share = square / (1.0 + square)
     value = (share * decomposition.projections**2 / (1.0 + square)).sum(axis=1)
     first, second = share.sum(axis=1), (share**2).sum(axis=1)
@@ -160,11 +184,39 @@ def compute_prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, F
     return np.where(testable, value * first / safe, 0.0), np.where(testable, first**2 / safe, 0.0)
 
 
-def estimate_excess_noise(decomposition: Decomposition) -> FloatArray:
-    """Return the factor (t,) on sigma that the part outside the range shows.
+def _test_directions(free: FreeParameters, d: Decomposition) -> LargestDeviation:
+    """Test the worst direction (t = 1); it is named by its largest parts, in tolerances."""
+    square = np.where(are_penalized(d), d.singular_values**2, 0.0)[0]
+    testable = square / (1.0 + square) > TESTABLE
+    values = np.where(testable, np.abs(d.projections[0]) / np.sqrt(1.0 + square), 0.0)
+    worst = int(np.argmax(values))
+    part = np.where(free.assumed, 0.0, np.abs(d.scale * d.directions[0][:, worst]))
+    order = [i for i in np.argsort(-part) if part[i] > MAIN_PART * part.max()]
+    return _largest(values, testable, tuple(free.names[i] for i in order))
 
-    It is 1 unless that part is larger than the noise beyond doubt.
-    """
-    left = (decomposition.rows - decomposition.rank).astype(np.float64)
-    larger = compute_chi_square_tail(left, decomposition.unexplained) < SIGNIFICANCE
-    return np.sqrt(np.where(larger, decomposition.unexplained / np.maximum(left, 1.0), 1.0))
+
+def _test_parameters(free: FreeParameters, d: Decomposition) -> LargestDeviation:
+    """Test the worst parameter (t = 1)."""
+    square = np.where(are_penalized(d), d.singular_values**2, 0.0)[0]
+    basis = d.scale[:, None] * d.directions[0]
+    deviation = basis @ (np.sqrt(square) * d.projections[0] / (1.0 + square))
+    variance = basis**2 @ (square / (1.0 + square))
+    testable = (variance > TESTABLE) & ~free.assumed
+    spread = np.sqrt(np.where(testable, variance, 1.0))
+    values = np.where(testable, np.abs(deviation) / spread, 0.0)
+    return _largest(values, testable, (free.names[int(np.argmax(values))],))
+
+
+def _largest(values: FloatArray, testable: BoolArray, names: tuple[str, ...]) -> LargestDeviation:
+    """Return the test of the largest of standard normal values that are testable."""
+    count = int(testable.sum())
+    if count == 0:
+        return LargestDeviation(0.0, 0, 1.0, ())
+    largest = float(values.max())
+    single = float(compute_chi_square_tail(1.0, largest**2))
+    return LargestDeviation(largest, count, _correct(single, count), names)
+
+
+def _correct(p_value: float, count: int) -> float:
+    """Return the probability 1 - (1 - p)^count that any of several tests is as significant."""
+    return float(-np.expm1(count * np.log1p(-min(p_value, 1.0 - 1e-16))))

@@ -174,13 +174,16 @@ def regularization(data: Data) -> str:
 
 
 def contradicted_tolerances(data: Data) -> str:
-    """Return the sentence on the prior that the data contradict, and the largest deviations."""
+    """Return the sentences on the prior that the data contradict, and the largest deviations."""
     pairs = zip(data["names"], data["deviations"], strict=True)
     return fill_template(
-        "The data contradict the stated tolerances: the deviations from nominal are {ratio} times "
-        "as large as these allow{far:if| (largest, in tolerances: {far})}.",
-        ratio=data["ratio"],
+        "The data contradict the stated tolerances (p = {p_value:.1g}; right tolerances are "
+        "rejected in {level:percent} of data sets): {worst:if|{worst:plural|{worst[0]} deviates|"
+        "{worst:list} together deviate} from nominal by {worst_statistic} standard deviations of "
+        "what they predict|the deviations from nominal are {ratio} times as large as they allow}"
+        "{far:if| (largest, in tolerances: {far})}.",
         far=", ".join(f"{name} {deviation:+.3g}" for name, deviation in pairs),
+        **data,
     )
 
 
