@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Effects that the residuals of a fit may depend on: time, temperature, session, actuator reading.
+
+An effect adds to each measured component a sum of stated functions of a quantity, with an unknown
+size for each function and component. Targets that are measured together share it. The whitened rows
+of one function and component are one column; its size is the range of the effect [SI].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, order_rows
+from loopcal.measure import Measurements, Observations
+from loopcal.measure.kinds.error_groups import list_error_groups
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension
+
+ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
+"""What residuals may depend on."""
+
+
+@dataclass(frozen=True)
+class EffectColumn:
+    """One function of the quantity, for one measured component.
+
+    Attributes
+    ----------
+    component : its name, such as "z". dimension : of its size.
+    """
+
+    component: str
+    dimension: Dimension
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A dependence of the measured values on one quantity.
+
+    Attributes
+    ----------
+    source : what it depends on, such as "time". name : of the temperature or actuator, else empty.
+    columns : (R, c) whitened rows by the sizes. labels : what the c columns are.
+    """
+
+    source: str
+    name: str
+    columns: FloatArray
+    labels: tuple[EffectColumn, ...]
+
+
+def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
+    """Return the effects that measurements can have.
+
+    Linear in time, or in the order of measurement where the rows state no time, linear in each
+    temperature, a difference between sessions, and quadratic in each actuator reading.
+
+    Parameters
+    ----------
+    rows : of a fit. data : its measurements, without excluded poses. robot : names the actuators.
+    """
+    observations = [o for o in data.observations if len(o)]
+    effects = [_build_trend(rows, observations)]
+    names = dict.fromkeys(name for o in observations for name in o.context if name != TIME)
+    for name in names:
+        functions = [
+            [scale_to_range(o.context[name])] if name in o.context else [] for o in observations
+        ]
+        effects.append(_build(rows, observations, functions, TEMPERATURE, name))
+    functions = [
+        [(o.session == name).astype(float) for name in np.unique(o.session)] for o in observations
+    ]
+    effects.append(_build(rows, observations, functions, SESSION))
+    for i, actuator in enumerate(robot.actuators):
+        functions = []
+        for o in observations:
+            x = scale_to_range(data.readings[o.rows.reshape(len(o), -1)[:, 0], i])
+            functions.append([x, 4.0 * x**2])
+        effects.append(_build(rows, observations, functions, READING, actuator.name))
+    return tuple(effects)
+
+
+def scale_to_range(values: FloatArray) -> FloatArray:
+    """Return values (r,) moved and scaled to the range -0.5 to 0.5; 0 where they are missing, or
+    all equal.
+    """
+    known = np.isfinite(values)
+    if not known.any() or not np.ptp(values[known]) > 0.0:
+        return np.zeros(len(values))
+    low, high = values[known].min(), values[known].max()
+    return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
+
+
+def _build_trend(rows: ResidualRows, observations: Sequence[Observations]) -> Effect:
+    """Return the linear trend in time, or in the order of the rows."""
+    has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
+    functions = []
+    for o in observations:
+        values = o.context[TIME] if has_time else order_rows(o).astype(float)
+        functions.append([scale_to_range(values)])
+    return _build(rows, observations, functions, TIME if has_time else ORDER)
+
+
+def _build(
+    rows: ResidualRows,
+    observations: Sequence[Observations],
+    functions: Sequence[Sequence[FloatArray]],
+    source: str,
+    name: str = "",
+) -> Effect:
+    """Return an effect from functions (r,) of the rows of each kind, less their means: an offset of
+    all rows is no such effect.
+    """
+    columns, labels = [np.zeros((len(rows.residual), 0))], []
+    for number, (o, of_kind) in enumerate(zip(observations, functions, strict=True)):
+        chosen = np.flatnonzero(rows.kind == number)
+        for label, members in list_components(o):
+            shift = o.whitener[rows.row[chosen], rows.column[chosen]][:, members].sum(axis=1)
+            for function in of_kind:
+                column = np.zeros(len(rows.residual))
+                column[chosen] = -shift * (function - function.mean())[rows.row[chosen]]
+                if column.any():
+                    columns.append(column[:, None])
+                    labels.append(label)
+    return Effect(source, name, np.concatenate(columns, axis=1), tuple(labels))
+
+
+def list_components(rows: Observations) -> Iterator[tuple[EffectColumn, list[int]]]:
+    """Give the measured components of a kind, with their columns: x of all targets is one."""
+    members: dict[EffectColumn, list[int]] = {}
+    for group in list_error_groups(rows.kind):
+        for name, column in zip(group.components, group.columns, strict=True):
+            members.setdefault(EffectColumn(name, group.dimension), []).append(column)
+    yield from members.items()

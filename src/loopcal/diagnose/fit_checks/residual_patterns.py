@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Test whether residuals depend on order, time, temperature, session or actuator readings.
+
+With r the residuals that no parameter explains, of nu degrees of freedom (`ResidualRows`), and Q
+the basis of the part of an effect's columns that nothing estimated explains, of rank q,
+
+    F = |Q'r|^2 / q  /  ((|r|^2 - |Q'r|^2) / (nu - q))
+
+has an F distribution for independent normal errors of any size. The correlation of neighbors in the
+order of measurement is r'L r / |r|^2, L the mean of the shifts by one row in both directions within
+every series. Its mean and variance for independent errors follow from the traces of M L and
+(M L)^2, M = I - U U'; it is compared with the beta distribution on (-1, 1) of these moments.
+Source: Durbin and Watson, Testing for serial correlation in least squares regression, Biometrika
+37 (1950) and 58 (1971).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.diagnose.fit_checks.residual_effects import ORDER, TIME, Effect, list_effects
+from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, span_columns
+from loopcal.measure import Measurements
+from loopcal.mechanism import Mechanism
+from loopcal.numerics.chi_square import compute_f_tail
+from loopcal.typing import FloatArray
+
+LEVEL = 0.01
+"""Probability that independent errors show any pattern, over all tests of a fit (Sidak)."""
+
+FEWEST_LEFT = 3.0
+"""Degrees of freedom of the residuals for each size of an effect that is tested, at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class EffectSizes:
+    """The sizes of a significant effect, and how they act on the residuals.
+
+    Attributes
+    ----------
+    effect : what the residuals depend on. p_value : of its test.
+    sizes, errors : (c,) [SI] estimates and standard deviations.
+    moments : (c, c) [SI] expected products of the sizes.
+    """
+
+    effect: Effect
+    p_value: float
+    sizes: FloatArray
+    errors: FloatArray
+    moments: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualPatterns:
+    """What the residuals of a fit show.
+
+    Attributes
+    ----------
+    tests : number of tests. effects : that are significant, the first found first.
+    correlation : of neighboring residuals, less what a fit causes. p_value : of it.
+    is_correlated : whether it is significant. order : "time" or "order", that of the rows.
+    rows : the residuals, as if the fit had estimated the effects.
+    """
+
+    tests: int
+    effects: tuple[EffectSizes, ...]
+    correlation: float
+    p_value: float
+    is_correlated: bool
+    order: str
+    rows: ResidualRows
+
+
+def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> ResidualPatterns:
+    """Test the residuals against every effect, then against correlation in the order of rows.
+
+    The most significant effect is estimated, and the others are tested again without it, until none
+    is significant.
+    """
+    listed = list_effects(rows, data, robot)
+    order = TIME if any(effect.source == TIME for effect in listed) else ORDER
+    effects = [e for e in listed if _is_testable(rows, e)]
+    correlation, p_value = test_correlation(rows)
+    tests = len(effects) + int(np.isfinite(p_value))
+    level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(tests, 1))
+    found: list[EffectSizes] = []
+    while effects:
+        p_values = [test_effect(rows, effect) for effect in effects]
+        best = int(np.argmin(p_values))
+        if not p_values[best] < level:
+            break
+        effect = effects.pop(best)
+        found.append(estimate_sizes(rows, effect, p_values[best]))
+        rows = rows.with_effects(effect.columns)
+        effects = [e for e in effects if _is_testable(rows, e)]
+    if found:
+        correlation, p_value = test_correlation(rows)
+    is_correlated = p_value < level
+    return ResidualPatterns(tests, tuple(found), correlation, p_value, is_correlated, order, rows)
+
+
+def test_effect(rows: ResidualRows, effect: Effect) -> float:
+    """Return the probability of a larger F for independent errors."""
+    basis = span_columns(rows.project(effect.columns))
+    q, explained = basis.shape[1], float(((basis.T @ rows.residual) ** 2).sum())
+    left = rows.degrees - q
+    statistic = explained / q / ((rows.square - explained) / left)
+    return float(compute_f_tail(q, left, statistic))
+
+
+def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> EffectSizes:
+    """Return the sizes of an effect, by least squares where residuals show them.
+
+    Sizes that the residuals hardly show, because they are like a parameter of the machine, get the
+    variance that the others have: g ~ N(0, tau^2) in units of the noise, tau^2 by its moments.
+    """
+    length = np.linalg.norm(effect.columns, axis=0) / np.sqrt(len(rows.residual))
+    scaled = effect.columns / length
+    left = rows.project(scaled)
+    noise = rows.square / rows.degrees
+    u, s, vt = np.linalg.svd(left, full_matrices=False)
+    seen = s > 1e-6 * np.linalg.norm(scaled)
+    c = np.where(seen, u.T @ rows.residual, 0.0)
+    excess = float((c**2).sum()) - noise * int(seen.sum())
+    tau2 = max(excess, noise) / float((s[seen] ** 2).sum())
+    variance = 1.0 / (s**2 / noise + 1.0 / tau2)
+    mean = vt.T @ (variance * s * c / noise)
+    spread = vt.T * np.sqrt(variance)
+    back = 1.0 / length
+    return EffectSizes(
+        effect,
+        p_value,
+        back * mean,
+        back * np.linalg.norm(spread, axis=1),
+        back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back,
+    )
+
+
+def test_correlation(rows: ResidualRows) -> tuple[float, float]:
+    """Return the correlation of neighboring residuals less its mean for independent errors, and the
+    probability of a larger one; NaN without neighbors or degrees of freedom.
+    """
+    pairs = np.flatnonzero(rows.series[1:] == rows.series[:-1])
+    nu = rows.degrees
+    if len(pairs) == 0 or nu < FEWEST_LEFT:
+        return np.nan, np.nan
+    r, U = rows.residual, rows.basis
+    observed = float(r[pairs] @ r[pairs + 1]) / rows.square
+    LU = _shift(U, pairs)
+    inner = U.T @ LU
+    # traces of B = M L M, from tr L = 0 and tr L^2 = pairs / 2
+    first = -float(np.trace(inner))
+    second = 0.5 * len(pairs) - 2.0 * float((LU**2).sum()) + float((inner**2).sum())
+    mean = first / nu
+    variance = 2.0 * (second - first**2 / nu) / (nu * (nu + 2.0))
+    if not variance > 0.0:
+        return np.nan, np.nan
+    return observed - mean, _compute_beta_tail(observed, mean, variance)
+
+
+def _shift(columns: FloatArray, pairs: np.ndarray) -> FloatArray:
+    """Return L columns, L the symmetric matrix with 1/2 for each pair of neighbors."""
+    moved = np.zeros_like(columns)
+    moved[pairs] += 0.5 * columns[pairs + 1]
+    moved[pairs + 1] += 0.5 * columns[pairs]
+    return moved
+
+
+def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:
+    """Return the probability of a larger value of a beta variable on (-1, 1)."""
+    from scipy.special import betainc
+
+    center, spread = 0.5 * (1.0 + mean), 0.25 * variance
+    total = center * (1.0 - center) / spread - 1.0
+    if not total > 0.0:
+        return float("nan")
+    place = float(np.clip(0.5 * (1.0 - observed), 0.0, 1.0))
+    return float(betainc((1.0 - center) * total, center * total, place))
+
+
+def _is_testable(rows: ResidualRows, effect: Effect) -> bool:
+    """Return whether residuals can show an effect, and enough degrees of freedom are left."""
+    if not effect.columns.shape[1]:
+        return False
+    rank = span_columns(rows.project(effect.columns)).shape[1]
+    return rank > 0 and rows.degrees >= (1.0 + FEWEST_LEFT) * rank

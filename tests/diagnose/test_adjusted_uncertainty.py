@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The uncertainty of a fit whose residuals are correlated, drift or depend on a session."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+from scipy.special import stdtrit
+
+import loopcal as lc
+from loopcal.diagnose import adjust_uncertainty
+from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_correlated_errors
+from loopcal.diagnose.fit_checks.residual_rows import collect_residual_rows
+from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
+from loopcal.mechanism import differentiate_pose, forward, sample_workspace
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
+
+PATTERNS = {
+    "residuals.correlated",
+    "residuals.drift",
+    "residuals.trend",
+    "residuals.sessions-differ",
+    "residuals.depend-on-reading",
+    "residuals.depend-on-temperature",
+}
+
+
+def fit_and_adjust(robot, kind, errors, seed, method=None, **context):
+    """Return truth, the fit, and the adjusted fit."""
+    truth, data = measure(robot, kind, errors, seed, **context)
+    fit = identify(ROBOTS[robot], data, method)
+    return truth, fit, adjust_uncertainty(fit, data)
+
+
+def cover_positions(robot, fit, truth):
+    """Return whether 95 % intervals (n, 3) of positions elsewhere contain the true errors."""
+    q = sample_workspace(robot, 8, 99).solution.q
+    estimated, true = forward(fit.robot, q), forward(robot.with_values(truth), q)
+    solved = differentiate_pose(fit.robot, fit.robot.values[None], q[None], estimated.state)
+    D = solved.parameters[0][:, 3:, fit.posterior.places]
+    sd = np.sqrt(((D @ fit.posterior.root) ** 2).sum(axis=-1))
+    degrees = np.minimum(fit.posterior.count_degrees(D[:, :, None, :]), 1e6)
+    error = estimated.T[:, :3, 3] - true.T[:, :3, 3]
+    return np.abs(error) <= stdtrit(degrees, 0.975) * sd
+
+
+@pytest.mark.parametrize(("correlation", "before"), [(0.6, 0.93), (0.9, 0.82)])
+def test_poses_are_covered_where_errors_are_correlated(correlation, before):
+    robot, inside, adjusted, named = ROBOTS["linear-delta"], [], [], []
+    for seed in range(50):
+        errors = draw_errors(20, 3, seed, correlation)
+        truth, fit, result = fit_and_adjust("linear-delta", "component", errors, seed)
+        inside.append(cover_positions(robot, fit, truth))
+        adjusted.append(cover_positions(robot, result, truth))
+        named.append(bool({f.code for f in result.findings} & PATTERNS))
+        assert (result.standard_deviations >= fit.standard_deviations).all()
+        assert (result.estimate == fit.estimate).all()
+    assert np.mean(inside) < before
+    assert np.mean(adjusted) > 0.93
+    assert np.mean(named) >= (0.95 if correlation > 0.8 else 0.7)
+
+
+def test_poses_are_covered_where_the_instrument_drifts():
+    robot, inside, adjusted, named = ROBOTS["3-prs"], [], [], []
+    ramp = np.linspace(-2.0, 2.0, 16)[:, None]
+    for seed in range(25):
+        errors = draw_errors(16, 6, seed) + ramp * np.random.default_rng(seed).normal(size=6)
+        truth, fit, result = fit_and_adjust("3-prs", "pose", errors, seed)
+        inside.append(cover_positions(robot, fit, truth))
+        adjusted.append(cover_positions(robot, result, truth))
+        named.append("residuals.trend" in {f.code for f in result.findings})
+    assert np.mean(named) >= 0.95
+    assert np.mean(adjusted) > max(np.mean(inside), 0.93)
+
+
+def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
+    errors = draw_errors(14, 3, 3, 0.7)
+    _, data = measure("linear-delta", "component", errors, 3)
+    rows = collect_residual_rows(identify(ROBOTS["linear-delta"], data), data)
+    assert rows is not None
+    result = estimate_correlated_errors(rows, 8.0)
+    # the likelihood of the rows A r that no parameter changes, A from the full QR of the basis
+    A = np.linalg.qr(rows.basis, mode="complete")[0][:, rows.basis.shape[1] :].T
+    y, logs, parts = A @ rows.residual, [], []
+    for rho in RHO:
+        for share in SHARE if rho else (1.0,):
+            one = share * toeplitz(rho ** np.arange(14.0)) + (1.0 - share) * np.eye(14)
+            K = np.kron(np.eye(3), one)
+            inside = A @ K @ A.T
+            total = 8.0 + y @ np.linalg.solve(inside, y)
+            nu = len(y) + 8.0
+            logs.append(-0.5 * (np.linalg.slogdet(inside)[1] + nu * np.log(total)))
+            parts.append(total / nu * rows.gain.T @ K @ rows.gain)
+    weight = np.exp(np.array(logs) - max(logs))
+    expected = np.tensordot(weight / weight.sum(), np.array(parts), 1)
+    assert np.allclose(result.covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
+
+
+def test_clean_data_change_nothing():
+    changed = 0
+    for seed in range(40):
+        _, fit, result = fit_and_adjust("linear-delta", "component", draw_errors(12, 3, seed), seed)
+        changed += result is not fit
+    assert changed <= 3
+
+
+def test_correlated_residuals_do_not_mean_that_sigma_is_too_large():
+    codes = []
+    for seed in range(12):
+        errors = draw_errors(25, 3, seed, 0.95)
+        _, fit, result = fit_and_adjust("linear-delta", "component", errors, seed, LeastSquares())
+        before = {f.code for f in fit.findings}
+        after = {f.code for f in result.findings}
+        assert "noise.residuals-too-small" not in after
+        assert ("noise.not-independent" in after) == ("noise.residuals-too-small" in before)
+        codes.append("noise.not-independent" in after)
+    assert any(codes)
+
+
+def test_a_calibration_reports_and_uses_the_larger_uncertainty():
+    errors = draw_errors(24, 3, 8, 0.95)
+    _, data = measure("linear-delta", "component", errors, 8)
+    report = lc.calibrate(ROBOTS["linear-delta"], data)
+    plain = identify(ROBOTS["linear-delta"], data)
+    assert {f.code for f in report.findings} & PATTERNS
+    assert (report.identification.standard_deviations > plain.standard_deviations).any()
+
+
+@pytest.mark.parametrize("case", ["loss", "no intervals", "not converged"])
+def test_fits_without_intervals_are_returned_as_they_are(case):
+    options = FitOptions()
+    n = 20
+    if case == "loss":
+        options = FitOptions(loss=Huber())
+    if case == "no intervals":
+        options, n = FitOptions(noise="estimated", method=LeastSquares()), 4
+    if case == "not converged":
+        options = FitOptions(control=replace(options.control, iterations=1))
+    _, data = measure("linear-delta", "component", draw_errors(n, 3, 1, 0.95), 1)
+    fit = identify(ROBOTS["linear-delta"], data, options=options)
+    assert adjust_uncertainty(fit, data) is fit
+
+
+def test_data_of_another_fit_are_refused():
+    _, data = measure("linear-delta", "component", draw_errors(12, 3, 1), 1)
+    _, other = measure("linear-delta", "component", draw_errors(13, 3, 1), 1)
+    fit = identify(ROBOTS["linear-delta"], data)
+    with pytest.raises(lc.DataError):
+        adjust_uncertainty(fit, other)
