@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.diagnose import NO_MOTION, ErrorFrame, choose_error_frame, twist_weights
-from loopcal.diagnose.error_frames import FITTED, RELATIVE, solve_home
+from loopcal.diagnose.error_frames import FITTED, RELATIVE, list_error_twists, solve_home
 from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_argument
@@ -194,12 +194,17 @@ def _covariance(
     """
     robot = posterior.robot
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    D = S.parameters[0][:, :, posterior.places] * posterior.unit
-    size = np.linalg.norm(D * twist_weights(robot)[:, None], axis=(1, 2))
-    D = H @ frame.relate(D, solution.T)
+    p = len(posterior.unit)
+    D = list_error_twists(posterior, solution.T, S.parameters[0][:, :, posterior.places])
+    size = np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2))
+    D, by_discrepancy = np.split(H @ frame.relate(D, solution.T), [p], axis=2)
+    rest = [by_discrepancy]
+    if posterior.discrepancy is not None:
+        rest.append(H @ posterior.discrepancy.errors.rest(solution.T))
+        posterior = posterior.without_discrepancy
     is_infinite = np.isinf(posterior.variance)
     known = posterior.directions[:, ~is_infinite] * np.sqrt(posterior.variance[~is_infinite])
-    factors = [D @ known, H @ frame.own_errors(solution.T)]
+    factors = [D @ known, H @ frame.own_errors(solution.T), *rest]
     if robot.stated_sigma.any():
         factors.append(H @ (S.readings[0] * robot.stated_sigma))
     root = np.concatenate(factors, axis=2)

@@ -60,7 +60,8 @@ class ErrorFrame:
     Attributes
     ----------
     name : "fitted", "base", "relative", or the name of the frame of an instrument.
-    size : of the robot [m]. by_parameters : (12, p) G. own : (12, k) K.
+    size : of the robot [m]. by_parameters : (12, p) G, also by the errors of a model discrepancy,
+        see `list_error_twists`. own : (12, k) K.
     fitted : frames of which motions are fitted: (), ("base",), ("platform",) or both.
     undetermined : frames that the measurements do not determine, and that are not fitted.
     origin : name of the pose to which others are relative; "" in other frames.
@@ -194,7 +195,7 @@ def choose_error_frame(
         )
     S = differentiate_pose(robot, robot.values[None], origin.q[None], origin.state)
     sigma = robot.stated_sigma
-    twists = S.parameters[0, 0][:, posterior.places] * posterior.unit
+    twists = list_error_twists(posterior, origin.T, S.parameters[0][..., posterior.places])[0]
     by_readings = (S.readings[0, 0] * sigma)[:, sigma > 0.0]
     followed = follow_pose(robot, origin.T[0], twists, by_readings, origin_name)
     return refer_errors(robot, RELATIVE, reference, motions, followed)
@@ -267,6 +268,9 @@ def _follow_instrument(posterior: Posterior, frame: InstrumentFrame) -> Followed
     """Return the motions of the base that move it like the frame of an instrument."""
     of_frame = frame_twists(frame.T, posterior.robot.size)[:, :6]
     by_parameters = _as_base_motion(of_frame, frame.by_parameters * posterior.unit)
+    if posterior.discrepancy is not None:  # the frame does not follow errors of the poses
+        nothing = np.zeros((MOTIONS, posterior.discrepancy.errors.count))
+        by_parameters = np.concatenate([by_parameters, nothing], axis=1)
     by_frames = np.diag(np.repeat([1.0, 0.0], 6))
     return FollowedMotion(by_frames, by_parameters, _as_base_motion(of_frame, frame.own))
 
@@ -312,8 +316,19 @@ def reference_poses(posterior: Posterior) -> ReferencePoses:
     reached = state.status[0] == Status.CONVERGED
     D = differentiate_pose(robot, robot.values[None], readings[None], state).parameters[0]
     usable = reached & np.isfinite(D).all(axis=(1, 2))
-    twists = D[usable][:, :, posterior.places] * posterior.unit
-    return ReferencePoses(state.T[0, usable], twists, where)
+    T = state.T[0, usable]
+    twists = list_error_twists(posterior, T, D[usable][:, :, posterior.places])
+    return ReferencePoses(T, twists, where)
+
+
+def list_error_twists(posterior: Posterior, T: FloatArray, D: FloatArray) -> FloatArray:
+    """Return twists (n, 6, p + m) of poses T (n, 4, 4) by the parameters, D (n, 6, p) [per SI], in
+    the units of the posterior, and by the m independent errors of its model discrepancy.
+    """
+    by_parameters, own = D * posterior.unit, posterior.discrepancy
+    if own is None:
+        return by_parameters
+    return np.concatenate([by_parameters, own.twists(T, D)], axis=2)
 
 
 def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose.error_frames import choose_error_frame, solve_home
+from loopcal.diagnose.error_frames import choose_error_frame, list_error_twists, solve_home
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
@@ -19,12 +19,14 @@ from loopcal.typing import FloatArray
 
 class ToolErrors(NamedTuple):
     """Twists (n, 6, ..) of the tool point in a frame: by the parameters in the units of the
-    posterior, by independent errors of the frame itself, and by the readings in their sigmas.
+    posterior without its discrepancy, by independent errors of the frame itself, by the readings in
+    their sigmas, and by independent errors of the model discrepancy.
     """
 
     by_parameters: FloatArray
     by_frame: FloatArray
     by_readings: FloatArray
+    by_discrepancy: FloatArray
     reference: Finding
 
 
@@ -43,12 +45,18 @@ def linearize_tool_errors(posterior: Posterior, solution: Solution, frame: str) 
     robot = posterior.robot
     chosen = choose_error_frame(posterior, frame, solve_home(robot), "home")
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    D = S.parameters[0][..., posterior.places] * posterior.unit
+    D = list_error_twists(posterior, solution.T, S.parameters[0][..., posterior.places])
     H = geometry.transport_matrix(solution.T[:, :3, :3] @ robot.tool[:3, 3])
+    p, by_errors = len(posterior.unit), H @ chosen.relate(D, solution.T)
+    by_discrepancy = by_errors[..., p:]
+    if posterior.discrepancy is not None:
+        rest = H @ posterior.discrepancy.errors.rest(solution.T)
+        by_discrepancy = np.concatenate([by_discrepancy, rest], axis=2)
     return ToolErrors(
-        H @ chosen.relate(D, solution.T),
+        by_errors[..., :p],
         H @ chosen.own_errors(solution.T),
         H @ (S.readings[0] * robot.stated_sigma),
+        by_discrepancy,
         chosen.describe(axes=""),
     )
 

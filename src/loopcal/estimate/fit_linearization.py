@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.estimate.inference.posterior import ScaledNoise, scale_variances
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.penalties import decompose_for
+from loopcal.estimate.poses.smooth_errors import SmoothErrors
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
@@ -74,16 +75,36 @@ def factor_known_setup(fit: Identification, data: Measurements) -> FloatArray:
     return _linearize(fit, data, is_setup_known=True)[1].factor[0, :-1, :-1]
 
 
+def linearize_smooth_errors(
+    fit: Identification, data: Measurements, errors: SmoothErrors
+) -> Linearization:
+    """Linearize the rows of a fit also by the coefficients of errors of the poses, whose columns
+    follow those of the parameters.
+
+    Parameters
+    ----------
+    fit, data : as of `linearize_fit`.
+    """
+    return _linearize(fit, data, is_setup_known=False, errors=errors)[1]
+
+
 def _linearize(
-    fit: Identification, data: Measurements, *, is_setup_known: bool
+    fit: Identification,
+    data: Measurements,
+    *,
+    is_setup_known: bool,
+    errors: SmoothErrors | None = None,
 ) -> tuple[Problem, Linearization]:
     """Return the weighted problem of a fit, and its linearization with an earlier calibration."""
     setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
     values = fit.nuisance.estimate
     if is_setup_known and len(setup):
         setup = setup.with_nominal(values).with_fixed("*")
-    problem = problem_of(fit.free_parameters, data, setup).weighted(fit.pose_weights)
-    z = fit.free_parameters.deviation(fit.robot.values[None])
+    free = replace(fit.free_parameters, errors=errors)
+    problem = problem_of(free, data, setup).weighted(fit.pose_weights)
+    if errors is not None:  # their columns have no part in the rank of the machine
+        problem = replace(problem, consistent=None)
+    z = free.deviation(fit.robot.values[None])
     start = problem.start(z, seek=False)
     start = start.with_nuisance(values[None]) if len(setup) else start
     prior = fit.options.prior

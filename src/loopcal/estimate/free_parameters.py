@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.estimate.poses.smooth_errors import SmoothErrors
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
@@ -36,6 +37,8 @@ class FreeParameters:
     assumed : (p,) True where the tolerance is the default one.
     correlation : (p, p) of the deviations z by the tolerances; None where they are independent,
         because the robot states no common errors.
+    errors : errors of the poses whose coefficients follow as more columns, to see what data say of
+        them; they are zero in every fit.
     """
 
     robot: Mechanism
@@ -44,9 +47,10 @@ class FreeParameters:
     tolerance: FloatArray
     assumed: BoolArray
     correlation: FloatArray | None = None
+    errors: SmoothErrors | None = None
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.places) + (0 if self.errors is None else self.errors.count)
 
     def __repr__(self) -> str:
         """Return the robot's name and the number of free parameters."""
@@ -66,12 +70,14 @@ class FreeParameters:
     def values(self, deviation: FloatArray) -> FloatArray:
         """Return all values (t, p of the robot) [SI] at deviations z (t, p)."""
         values = np.repeat(self.robot.values[None], len(deviation), axis=0)
-        values[:, self.places] = self.nominal + self.tolerance * deviation
+        values[:, self.places] = self.nominal + self.tolerance * deviation[:, : len(self.places)]
         return values
 
     def deviation(self, values: FloatArray) -> FloatArray:
         """Return the deviations z (t, p) of all values (t, p of the robot) [SI]."""
-        return (values[:, self.places] - self.nominal) / self.tolerance
+        z = np.zeros((len(values), len(self)))
+        z[:, : len(self.places)] = (values[:, self.places] - self.nominal) / self.tolerance
+        return z
 
     def correlation_root(self) -> FloatArray:
         """Return the Cholesky factor (p, p) of the correlation of the deviations z."""

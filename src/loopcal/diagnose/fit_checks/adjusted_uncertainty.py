@@ -16,6 +16,7 @@ import numpy as np
 
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.correlated_errors import estimate_correlated_errors
+from loopcal.diagnose.fit_checks.model_discrepancy import add_model_discrepancy
 from loopcal.diagnose.fit_checks.residual_effects import READING, SESSION, TEMPERATURE, TIME
 from loopcal.diagnose.fit_checks.residual_patterns import (
     EffectSizes,
@@ -61,7 +62,8 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
         return fit
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     rows = collect_residual_rows(fit, data)
-    return fit if rows is None else _add_patterns(fit, data, rows)
+    fit = fit if rows is None else _add_patterns(fit, data, rows)
+    return add_model_discrepancy(fit, data)
 
 
 def _add_patterns(fit: Identification, data: Measurements, rows: ResidualRows) -> Identification:

@@ -9,13 +9,18 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.measured_frames import MeasuredFrames, frames_from_arrays
+from loopcal.estimate.inference.model_discrepancy import (
+    DISCREPANCY,
+    ModelDiscrepancy,
+    discrepancy_from_arrays,
+)
 from loopcal.estimate.inference.residual_test import ResidualTest
 from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.findings import report_finding
@@ -68,8 +73,13 @@ class Posterior:
         of earlier versions.
     parts : the parts of the covariance whose size was estimated from data, with their degrees of
         freedom; what they leave of the covariance counts as known.
+<<<<<<< HEAD
     fitted_rows : the measured rows that it comes from, so that they do not count twice; None where
         they are not known.
+=======
+    discrepancy : slow errors of the poses that no geometry explains; None where none were found.
+        Their effect on the parameters is one of the parts.
+>>>>>>> 3339975 (wip)
     """
 
     robot: Mechanism
@@ -81,6 +91,7 @@ class Posterior:
     frames: MeasuredFrames | None = None
     parts: tuple[CovariancePart, ...] = ()
     fitted_rows: FittedRows | None = None
+    discrepancy: ModelDiscrepancy | None = None
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -98,6 +109,17 @@ class Posterior:
     def estimate(self) -> FloatArray:
         """(p,) estimates [SI]."""
         return self.robot.values[self.places]
+
+    @property
+    def without_discrepancy(self) -> Posterior:
+        """The posterior of the parameters if no slow error of the poses moved them."""
+        own = self.discrepancy
+        if own is None:
+            return self
+        parts = tuple(part for part in self.parts if part.source != DISCREPANCY)
+        return replace(
+            self, directions=own.directions, variance=own.variance, parts=parts, discrepancy=None
+        )
 
     @property
     def root(self) -> FloatArray:
@@ -146,7 +168,7 @@ class Posterior:
             np.repeat(np.arange(len(parts)), [part.root.shape[1] for part in parts]),
         )
         own |= {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
-        for value in (self.frames, self.fitted_rows):
+        for value in (self.frames, self.fitted_rows, self.discrepancy):
             own |= {} if value is None else value.arrays()
         return own
 
@@ -239,6 +261,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         frames_from_arrays(arrays),
         _parts_from_arrays(arrays),
         fitted_rows_from_arrays(arrays),
+        discrepancy_from_arrays(arrays),
     )
 
 

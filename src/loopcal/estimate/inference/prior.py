@@ -109,7 +109,8 @@ class WithPrior:
         mean[places] = prior.mean
         self.measured = problem
         self.parameters = problem.parameters
-        self.slope = B[:, free.places] * free.tolerance
+        self.slope = np.zeros((len(B), len(free)))
+        self.slope[:, : len(free.places)] = B[:, free.places] * free.tolerance
         self.center = free.deviation(mean[None])
         # parameters that are no longer free contribute their difference from the mean
         self.constant = B @ (free.values(self.center)[0] - mean)

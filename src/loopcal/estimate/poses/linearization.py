@@ -70,7 +70,10 @@ def scale_parameters(free: FreeParameters, by_parameter: FloatArray) -> FloatArr
     """Return derivatives (.., p) by the free parameters in units of their tolerance."""
     p = by_parameter.shape[-1]
     columns = by_parameter[..., free.places] if len(free.places) < p else by_parameter
-    return columns * free.tolerance
+    columns = columns * free.tolerance
+    if free.errors is None:
+        return columns
+    return np.concatenate([columns, np.zeros((*columns.shape[:-1], free.errors.count))], axis=-1)
 
 
 def locate_poses(
@@ -163,6 +166,10 @@ def mask_unreached(
     """Complete linearized poses: joint values, which are reached, and zeros where one is not."""
     shape = state.T.shape[:2]
     Y, slopes, turns = poses.by_coordinates, poses.joints_by_parameters, poses.joints_by_coordinates
+    if free.errors is not None and poses.by_parameters.shape[-1]:
+        by_parameters = poses.by_parameters.copy()
+        by_parameters[..., -free.errors.count :] = free.errors.twists(state.T)
+        poses = replace(poses, by_parameters=by_parameters)
     derivatives = [poses.by_parameters, *slopes.values(), *turns.values()]
     derivatives += [] if Y is None else [Y, q]
     ok = np.asarray(state.status == Status.CONVERGED)

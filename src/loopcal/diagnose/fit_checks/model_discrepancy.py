@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Test whether the residuals of a fit vary slowly with the pose, and add what they show to its
+uncertainty.
+
+With the whitened rows A of the parameters, the rows of the prior, and the rows Phi of slow errors
+of the poses (`SmoothErrors`), the elimination of the parameters leaves (y, S) of the residuals and
+Phi. If the model is right, y has the variance sigma^2; with errors of amplitude tau it has
+sigma^2 + tau^2 S S'. The test does not need sigma, and does not depend on the order of the poses.
+Displacements and rotations of the tool are tested one after the other, the more significant first.
+See docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.fit_linearization import linearize_fit, linearize_smooth_errors
+from loopcal.estimate.inference.added_covariance import add_covariance
+from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
+from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
+from loopcal.estimate.poses.smooth_errors import SmoothErrors, describe_smooth_errors
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.mechanism import forward
+from loopcal.numerics.variance_component import (
+    VarianceComponent,
+    compute_component_tail,
+    estimate_variance_component,
+)
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension
+
+LEVEL = 0.05
+"""Probability of adding a discrepancy at all where there is none."""
+
+KNOWN = 8.0
+"""Degrees of freedom with which a stated sigma is known: to a quarter of its value."""
+
+FEWEST_POSES = 5
+"""Different poses below which nothing can be said of how errors vary with the pose."""
+
+UNSEEN = 1e-8
+"""Share of the effect of errors on the rows below which the parameters take up all of it."""
+
+ROTATION, PLACE = 0, 1
+"""Number of the errors of rotation and of place."""
+
+
+@dataclass(frozen=True, eq=False)
+class SlowErrorRows:
+    """What the elimination of the parameters leaves of residuals and slow errors.
+
+    Attributes
+    ----------
+    errors : of unit amplitude. slope : (p, m) change of the estimates [SI] with the coefficients.
+    rows : (k, m) S. residuals : (k,) y. rest : sum of squares that no slow error touches.
+    degrees : number of residuals, those of `rest` included.
+    """
+
+    errors: SmoothErrors
+    slope: FloatArray
+    rows: FloatArray
+    residuals: FloatArray
+    rest: float
+    degrees: int
+
+
+def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
+    """Return a fit whose uncertainty includes a model discrepancy, where its residuals show one.
+
+    The parameters get what the discrepancy does to them, and poses what is left of it. Estimates
+    stay.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    """
+    if not (fit.converged and fit.residual_test.intervals):
+        return fit
+    rows = project_slow_errors(fit, data)
+    if rows is None:
+        return fit
+    found = detect_slow_errors(rows, _known_degrees(fit))
+    if not found:
+        return fit
+    amplitude, degrees, first = np.zeros(6), np.full(2, np.inf), fit.posterior
+    for part, (component, _) in found.items():
+        amplitude[3 * part : 3 * part + 3] = np.sqrt(component.variance)
+        degrees[part] = component.degrees
+    errors = rows.errors.scaled(amplitude)
+    root = rows.slope * np.repeat(amplitude, rows.errors.count // 6)
+    for part, (component, p_value) in found.items():
+        own = root[:, _columns(rows.errors, part)]
+        finding = _report(fit, part, float(amplitude[3 * part]), component.degrees, p_value)
+        fit = add_covariance(fit, own, component.degrees, finding)
+    discrepancy = ModelDiscrepancy(errors, root, degrees, first.directions, first.variance)
+    return replace(fit, posterior=replace(fit.posterior, discrepancy=discrepancy))
+
+
+def detect_slow_errors(
+    rows: SlowErrorRows, known: float
+) -> dict[int, tuple[VarianceComponent, float]]:
+    """Return the significant errors, the number of each -> its size and probability.
+
+    `known` degrees of freedom say that the residuals have unit variance.
+    """
+    parts = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
+    level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(len(parts), 1))
+    whitening, found = np.eye(len(rows.residuals)), {}
+    while parts:
+        y = whitening @ rows.residuals
+        turned = {
+            part: np.linalg.svd(
+                whitening @ rows.rows[:, _columns(rows.errors, part)], full_matrices=False
+            )[:2]
+            for part in parts
+        }
+        tests = {
+            part: (s**2, u.T @ y, rows.rest + _square_outside(u, y), rows.degrees)
+            for part, (u, s) in turned.items()
+        }
+        p_values = {part: compute_component_tail(*test) for part, test in tests.items()}
+        part = min(parts, key=lambda each: p_values[each])
+        if p_values[part] >= level:
+            break
+        u, s = turned[part]
+        component = estimate_variance_component(*tests[part], known)
+        found[part] = (component, p_values[part])
+        # u diag(1 / sqrt(1 + ratio s^2)) u' + (I - u u')
+        shrink = 1.0 / np.sqrt(1.0 + component.ratio * s**2) - 1.0
+        whitening = (np.eye(len(y)) + (u * shrink) @ u.T) @ whitening
+        parts.remove(part)
+    return found
+
+
+def project_slow_errors(fit: Identification, data: Measurements) -> SlowErrorRows | None:
+    """Return residuals and slow errors without what the parameters explain; None where there are
+    too few poses or residuals.
+    """
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
+    readings = readings[np.isfinite(readings).all(axis=1)]
+    solution = forward(fit.robot, readings)
+    T = solution.T[solution.converged]
+    if len(T) < FEWEST_POSES:
+        return None
+    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3])
+    if len(errors.centers) < FEWEST_POSES:
+        return None
+    linear = linearize_fit(fit, data)
+    extended = linearize_smooth_errors(fit, data, errors)
+    d, scaled, m = linear.decomposition, linear.scaled, errors.count
+    unit = 1.0 if scaled.decomposition is d else fit.residual_test.sigma_scale
+    used = d.used[0]
+    k = int(used.sum())
+    to_z = d.deviation(np.eye(len(used)))[used].T
+    penalty = np.where(np.isfinite(scaled.penalty[0]), scaled.penalty[0], 0.0)[used]
+    prior = np.zeros((k, k + m + 1))
+    prior[:, :k] = np.diag(np.sqrt(penalty))
+    prior[:, -1] = np.sqrt(penalty) * d.coordinates(linear.linearization.deviation)[0][used]
+    factor = extended.factor[0] / unit
+    p = len(used)
+    columns = np.concatenate([factor[:, :p] @ to_z, factor[:, p:]], axis=1)
+    R = np.linalg.qr(np.concatenate([columns, prior[penalty > 0.0]]), mode="r")
+    degrees = int(extended.equations[0] + (penalty > 0.0).sum()) - k
+    if degrees < FEWEST_DEGREES:
+        return None
+    slope = fit.tolerance[:, None] * (to_z @ np.linalg.solve(R[:k, :k], R[:k, k : k + m]))
+    left = R[k:, k:]
+    turned, triangle = np.linalg.qr(left[:, :m])
+    residuals = turned.T @ left[:, m]
+    rest = float(max(left[:, m] @ left[:, m] - residuals @ residuals, 0.0))
+    size = np.linalg.norm(factor[:, p : p + m])
+    if not np.linalg.norm(triangle) > UNSEEN * size:
+        return None
+    u, s, vt = np.linalg.svd(triangle, full_matrices=False)
+    seen = s > UNSEEN * size
+    return SlowErrorRows(
+        errors,
+        slope,
+        s[seen, None] * vt[seen],
+        (u.T @ residuals)[seen],
+        rest + float(((u.T @ residuals)[~seen] ** 2).sum()),
+        degrees,
+    )
+
+
+def _columns(errors: SmoothErrors, part: int) -> slice:
+    """Return the coefficients of the errors of rotation or of place."""
+    half = errors.count // 2
+    return slice(part * half, (part + 1) * half)
+
+
+def _square_outside(u: FloatArray, y: FloatArray) -> float:
+    """Return the squared length of y (k,) outside orthonormal columns u (k, r)."""
+    return float(((y - u @ (u.T @ y)) ** 2).sum())
+
+
+def _known_degrees(fit: Identification) -> float:
+    """Return the degrees of freedom with which the stated noise is known."""
+    return 0.0 if fit.residual_test.noise == "estimated" else KNOWN
+
+
+def _report(
+    fit: Identification, part: int, amplitude: float, degrees: float, p_value: float
+) -> Finding:
+    """Return the size of the errors of rotation or of place, and that they are in the uncertainty.
+
+    The intervals of parameters contain what errors of this size do to them.
+    """
+    dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
+    return report_finding(
+        DISCREPANCY,
+        quantity=("orientation", "position")[part],
+        amplitude=fit.robot.to_quantity(amplitude, dimension),
+        degrees=degrees,
+        p_value=p_value,
+        level=LEVEL,
+    )
+
+
+def _is_seen(rows: SlowErrorRows, part: int) -> bool:
+    """Return whether the residuals can show errors of rotation or of place."""
+    own = rows.rows[:, _columns(rows.errors, part)]
+    return bool(len(own)) and bool(np.linalg.norm(own) > UNSEEN * np.linalg.norm(rows.rows))
