@@ -77,7 +77,9 @@ def estimate_variance_component(
     share /= share.sum()
     values = ratio * square / count
     mean = float(share @ values)
-    spread = float(share @ (values - mean) ** 2)
+    # sigma^2 at each tau has a relative variance of its own
+    own = 2.0 / max(count - 4.0, 1.0)
+    spread = float(share @ ((values - mean) ** 2 + own * values**2))
     return VarianceComponent(mean, 2.0 * mean**2 / spread, float(ratio[np.argmax(density)]))
 
 

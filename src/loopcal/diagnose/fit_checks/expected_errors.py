@@ -84,18 +84,18 @@ def estimate_calibration_gain(
         return _unpredicted("model.gain-needs-consistent-noise")
     solution = locate_measured_poses(fit, data, MOST_POSES)
     # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
-    posterior = fit.posterior
+    posterior = fit.posterior.without_discrepancy
     variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
     factor = posterior.directions * np.sqrt(variance)
     if not len(solution.q) or np.isnan(factor).any():
         return _unpredicted("model.gain-without-intervals")
-    effects = linearize_tool_errors(posterior, solution, frame)
-    D, own = effects.by_parameters, effects.by_frame
+    effects = linearize_tool_errors(fit.posterior, solution, frame)
+    D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
     size = fit.robot.size
     angle_before, position_before = _rms_errors(
         (D * (free.tolerance / posterior.unit)) @ free.correlation_root(), size
     )
-    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, own], axis=2), size)
+    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, *own], axis=2), size)
     pairs = ((position_before, position_after), (angle_before, angle_after))
     is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)
     finding = report_finding(

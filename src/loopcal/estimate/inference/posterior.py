@@ -73,13 +73,10 @@ class Posterior:
         of earlier versions.
     parts : the parts of the covariance whose size was estimated from data, with their degrees of
         freedom; what they leave of the covariance counts as known.
-<<<<<<< HEAD
     fitted_rows : the measured rows that it comes from, so that they do not count twice; None where
         they are not known.
-=======
     discrepancy : slow errors of the poses that no geometry explains; None where none were found.
         Their effect on the parameters is one of the parts.
->>>>>>> 3339975 (wip)
     """
 
     robot: Mechanism

@@ -116,7 +116,8 @@ def describe_smooth_errors(T: FloatArray, tool: FloatArray) -> SmoothErrors:
     ----------
     tool : (3,) [m] tool point in the platform frame.
     """
-    rotation = T[0, :3, :3]
+    u, _, vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     x = _coordinates(T, tool, rotation)
     origin = x.mean(axis=0)
     least = (STILL, STILL * float(np.abs(x[:, 3:]).max()))
@@ -133,11 +134,11 @@ def describe_smooth_errors(T: FloatArray, tool: FloatArray) -> SmoothErrors:
 
 
 def _spread(x: FloatArray) -> list[int]:
-    """Return the first of coordinates (n, 6), then always the one farthest from all chosen ones, up
-    to `CENTERS` different ones.
+    """Return the outermost of coordinates (n, 6), then always the one farthest from all chosen
+    ones, up to `CENTERS` different ones.
     """
-    chosen = [0]
-    distance = ((x - x[0]) ** 2).sum(axis=1)
+    chosen = [int(np.argmax((x**2).sum(axis=1)))]
+    distance = ((x - x[chosen[0]]) ** 2).sum(axis=1)
     while len(chosen) < CENTERS and distance.max() > STILL**2:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(axis=1))

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Slow errors of the poses that no geometry explains: found, stated, and contained in U."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal import geometry
+from loopcal.apply import pose_uncertainty
+from loopcal.diagnose import adjust_uncertainty
+from loopcal.diagnose.fit_checks.model_discrepancy import LEVEL
+from loopcal.estimate import FitOptions, Identification, LeastSquares, identify
+from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    sample_truth,
+    simulate,
+)
+from loopcal.mechanism import Mechanism, differentiate_pose, forward, sample_workspace
+from tests.estimate.problems import UM, URAD
+
+SIGMA = 10 * UM
+
+
+@cache
+def delta() -> Mechanism:
+    """Return a robot whose fit is fast, with stated tolerances and workspace."""
+    return lc.load_robot("linear-delta")
+
+
+def measure(robot: Mechanism, poses: int = 30, seed: int = 1, scale: float = 1.0) -> Measurements:
+    """Return measurements of a machine whose noise is `scale` times the stated one."""
+    machine = robot.with_values(sample_truth(robot, 1, seed)[0])
+    kind = Component(("x", "y", "z")) if robot.name == "linear-delta" else Pose()
+    sigma = np.full(3, SIGMA)
+    if isinstance(kind, Pose):
+        sigma = np.r_[np.full(3, 50 * URAD), sigma]
+    coordinates = sample_workspace(robot, poses, 7).coordinates
+    stated, true = (
+        simulate(machine, coordinates, Instrument((Sensor(kind, Gaussian(s * sigma)),)), seed)
+        for s in (1.0, scale)
+    )
+    (rows,), (noisy,) = stated.observations, true.observations
+    return replace(stated, observations=(replace(rows, measured=noisy.measured),))
+
+
+def bend(points: np.ndarray, reference: np.ndarray, amplitude: float, seed: int) -> np.ndarray:
+    """Return slow displacements (n, 3): one wave over the diameter of the reference points."""
+    rng = np.random.default_rng(seed)
+    center = reference.mean(axis=0)
+    radius = np.sqrt(((reference - center) ** 2).sum(axis=1).max())
+    directions = rng.normal(size=(3, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+    return amplitude * np.sin(np.pi * (points - center) @ directions.T / radius + phase)
+
+
+def displaced(data: Measurements, by: np.ndarray) -> Measurements:
+    """Return measurements whose measured places x, y, z are displaced by (n, 3)."""
+    (rows,) = data.observations
+    columns = [c.name for c in rows.kind.columns]
+    measured = rows.measured.copy()
+    measured[:, [columns.index(name) for name in "xyz"]] += by
+    return replace(data, observations=(replace(rows, measured=measured),))
+
+
+def find(fit: Identification) -> list:
+    """Return the findings of a discrepancy."""
+    return [f for f in fit.findings if f.code == DISCREPANCY]
+
+
+def places(robot: Mechanism, readings: np.ndarray) -> np.ndarray:
+    """Return places of the tool (n, 3)."""
+    return (forward(robot, readings).T @ robot.tool)[:, :3, 3]
+
+
+def study(amplitude: float, machines: int) -> tuple[float, float, float]:
+    """Return the coverage of U at held-out poses before and after, and the share of machines with a
+    discrepancy.
+    """
+    robot, before, after, count = delta(), [], [], 0
+    held_out = sample_workspace(robot, 30, 8).solution.q
+    for seed in range(machines):
+        machine = robot.with_values(sample_truth(robot, 1, seed)[0])
+        data = measure(robot, 30, seed)
+        at, elsewhere = places(machine, data.readings), places(machine, held_out)
+        data = displaced(data, bend(at, at, amplitude, seed))
+        fit = identify(robot, data)
+        adjusted = adjust_uncertainty(fit, data)
+        count += bool(find(adjusted))
+        true = elsewhere + bend(elsewhere, at, amplitude, seed)
+        error = np.abs(places(fit.robot, held_out) - true)
+        for each, inside in ((fit, before), (adjusted, after)):
+            u = pose_uncertainty(each, forward(fit.robot, held_out), frame="base")
+            inside.append((error <= u.expanded[:, 3:]).mean())
+    return float(np.mean(before)), float(np.mean(after)), count / machines
+
+
+def test_slow_errors_are_found_and_the_uncertainty_of_poses_contains_them():
+    before, after, share = study(15 * UM, 20)
+    assert before < 0.80
+    assert after > 0.93
+    assert share > 0.8
+
+
+def test_clean_data_have_no_discrepancy_at_the_stated_level():
+    _, coverage, share = study(0.0, 24)
+    assert share <= LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 24)
+    assert coverage > 0.93
+
+
+def test_a_wrong_sigma_is_no_discrepancy():
+    found = [
+        bool(find(adjust_uncertainty(identify(delta(), data), data)))
+        for data in (measure(delta(), 30, seed, 2.0) for seed in range(16))
+    ]
+    assert np.mean(found) <= LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 16)
+
+
+@cache
+def bent_fit(name: str = "3-prs") -> tuple[Identification, Identification, Measurements]:
+    """Return a fit of a machine with slow errors before and after, and its data."""
+    robot = lc.load_robot(name)
+    data = measure(robot)
+    at = places(robot, data.readings)
+    data = displaced(data, bend(at, at, 40 * UM, 3))
+    fit = identify(robot, data)
+    return fit, adjust_uncertainty(fit, data), data
+
+
+def test_covariance_of_poses_is_that_of_a_dense_gaussian_process():
+    """Independent computation: kernels between all poses, without any decomposition."""
+    fit, adjusted, data = bent_fit()
+    assert adjusted.posterior.discrepancy is not None
+    amplitude = adjusted.posterior.discrepancy.errors.amplitude
+    robot, free = fit.robot, fit.free_parameters
+    other = sample_workspace(robot, 12, 5).solution
+    T = np.concatenate([forward(robot, data.readings).T, other.T])
+    q = np.concatenate([data.readings, other.q])
+    n = len(data.readings)
+    state = forward(robot, q).state
+    D = differentiate_pose(robot, robot.values[None], q[None], state).parameters[0]
+    D = D[:, :, free.places] * free.tolerance
+    mean = np.linalg.svd(T[:n, :3, :3].mean(axis=0))
+    rotation = geometry.log_so3(T[:, :3, :3] @ (mean[0] @ mean[2]).T)
+    place = (T @ robot.tool)[:, :3, 3]
+    x = np.column_stack([rotation, place])
+    x = x - x[:n].mean(axis=0)
+    for part in (slice(0, 3), slice(3, 6)):
+        x[:, part] /= np.sqrt((x[:n, part] ** 2).sum(axis=1).max())
+    kernel = np.exp(-0.5 * ((x[:, None] - x) ** 2).sum(axis=2))
+    arm = T[:, :3, :3] @ robot.tool[:3, 3]
+    back = geometry.transport_matrix(-arm)
+    # covariance (6 N, 6 N) of the slow twists of the platform's origin
+    slow = np.einsum("nac,nm,c,mbc->namb", back, kernel, amplitude**2, back).reshape(6 * len(T), -1)
+    (rows,) = data.observations
+    W = rows.whitener
+    G = rows.kind.evaluate(T[None, :n], rows.measured[None], None, None).jacobian[0]
+    A = (W @ G @ D[:n]).reshape(-1, len(free))
+    WG = np.zeros((len(A), 6 * n))
+    for i in range(n):
+        m = W.shape[1]
+        WG[m * i : m * (i + 1), 6 * i : 6 * i + 6] = W[i] @ G[i]
+    gain = np.linalg.solve(A.T @ A + np.eye(len(free)), A.T)
+    move = D[n:].reshape(-1, len(free)) @ gain @ WG
+    own, cross = slow[6 * n :, 6 * n :], slow[6 * n :, : 6 * n]
+    added = own - move @ cross.T - cross @ move.T + move @ slow[: 6 * n, : 6 * n] @ move.T
+    H = geometry.transport_matrix(arm[n:])
+    before, after = (pose_uncertainty(f, other, frame="base").covariance for f in (fit, adjusted))
+    blocks = np.stack([added[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(12)])
+    expected = H @ blocks @ H.swapaxes(1, 2)
+    scale = np.sqrt(np.einsum("nii,njj->nij", after, after))
+    assert np.abs((after - before - expected) / scale).max() < 1e-5
+    # the parameters: gain times the slow errors of the measured poses
+    root = gain @ WG
+    by_errors = root @ slow[: 6 * n, : 6 * n] @ root.T * np.outer(free.tolerance, free.tolerance)
+    size = np.sqrt(np.diag(adjusted.covariance))
+    widened = (adjusted.covariance - fit.covariance - by_errors) / np.outer(size, size)
+    assert np.abs(widened).max() < 1e-5
+
+
+def test_the_estimate_stays_and_no_variance_becomes_smaller():
+    fit, adjusted, _ = bent_fit()
+    assert np.array_equal(fit.estimate, adjusted.estimate)
+    assert (adjusted.standard_deviations >= fit.standard_deviations * (1.0 - 1e-12)).all()
+    poses = sample_workspace(fit.robot, 50, 4).solution
+    before, after = (pose_uncertainty(f, poses, frame="base").sd for f in (fit, adjusted))
+    assert (after >= before * (1.0 - 1e-9)).all()
+
+
+def test_the_finding_states_size_degrees_of_freedom_and_level():
+    _, adjusted, _ = bent_fit()
+    (finding,) = find(adjusted)
+    assert finding.data["quantity"] == "position"
+    assert 10 < 1e3 * finding.data["amplitude"].value < 80  # [um], wave of 40 um
+    assert 3.0 < finding.data["degrees"] < 100.0
+    assert finding.data["p_value"] < LEVEL
+    part = adjusted.posterior.parts[-1]
+    assert (part.source, part.degrees) == (DISCREPANCY, finding.data["degrees"])
+
+
+def test_the_order_of_the_poses_does_not_matter():
+    _, adjusted, data = bent_fit()
+    turned = data.take(np.random.default_rng(0).permutation(data.n_poses))
+    again = adjust_uncertainty(identify(adjusted.initial, turned), turned)
+    poses = sample_workspace(adjusted.robot, 20, 4).solution
+    first, second = (pose_uncertainty(f, poses, frame="base").sd for f in (adjusted, again))
+    assert np.allclose(first, second, rtol=1e-5)
+
+
+def test_slow_rotations_are_stated_as_orientation():
+    robot = lc.load_robot("3-prs")
+    data = measure(robot)
+    at = places(robot, data.readings)
+    (rows,) = data.observations
+    measured = rows.measured.copy()
+    measured[:, :3] += bend(at, at, 300 * URAD, 3)  # rotation vectors of small rotations
+    data = replace(data, observations=(replace(rows, measured=measured),))
+    found = find(adjust_uncertainty(identify(robot, data), data))
+    assert "orientation" in [f.data["quantity"] for f in found]
+
+
+def test_a_run_folder_keeps_the_discrepancy(tmp_path):
+    from loopcal.estimate.inference.posterior import posterior_from_arrays
+
+    _, adjusted, _ = bent_fit()
+    np.savez(tmp_path / "arrays.npz", **adjusted.arrays())
+    with np.load(tmp_path / "arrays.npz") as stored:
+        read = posterior_from_arrays(adjusted.robot, dict(stored))
+    poses = sample_workspace(adjusted.robot, 20, 4).solution
+    for frame in ("fitted", "relative"):
+        first, second = (pose_uncertainty(f, poses, frame=frame) for f in (adjusted, read))
+        assert np.array_equal(first.covariance, second.covariance)
+
+
+@pytest.mark.parametrize("frame", ["fitted", "base", "relative", "frame"])
+def test_errors_that_a_frame_takes_up_do_not_count_in_it(frame):
+    """The unknown frame of the instrument takes the mean of slow errors, and the best fit, too."""
+    robot = lc.load_robot("3-prs")
+    target = np.array([[0.03, 0.0, 0.05], [-0.03, 0.02, 0.05], [0.0, -0.03, 0.06]])
+    kind = Position(targets=("a", "b", "c"), places=target, unknown=("frame",))
+    sensor = Sensor(kind, Gaussian(np.full(9, SIGMA)))
+    data = simulate(robot, sample_workspace(robot, 30, 7).coordinates, Instrument((sensor,)), 1)
+    (rows,) = data.observations
+    at = places(robot, data.readings)
+    moved = rows.measured + np.tile(bend(at, at, 60 * UM, 3), 3)
+    data = replace(data, observations=(replace(rows, measured=moved),))
+    fit = identify(robot, data)
+    adjusted = adjust_uncertainty(fit, data)
+    assert find(adjusted)
+    poses = sample_workspace(fit.robot, 20, 4).solution
+    before, after = (pose_uncertainty(f, poses, frame=frame).position for f in (fit, adjusted))
+    assert np.isfinite(after).all()
+    assert after.mean() > before.mean()
+
+
+def test_uncertain_readings_least_squares_and_few_poses_are_no_obstacle():
+    robot = delta()
+    data = measure(robot)
+    at = places(robot, data.readings)
+    bent = displaced(data, bend(at, at, 60 * UM, 3))
+    assert find(adjust_uncertainty(identify(robot, bent, LeastSquares()), bent))
+    estimated = identify(robot, bent, options=FitOptions(noise="estimated"))
+    assert find(adjust_uncertainty(estimated, bent))
+    uncertain = replace(bent, reading_sigma=np.full(bent.readings.shape, 2 * UM))
+    assert find(adjust_uncertainty(identify(robot, uncertain), uncertain))
+    few = bent.take(np.arange(4))
+    fit = identify(robot, few)
+    assert adjust_uncertainty(fit, few) is fit
+
+
+def test_a_calibration_states_the_discrepancy_and_its_run_uses_it():
+    fit, adjusted, data = bent_fit()
+    report = lc.calibrate(fit.initial, data)
+    assert report.identification.posterior.discrepancy is not None
+    assert DISCREPANCY in [f.code for f in report.findings]
+    assert np.array_equal(report.identification.covariance, adjusted.covariance)
