@@ -117,7 +117,7 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
         return kept, d, penalty, d.deviation(d.solution(penalty))
 
     whole, d, penalty, at = fitted(np.ones(12))
-    result = compute_influence(problem, whole, member, d, penalty, np.ones(6), at)
+    result = compute_influence(problem, whole, member, d, [(penalty, at)], np.ones(6))[0]
     parts = [part for block in problem.leverage_rows(whole) for part in block]
     A = np.concatenate([part.rows.reshape(-1, 43) for part in parts])
     for j in range(6):
@@ -137,7 +137,7 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
         # the same from a fit in which the block has no weight
         outside = (np.arange(6) != j).astype(float)
         kept, d_j, penalty_j, at_j = fitted(outside[member])
-        again = compute_influence(problem, kept, member, d_j, penalty_j, outside, at_j)
+        again = compute_influence(problem, kept, member, d_j, [(penalty_j, at_j)], outside)[0]
         assert again.distance[j] == pytest.approx(expected, rel=1e-6)
         assert again.leverage[j] == 0.0
     if method == LeastSquares():

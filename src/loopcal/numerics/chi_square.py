@@ -31,13 +31,20 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
 
     Parameters
     ----------
-    degrees : degrees of freedom of the statistic. left : of the residuals. All broadcast.
+    degrees : degrees of freedom of the statistic; without one the probability is 1.
+    left : of the residuals; infinite for known noise. All broadcast.
     """
     from scipy.special import fdtrc
 
-    left = np.asarray(left, dtype=float)
-    tail = fdtrc(degrees, np.where(left > 0.0, left, 1.0), statistic)
-    return np.where(left > 0.0, tail, np.nan)
+    degrees, left = np.asarray(degrees, dtype=float), np.asarray(left, dtype=float)
+    tested = np.where(degrees > 0.0, degrees, 1.0)
+    is_estimated = (left > 0.0) & np.isfinite(left)
+    tail = np.where(
+        is_estimated,
+        fdtrc(tested, np.where(is_estimated, left, 1.0), statistic),
+        compute_chi_square_tail(tested, tested * np.asarray(statistic, dtype=float)),
+    )
+    return np.where(left > 0.0, np.where(degrees > 0.0, tail, 1.0), np.nan)
 
 
 def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:

@@ -15,7 +15,7 @@ The leverage is the trace of w G. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,41 +64,52 @@ def compute_influence(
     linearization: Linearization,
     member: IntArray,
     decomposition: Decomposition,
-    penalty: FloatArray,
+    fits: Sequence[tuple[FloatArray, FloatArray]],
     weight: FloatArray,
-    solved: FloatArray | None = None,
-) -> Influence:
-    """Return the influence of every block (one trial).
+) -> list[Influence]:
+    """Return the influence of every block (one trial) on fits of the same rows, in one pass.
 
     Parameters
     ----------
     problem : unweighted. linearization : of the weighted problem.
-    member : (n,) block 0..u-1 of each pose. weight : (u,) weight of each block in the fit.
-    decomposition, penalty : of the weighted fit.
-    solved : (1, p), optional. Deviation at which the residuals are evaluated, to first order;
-        default that of the linearization.
+    member : (n,) block 0..u-1 of each pose. decomposition : of the weighted fits.
+    fits : the penalty of each fit, and the deviation (1, p) at which its residuals are evaluated,
+        to first order.
+    weight : (u,) weight of each block in the fits.
     """
-    d = decomposition
-    variance = d.variances(penalty)[0]
-    sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
-    covariance_factor = d.scale[:, None] * d.directions[0] * sd
-    change = np.zeros(d.scale.shape) if solved is None else (solved - linearization.deviation)[0]
-    u, p = len(weight), len(sd)
-    leverage, distance, deleted = np.zeros(u), np.zeros(u), np.zeros(u)
-    residuals, degrees = np.zeros(u, np.int64), np.zeros(u, np.int64)
+    d, u, p = decomposition, len(weight), len(decomposition.scale)
+    roots, changes = [], []
+    for penalty, solved in fits:
+        variance = d.variances(penalty)[0]
+        sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
+        roots.append(d.scale[:, None] * d.directions[0] * sd)
+        changes.append((solved - linearization.deviation)[0])
+    results = [_make_empty(u) for _ in fits]
     total = problem.count_leverage_rows(member, u)
     rows = problem.leverage_rows(linearization)
     for blocks, columns, r in iterate_blocks(rows, member, total):
         # nuisance parameters come first, in units of their standard deviation
         A, nuisance = columns[..., -p:], columns[..., :-p]
-        residual = r + A @ change
         present = np.any(A != 0.0, axis=2) | np.any(nuisance != 0.0, axis=2) | (r != 0.0)
-        half = np.concatenate([nuisance, A @ covariance_factor], axis=2)
-        tested = compute_block_influence(half, residual, present, weight[blocks])
-        leverage[blocks], residuals[blocks] = tested.leverage, tested.residuals
-        distance[blocks], degrees[blocks] = tested.distance, tested.degrees
-        deleted[blocks] = tested.deleted
-    return Influence(leverage, residuals, distance, degrees, deleted)
+        for result, root, change in zip(results, roots, changes, strict=True):
+            half = np.concatenate([nuisance, A @ root], axis=2)
+            tested = compute_block_influence(half, r + A @ change, present, weight[blocks])
+            for array, values in zip(_list_arrays(result), _list_arrays(tested), strict=True):
+                array[blocks] = values
+    return results
+
+
+def _make_empty(blocks: int) -> Influence:
+    """Return an influence of zeros, to be filled."""
+    counts = (np.zeros(blocks, np.int64) for _ in range(2))
+    zeros = (np.zeros(blocks) for _ in range(3))
+    return Influence(next(zeros), next(counts), next(zeros), next(counts), next(zeros))
+
+
+def _list_arrays(influence: Influence) -> tuple[np.ndarray, ...]:
+    """Return the arrays of an influence."""
+    i = influence
+    return (i.leverage, i.residuals, i.distance, i.degrees, i.deleted)
 
 
 def compute_block_influence(

@@ -11,17 +11,21 @@ as well: with j excluded instead of i, i must still be a suspect.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from loopcal.diagnose.fit_checks.influence import Influence, compute_influence
+from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.penalties import decompose_for
-from loopcal.estimate.minimization.robust_descent import estimate_scale_of
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
-from loopcal.numerics.chi_square import compute_chi_square_quantile, compute_chi_square_tail
+from loopcal.numerics.chi_square import (
+    compute_chi_square_quantile,
+    compute_chi_square_tail,
+    compute_f_tail,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 MOST_ROUNDS = 20
@@ -30,10 +34,27 @@ MOST_ROUNDS = 20
 MOST_EXCLUDED = 0.5
 """Largest share of excluded blocks; beyond it nothing can be said of the others."""
 
+SMALLEST_NOISE = 1e-12
+"""Variance of the noise, in units of the stated one, below which residuals are rounding."""
+
 MOST_COMPARED = 10
 """Suspects, farthest first, that are compared with others which would do as well; more suspects are
 a matter of the model.
 """
+
+
+class JudgingNoise(NamedTuple):
+    """The noise by which each of u blocks is judged: that of the other fitted blocks.
+
+    Attributes
+    ----------
+    variance : (u,) of the whitened rows, in units of the stated one.
+    degrees : (u,) its degrees of freedom; infinite where the stated noise counts, 0 where nothing
+        is known of it.
+    """
+
+    variance: FloatArray
+    degrees: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +64,18 @@ class PartialFit:
     Attributes
     ----------
     excluded : (u,) blocks that are not fitted. influence : of all blocks.
-    scale : factor on sigma; NaN where it is to be estimated and no fitted block can be tested.
+    scale : factor on sigma; NaN where it is to be estimated and the fitted blocks do not show it.
     directions : number of directions that the fit determines.
+    noise : by which noise each block is judged; by default that of `scale`, as if it were known.
+    left : degrees of freedom of `scale`; 0 where the stated noise counts.
     """
 
     excluded: BoolArray
     influence: Influence
     scale: float
     directions: int
+    noise: JudgingNoise | None = None
+    left: float = 0.0
 
     @property
     def tested(self) -> int:
@@ -62,12 +87,20 @@ class PartialFit:
         """(u,) distance per degree of freedom in units of the noise; zero without a test."""
         degrees = self.influence.degrees
         ratio = self.influence.distance / np.maximum(degrees, 1)
-        return np.where(degrees > 0, ratio, 0.0) / self.scale**2
+        variance = self.scale**2 if self.noise is None else self.noise.variance
+        return np.where(degrees > 0, ratio, 0.0) / variance
 
     def p_value(self) -> FloatArray:
         """Return (u,) the probability of a larger distance; 1 where there is no test."""
-        statistic = self.influence.distance / self.scale**2
-        return compute_chi_square_tail(self.influence.degrees, statistic)
+        left = np.inf if self.noise is None else self.noise.degrees
+        p_value = compute_f_tail(self.influence.degrees, left, self.ratio)
+        return np.where(np.isnan(p_value), 1.0, p_value)
+
+    @property
+    def contradicts_noise(self) -> bool:
+        """Whether the fitted blocks exceed the stated noise beyond doubt."""
+        square = self.left * self.scale**2
+        return self.left > 0.0 and bool(compute_chi_square_tail(self.left, square) < SIGNIFICANCE)
 
     def determines_as_much(self, whole: PartialFit) -> bool:
         """Return whether the fitted blocks determine as many directions as all blocks do, and the
@@ -108,12 +141,6 @@ class BlockSearch:
     def is_converged(self) -> bool:
         """Whether the same blocks were suspected twice."""
         return len(self.fits) == 1
-
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether as many blocks are excluded as may be; then it is no matter of single blocks."""
-        most = int(MOST_EXCLUDED * self.whole.tested)
-        return any(int(fit.excluded.sum()) >= max(most, 1) for fit in self.fits)
 
 
 def search_blocks(
@@ -156,13 +183,39 @@ def fit_without(
     kept = problem.weighted(weight[member]).linearize(deviation, start)
     d = decompose_for(fit.method, kept.factor, kept.equations, deviation, fit.spectrum.tolerance)
     penalty = np.array(fit.method.penalty(d), dtype=np.float64)
-    solved = d.deviation(d.solution(penalty))
-    influence = compute_influence(problem, kept, member, d, penalty, weight, solved)
-    inside, scale = (influence.degrees > 0) & ~excluded, 1.0
-    if noise != "given":
-        distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
-        scale = estimate_scale_of(distance, degrees.astype(np.float64)) if inside.any() else np.nan
-    return PartialFit(excluded, influence, scale, int(np.isfinite(penalty).sum()))
+    fits = [(q, d.deviation(d.solution(q))) for q in (penalty, np.where(d.used, 0.0, np.inf))]
+    influence, plain = compute_influence(problem, kept, member, d, fits, weight)
+    left, is_given = float(d.rows[0] - d.rank[0]), noise == "given"
+    judging = judge_noise(float(d.unexplained[0]), left, plain, excluded, is_given)
+    scale, directions = 1.0 if is_given else np.nan, int(np.isfinite(penalty).sum())
+    if left < (FEWEST_DEGREES if is_given else 1):
+        return PartialFit(excluded, influence, scale, directions, judging)
+    scale = float(np.sqrt(max(d.unexplained[0] / left, SMALLEST_NOISE)))
+    return PartialFit(excluded, influence, scale, directions, judging, left)
+
+
+def judge_noise(
+    unexplained: float, degrees: float, plain: Influence, excluded: BoolArray, is_given: bool
+) -> JudgingNoise:
+    """Return the noise that the fitted blocks show to each block: without its own residuals, so
+    that a wrong block cannot hide in it. No prior contributes.
+
+    The sum of squares that no parameter explains is lower by d_j^2 without block j, and its
+    degrees of freedom by those of d_j^2 (least squares). Where fewer than five are left, stated
+    noise counts as it is.
+
+    Parameters
+    ----------
+    unexplained, degrees : sum of squares of all fitted blocks that no parameter explains.
+    plain : influence (u,) on the fit by least squares. excluded : (u,) blocks that are not fitted.
+    is_given : whether the noise is stated.
+    """
+    left = degrees - np.where(excluded, 0, plain.degrees)
+    square = unexplained - np.where(excluded, 0.0, plain.distance)
+    is_shown = left >= (FEWEST_DEGREES if is_given else 1)
+    variance = np.maximum(square / np.where(is_shown, left, 1.0), SMALLEST_NOISE)
+    otherwise = np.inf if is_given else 0.0
+    return JudgingNoise(np.where(is_shown, variance, 1.0), np.where(is_shown, left, otherwise))
 
 
 def search_suspects(
@@ -215,7 +268,7 @@ def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) ->
         excluded = end.excluded.copy()
         excluded[i] = False
         back = refit(excluded)
-        square = back.influence.distance / back.scale**2
+        square = back.influence.distance / end.scale**2
         far = float(compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit))
         group = np.zeros_like(excluded)
         near = ~end.excluded & (back.p_value() < limit) & (square > square[i] - far)

@@ -8,11 +8,12 @@ raise no alarm in 95 % of cases. Several wrong blocks hide each other: see `outl
 one degree of freedom every block explains the misfit of all, and none is named. Nothing is removed
 from the data: the result names the blocks for whoever decides.
 
+The distance is judged by the noise that the other blocks show (an F ratio), not by the stated one.
+A wrong sigma therefore makes no outliers, and a misfit that is spread over all blocks names none.
+The stated noise counts only where the others leave fewer than five degrees of freedom.
+
 A fit that contradicts the stated noise is no good reference: one wrong row of a meter pulls the
-geometry so far that right poses seem wrong. Blocks are then compared at a robust fit (Tukey). Where
-even so as many blocks as may be excluded exceed the stated noise, it is not a matter of single
-poses: the noise is then the one that the residuals show, and the result says by how much it is
-larger.
+geometry so far that right poses seem wrong. Blocks are then compared at a robust fit (Tukey).
 """
 
 from __future__ import annotations
@@ -169,7 +170,7 @@ def find_outliers(
     """
     check_fitted_data(fit, data)
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    problem = problem_of(fit.free_parameters, data)
+    problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
     numbers, member = np.unique(linked_blocks(data), return_inverse=True)
     names = np.array(data.labels)
     labels = tuple(tuple(names[member == i].tolist()) for i in range(len(numbers)))
@@ -179,12 +180,9 @@ def find_outliers(
     low_weight = np.zeros(len(numbers), dtype=bool)
     low_weight[member] = reference.pose_weights < 0.5
 
-    refit = partial(fit_without, fit, problem, member, deviation=z, start=start)
     noise = fit.residual_test.noise
-    search = search_blocks(partial(refit, noise=noise), low_weight, level, progress)
-    if fit.residual_test.failed and search.is_exhausted:
-        noise = "estimated"
-        search = search_blocks(partial(refit, noise=noise), low_weight, level, progress)
+    refit = partial(fit_without, fit, problem, member, deviation=z, start=start, noise=noise)
+    search = search_blocks(refit, low_weight, level, progress)
     if search.is_converged:
         groups = find_rivals(search, progress)
     else:
@@ -196,7 +194,7 @@ def find_outliers(
     outliers = tuple(
         Outlier(
             labels[i],
-            float(influence.distance[i] / end.scale**2),
+            float(end.ratio[i] * influence.degrees[i]),
             int(influence.degrees[i]),
             float(p_value[i]),
         )
@@ -211,7 +209,7 @@ def find_outliers(
     single = all(len(poses) == 1 for poses in labels)
     shared = {"blocks": tested, "single_poses": single}
     summary = _summarize(fit, counts, level, shared, is_converged=search.is_converged)
-    if noise != fit.residual_test.noise and outliers:
+    if noise == "given" and outliers and end.contradicts_noise:
         times = report_finding("outliers.larger-noise", times=end.scale, **shared)
         summary = (times, *summary)
     return OutlierCheck(

@@ -71,6 +71,8 @@ def descend_robustly(
     """
     member = np.unique(block, return_inverse=True)[1]
     fit = RobustFit(run(problem, deviation, None), problem, np.ones(len(block)))
+    if fit.fit.status[0] not in (DescentStatus.CONVERGED, DescentStatus.BAD_START):
+        fit = _begin_without_far_blocks(problem, member, fit, deviation, run)
     if isinstance(loss, Tukey):
         coarse = 100.0 * CONVERGED_CHANGE
         fit = _reweight(problem, member, Huber(), fit, estimate_scale, run, coarse)
@@ -121,6 +123,20 @@ def _with_comparable_start(
     costs = robust.fit.cost_history.copy()
     costs[0] = whole.linearize(deviation, robust.fit.start).cost
     return replace(robust, fit=replace(robust.fit, cost_history=costs))
+
+
+def _begin_without_far_blocks(
+    problem: Problem, member: IntArray, failed: RobustFit, deviation: FloatArray, run: Run
+) -> RobustFit:
+    """Return a fit without the blocks that lie far from the start, where the fit to all of them
+    did not converge: one row that is far off can prevent every step. The scale is that of the
+    median block, whose distance is the error of the start.
+    """
+    start = replace(failed.fit, deviation=deviation, start=problem.start(deviation))
+    distance, degrees = measure_block_distances(problem, start, member, problem)
+    weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
+    weighted = problem.weighted(weight)
+    return RobustFit(run(weighted, deviation, None), weighted, weight)
 
 
 def _reweight(
