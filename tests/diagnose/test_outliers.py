@@ -319,7 +319,7 @@ def test_one_gross_row_does_not_make_the_right_poses_outliers():
     """A row that is half a machine off pulls the geometry so far that half the poses misfit."""
     robot, data = measure_five_bar()
     wrong = move_row(data, 6, 0.3)
-    fit = identify(robot, wrong)
+    fit = identify(robot, wrong, MAP())
     assert fit.converged
     assert fit.residual_test.failed
     assert find_outliers(fit, wrong).names == (data.labels[6],)
