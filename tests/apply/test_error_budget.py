@@ -221,9 +221,11 @@ def test_fits_that_contradict_the_noise_or_have_no_intervals_state_no_expected_e
     data = simulate(robot(), measured_poses(30), Instrument((sensor,)), 1)
     (rows,) = data.observations
     optimistic = replace(data, observations=(replace(rows, covariance=rows.covariance / 9.0),))
-    fit = identify(robot(), optimistic)
-    assert fit.residual_test.failed
-    assert compute_error_budget(fit, optimistic) is None
+    report = lc.calibrate(robot(), optimistic)
+    assert report.identification.residual_test.failed
+    assert report.budget is not None  # the parts of intervals that the residuals made wider
+    assert not report.states_expected_error
+    assert "Expected error" not in str(report)
     few = data.take(np.arange(8))
     fit = identify(robot(), few, LeastSquares(), options=FitOptions(noise="estimated"))
     assert (compute_error_budget(fit, few) is None) is not fit.residual_test.intervals

@@ -1,34 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Expected errors of the poses of a calibrated machine, and the sources that they come from.
+"""The uncertainty budget of a calibration: parameters and poses by the sources of their errors.
 
-The covariance of a fit is C = b (sigma^2 A'A + P) b, b = (A'A + P)^-1, with the whitened rows A
-after the elimination of the setup parameters, and the penalty P. A direction that the data do not
-determine keeps its nominal value and errs by its tolerance, which is a penalty of 1. With the rows
-A_known for known frames, targets, surfaces and offsets, and b_known and C_known from these, the
-variance of a pose error is the sum of
-
-    instrument              b_known sigma^2 A_known'A_known b_known     noise of the rows
-    undetermined tolerances b_known P b_known           what the rows leave to the tolerances
-    set-up                  C - C_known                 what the unknown setup parameters add
-    repeatability           J_q S_q J_q'                readings, where the actuators have a sigma
-
-each taken to a pose by D, in the frame of `loopcal.diagnose.error_frames`. Less knowledge never
-lowers C, so that no part is negative. See docs/theory/uncertainty.md.
+The roots by source of `split_covariance` are taken to every parameter and, by the error model D, to
+poses over the workspace, in the frame of `loopcal.diagnose.error_frames`. Poses have three more
+errors: those of the frame itself (setup), those of the readings in use, where the actuators have a
+sigma (repeatability), and what a model discrepancy leaves beyond the parameters. The squares of all
+sources add up to the variance. What half a sigma would gain is computed from a covariance with all
+weights changed, not from the part of the source. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.error_frames import FITTED, RELATIVE
+from loopcal.apply.covariance_sources import (
+    EARLIER,
+    INSTRUMENT,
+    READINGS,
+    REPEATABILITY,
+    SETUP,
+    TOLERANCES,
+    CovarianceSplit,
+    Source,
+    halve_sigma,
+    split_covariance,
+)
+from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE
 from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.diagnose.tool_errors import ToolErrors, linearize_tool_errors, locate_measured_poses
 from loopcal.errors import MechanismError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.fit_linearization import factor_known_setup, linearize_fit
+from loopcal.estimate.frame_freedoms import find_measured_frames
+from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
@@ -42,14 +48,28 @@ POSES, SEED = 200, 0
 NEGLIGIBLE = 0.01
 """Share of an expected error below which the sentence leaves out a source."""
 
+_LENGTHS = ("position", "orientation")
+_OF_ROWS = (INSTRUMENT, READINGS, SETUP, TOLERANCES, EARLIER)
+"""Kinds of sources whose errors the fit weighs against each other."""
+
+PRIOR = "prior."
+"""Beginning of the codes of findings on the tolerances, whose errors count as theirs."""
+
 
 class ErrorSources(NamedTuple):
-    """Variances [m^2 or rad^2] of the length of an error, mean over poses, by source."""
+    """Variances [m^2 or rad^2] of the length of an error, mean over poses, by kind of source.
+
+    `other` are the covariances that findings added, such as for correlated errors.
+    """
 
     instrument: float
     setup: float
     tolerances: float
     repeatability: float
+    readings: float = 0.0
+    earlier: float = 0.0
+    discrepancy: float = 0.0
+    other: float = 0.0
 
     @property
     def rms(self) -> float:
@@ -58,18 +78,55 @@ class ErrorSources(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorBudget:
-    """Expected errors of the tool point and of the orientation over the workspace.
+class SourceBudget:
+    """What one source does, and what half its sigma would leave.
 
     Attributes
     ----------
-    position, orientation : variances by source. poses : number of poses.
-    is_workspace : whether they are drawn from the workspace of the robot; otherwise they are those
-        that were measured. finding : the errors with their frame, in one sentence.
+    source : kind, name, type of evaluation and degrees of freedom.
+    position, orientation : variances [m^2, rad^2] of the length of the error of a pose.
+    parameters : (p,) variances [SI]; NaN for undetermined parameters.
+    halved : root mean squares with half the sigma of this source; None where it has no sigma.
+    """
+
+    source: Source
+    position: float
+    orientation: float
+    parameters: FloatArray
+    halved: HalvedErrors | None
+
+
+class HalvedErrors(NamedTuple):
+    """Root mean squares of position [m] and orientation [rad] from all sources with one sigma
+    halved, and the standard deviations (p,) of the parameters [SI].
+    """
+
+    position: float
+    orientation: float
+    parameters: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """The uncertainty of the parameters and of poses over the workspace, by source.
+
+    Attributes
+    ----------
+    position, orientation : variances of the tool's place and of the rotation, by kind of source.
+    lines : every source. sd : (p,) standard deviations of the parameters `names` [SI]; infinite for
+        undetermined ones. worst : name of the determined parameter with the largest standard
+        deviation in tolerances; empty where none is determined.
+    poses : number of poses. is_workspace : whether they are drawn from the workspace of the robot;
+        otherwise they are those that were measured.
+    finding : the errors of poses with their frame, in one sentence.
     """
 
     position: ErrorSources
     orientation: ErrorSources
+    lines: tuple[SourceBudget, ...]
+    names: tuple[str, ...]
+    sd: FloatArray
+    worst: str
     poses: int
     is_workspace: bool
     finding: Finding
@@ -77,58 +134,97 @@ class ErrorBudget:
     def __str__(self) -> str:
         return str(self.finding)
 
+    def __repr__(self) -> str:
+        """Return the number of sources and the errors."""
+        position, orientation = 1e3 * self.position.rms, 1e3 * self.orientation.rms
+        return (
+            f"<ErrorBudget: {len(self.lines)} sources; position {position:.3g} mm, orientation "
+            f"{orientation:.3g} mrad>"
+        )
+
     def to_dict(self) -> dict[str, Any]:
-        """Return root mean squares and variances by source for JSON, SI."""
+        """Return root mean squares and variances by source for JSON, SI.
+
+        `sources` has one entry for each source, with the variance of every parameter by name.
+        """
         errors = {}
         for name in ("position", "orientation"):
             sources: ErrorSources = getattr(self, name)
             errors[name] = {"rms": sources.rms, "variances": sources._asdict()}
         place = "workspace" if self.is_workspace else "measured poses"
-        return {**errors, "poses": self.poses, "over": place, "finding": self.finding}
+        return {
+            **errors,
+            "parameters": dict(zip(self.names, self.sd.tolist(), strict=True)),
+            "worst_parameter": self.worst,
+            "sources": [self._list_line(line) for line in self.lines],
+            "poses": self.poses,
+            "over": place,
+            "frame": self.finding.data["frame"],
+            "finding": self.finding,
+        }
+
+    def _list_line(self, line: SourceBudget) -> dict[str, Any]:
+        """Return a source by name for JSON."""
+        halved, at = line.halved, self.names.index(self.worst) if self.worst else None
+        source = line.source._asdict()
+        if not np.isfinite(line.source.degrees):
+            source["degrees"] = None
+        return {
+            **source,
+            "position": line.position,
+            "orientation": line.orientation,
+            "parameters": dict(zip(self.names, line.parameters.tolist(), strict=True)),
+            "halved": None
+            if halved is None
+            else {
+                "position_rms": halved.position,
+                "orientation_rms": halved.orientation,
+                "worst_parameter_sd": None if at is None else float(halved.parameters[at]),
+            },
+        }
 
 
 def compute_error_budget(
     fit: Identification, data: Measurements, frame: str = FITTED
 ) -> ErrorBudget | None:
-    """Compute the expected errors of a calibrated machine over its workspace, by source.
+    """Compute the uncertainty budget of a calibrated machine.
 
     Parameters
     ----------
     fit : an identification. data : the measurements it was made from.
-    frame : in which the errors are stated, see `loopcal.diagnose.choose_error_frame`; "relative"
-        means relative to the home pose.
+    frame : in which the errors of poses are stated, see `loopcal.diagnose.choose_error_frame`;
+        "relative" means relative to the home pose.
 
     Returns
     -------
-    ErrorBudget; None where the fit has no intervals, where its residuals contradict the stated
-    noise, or where no pose is reached.
+    ErrorBudget; None where the fit has no intervals, or where no pose is reached.
 
     Raises
     ------
     EstimationError : no such frame.
     """
     check_fitted_data(fit, data)
-    if not fit.residual_test.intervals or fit.residual_test.failed:
+    if not (fit.converged and fit.residual_test.intervals):
         return None
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     solution, is_workspace = _choose_poses(fit, data)
     if not len(solution.q):
         return None
     effects = linearize_tool_errors(fit.posterior, solution, frame)
-    angle, position = _split(effects, _split_covariance(fit, data), is_relative=frame == RELATIVE)
+    split = split_covariance(fit, data)
+    lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
+    sd = np.sqrt(sum(line.parameters for line in lines))
+    sd = np.where(split.undetermined, np.inf, sd)
+    places = _Places(solution, frame)
+    lines = [replace(each, halved=_halve(fit, data, each, lines, places)) for each in lines]
+    position, orientation = _add_kinds(lines)
     n = len(solution.q)
-    finding = _word(fit, (position, angle), n, is_workspace, effects.reference)
-    return ErrorBudget(position, angle, n, is_workspace, finding)
-
-
-class CovarianceRoots(NamedTuple):
-    """Square roots (p, p) of the covariance of a fit and, for known setup parameters, of its parts
-    by noise and by tolerances; in the units of the posterior.
-    """
-
-    whole: FloatArray
-    noise: FloatArray
-    tolerances: FloatArray
+    finding = _word(fit, (position, orientation), n, is_workspace, effects.reference)
+    shares = np.where(np.isfinite(sd), sd / fit.tolerance, -1.0)
+    worst = fit.names[int(np.argmax(shares))] if shares.max(initial=-1.0) > 0.0 else ""
+    return ErrorBudget(
+        position, orientation, tuple(lines), fit.names, sd, worst, n, is_workspace, finding
+    )
 
 
 def _choose_poses(fit: Identification, data: Measurements) -> tuple[Solution, bool]:
@@ -142,49 +238,105 @@ def _choose_poses(fit: Identification, data: Measurements) -> tuple[Solution, bo
     return solution.take(np.flatnonzero(solution.converged)), True
 
 
-def _split_covariance(fit: Identification, data: Measurements) -> CovarianceRoots:
-    """Return the parts of the covariance of a fit.
-
-    With the triangle of [A_known V; sqrt P] = Q R, V the directions of the fit, b_known is R^-1
-    R^-T, and the roots of the parts are R^-1 Q_1' and R^-1 Q_2'. A'A is never formed.
-    """
-    from scipy.linalg import solve_triangular
-
-    linear = linearize_fit(fit, data)
-    d, scaled, variance = linear.decomposition, linear.scaled, linear.variance
-    V, used = d.directions[0], linear.is_estimated
-    variance = np.where(np.isinf(variance), 1.0, variance)
-    penalty = np.where(used, scaled.penalty[0], 1.0 / variance)
-    # with an estimated noise and a prior, the rows are divided by the noise
-    unit = 1.0 if scaled.decomposition is d else fit.residual_test.sigma_scale
-    rows = factor_known_setup(fit, data) @ (d.scale[:, None] * V) / unit
-    Q, R = np.linalg.qr(np.concatenate([rows, np.diag(np.sqrt(penalty))]))
-    noise, tolerances = (solve_triangular(R, q.T) for q in (Q[: len(rows)], Q[len(rows) :]))
-    return CovarianceRoots(V * np.sqrt(variance), V @ noise * np.sqrt(scaled.noise), V @ tolerances)
-
-
-def _split(
-    effects: ToolErrors, roots: CovarianceRoots, *, is_relative: bool
-) -> tuple[ErrorSources, ErrorSources]:
-    """Return the sources of the errors of orientation and position.
+def _list_sources(
+    fit: Identification, split: CovarianceSplit, effects: ToolErrors, *, is_relative: bool
+) -> list[SourceBudget]:
+    """Return every source with its variances.
 
     Errors of the frame itself are those of the set-up; those of the reference pose of relative
     errors are repeatability.
     """
-    whole, noise, tolerances = (_mean_squares(effects.by_parameters @ root) for root in roots)
-    of_frame, repeated = _mean_squares(effects.by_frame), _mean_squares(effects.by_readings)
-    sources = []
-    for i in range(2):
-        setup = max(whole[i] - noise[i] - tolerances[i], 0.0)  # rounding, for known parameters
-        sources.append(
-            ErrorSources(
-                instrument=max(whole[i] - tolerances[i] - setup, 0.0),
-                setup=setup + (0.0 if is_relative else of_frame[i]),
-                tolerances=tolerances[i],
-                repeatability=repeated[i] + (of_frame[i] if is_relative else 0.0),
+    D = effects.by_parameters / fit.posterior.unit
+    lines = []
+    for source, root in zip(split.sources, split.roots, strict=True):
+        twists = D @ root
+        if source.kind == DISCREPANCY:
+            twists = _select_discrepancy(effects.by_discrepancy, source.name)
+        if source.kind == SETUP and not is_relative:
+            twists = np.concatenate([twists, effects.by_frame], axis=2)
+        variances = np.where(split.undetermined, np.nan, (root**2).sum(axis=1))
+        angle, position = _mean_squares(twists)
+        lines.append(SourceBudget(source, position, angle, variances, None))
+    repeated = effects.by_readings
+    if is_relative:
+        repeated = np.concatenate([repeated, effects.by_frame], axis=2)
+    if repeated.any():
+        angle, position = _mean_squares(repeated)
+        nothing = np.where(split.undetermined, np.nan, 0.0)
+        source = Source(REPEATABILITY, "", "B", np.inf)
+        lines.append(SourceBudget(source, position, angle, nothing, None))
+    return lines
+
+
+class _Places(NamedTuple):
+    """Poses, and the frame in which their errors are stated."""
+
+    solution: Solution
+    frame: str
+
+
+def _select_discrepancy(twists: FloatArray, name: str) -> FloatArray:
+    """Return the twists (n, 6, k) of a model discrepancy that its position or orientation causes:
+    columns are those of rotations and of places, then what is independent at each pose, likewise.
+    """
+    part = 1 if name == "position" else 0
+    common, own = np.split(twists, [twists.shape[2] - 6], axis=2)
+    return np.concatenate([np.split(each, 2, axis=2)[part] for each in (common, own)], axis=2)
+
+
+def _halve(
+    fit: Identification,
+    data: Measurements,
+    line: SourceBudget,
+    lines: list[SourceBudget],
+    places: _Places,
+) -> HalvedErrors | None:
+    """Return the errors from all sources with half the sigma of one."""
+    solution, frame = places
+    position, orientation = (sum(getattr(each, name) for each in lines) for name in _LENGTHS)
+    parameters = sum(each.parameters for each in lines)
+    if line.source.kind in _OF_ROWS:
+        halved = halve_sigma(fit, data, line.source)
+        if halved is None:
+            return None
+        root, linearization, problem = halved
+        posterior = replace(fit.posterior, discrepancy=None)
+        if frame not in (FITTED, BASE, RELATIVE):
+            frames = find_measured_frames(
+                problem,
+                data,
+                linearization.deviation,
+                linearization.next_start,
+                fit.options.prior,
+                linearization,
+                fit.residual_test.sigma_scale**2,
             )
-        )
-    return sources[0], sources[1]
+            posterior = replace(posterior, frames=frames)
+        effects = linearize_tool_errors(posterior, solution, frame)
+        D, own = effects.by_parameters / posterior.unit, effects.by_frame
+        own = own[..., :0] if frame == RELATIVE else own
+        angle, place = _mean_squares(np.concatenate([D @ root, own], axis=2))
+        kept = [each for each in lines if each.source.kind not in _OF_ROWS]
+        place += sum(each.position for each in kept)
+        angle += sum(each.orientation for each in kept)
+        rest = sum((each.parameters for each in kept), np.zeros(len(root)))
+        variances = rest + np.where(np.isnan(parameters), np.nan, (root**2).sum(axis=1))
+    else:
+        place, angle = position - 0.75 * line.position, orientation - 0.75 * line.orientation
+        variances = parameters - 0.75 * line.parameters
+    return HalvedErrors(float(np.sqrt(place)), float(np.sqrt(angle)), np.sqrt(variances))
+
+
+def _add_kinds(lines: list[SourceBudget]) -> tuple[ErrorSources, ErrorSources]:
+    """Return the variances of position and orientation by kind of source."""
+    sums = [dict.fromkeys(ErrorSources._fields, 0.0) for _ in _LENGTHS]
+    names = {DISCREPANCY: "discrepancy", EARLIER: "earlier"}
+    for line in lines:
+        kind = names.get(line.source.kind, line.source.kind)
+        kind = TOLERANCES if kind.startswith(PRIOR) else kind
+        for total, name in zip(sums, _LENGTHS, strict=True):
+            total[kind if kind in total else "other"] += getattr(line, name)
+    return ErrorSources(**sums[0]), ErrorSources(**sums[1])
 
 
 def _mean_squares(twists: FloatArray) -> tuple[float, float]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal calibrate`, `loopcal validate` and `loopcal compensate`."""
+"""`loopcal calibrate`, `loopcal budget`, `loopcal validate` and `loopcal compensate`."""
 
 from __future__ import annotations
 
@@ -174,6 +174,33 @@ def _list_inputs(
     if compare is not None:
         inputs["compare"] = find_robot_file(compare)
     return inputs
+
+
+@click.command()
+@click.argument("run", metavar="RUN", type=FILE)
+@json_option
+def budget(run: Path, as_json: bool) -> int:
+    """Show the uncertainty budget of RUN, a run folder: what each source of errors contributes to
+    poses and parameters, and what half its sigma would gain.
+
+    The frame of the pose errors is that of the calibration, see its option --frame. A run without
+    intervals has no budget.
+
+    \b
+    Examples:
+      loopcal budget run
+      loopcal budget run --json
+    """  # noqa: D301
+    from loopcal.io.runs.run_folder import load_run
+    from loopcal.report.budget_view import view_budget
+
+    calibrated = load_run(run)
+    content = calibrated.load_budget()
+    if as_json:
+        terminal.print_json(content)
+    else:
+        terminal.print_page(view_budget(content, calibrated.robot))
+    return 0
 
 
 @click.command()

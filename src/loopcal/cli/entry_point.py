@@ -35,6 +35,7 @@ SECTIONS = {
     "Calibrate": {
         "calibrate": "Identify the parameters of a robot and validate them.",
         "validate": "Validate a calibration, or a robot file, with measurements.",
+        "budget": "Show the uncertainty of a calibration by source.",
         "compensate": "Compute readings or commands that reach targets.",
     },
     "Published studies": {
@@ -49,7 +50,7 @@ MODULES = {
     "exchange_commands": ("import", "export"),
     "measurement_commands": ("identifiability", "simulate"),
     "plan_command": ("plan",),
-    "calibration_commands": ("calibrate", "validate", "compensate"),
+    "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
     "study_commands": ("reproduce", "per-leg"),
 }
 """Modules of this package, and the commands in each; they are imported when they run."""

@@ -68,6 +68,13 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
     return FitLinearization(problem, linearization, d, penalty, scaled)
 
 
+def linearize_rows_of(fit: Identification, data: Measurements) -> tuple[Problem, Linearization]:
+    """Linearize the rows of other measurements of the poses of a fit at its estimate, such as those
+    of another sigma, with an earlier calibration; arguments as of `linearize_fit`.
+    """
+    return _linearize(fit, data, is_setup_known=False)
+
+
 def factor_known_setup(fit: Identification, data: Measurements) -> FloatArray:
     """Return the triangular factor (p, p) of the whitened rows of a fit by the parameters in
     tolerances, as if its frames, targets, surfaces and offsets were known.

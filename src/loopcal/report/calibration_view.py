@@ -11,6 +11,7 @@ from loopcal.estimate import Identification
 from loopcal.estimate.result import LAST_DIGITS
 from loopcal.findings import Finding
 from loopcal.mechanism import Mechanism
+from loopcal.report.budget_view import build_budget_table
 from loopcal.report.numbers import (
     format_in,
     format_number,
@@ -47,7 +48,7 @@ def view_calibration(
     """
     fit = report.identification
     rows = fit.to_dict()
-    task = [] if report.budget is None else ["", str(report.budget)]
+    task = ["", str(report.budget)] if report.states_expected_error else []
     blocks: list[Block] = [report.headline, *task, *_view_errors(report)]
     selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in selected])]
@@ -87,6 +88,8 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
     blocks += ["", _describe_iteration(fit)]
     for suggestion in report.suggestions or ():
         blocks.append(f"Suggested measurement: {suggestion}")
+    if report.budget is not None:
+        blocks.append(build_budget_table(report.budget.to_dict(), report.robot))
     if report.model_choice is not None:
         blocks.append(build_model_table(report.model_choice))
     if report.reading_errors is not None:

@@ -91,7 +91,8 @@ class CalibrationReport:
     fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic. None
         where the fit did not converge.
     findings : everything noticed, the most important first.
-    budget : expected errors over the workspace and their sources; None where they cannot be stated.
+    budget : uncertainty of parameters and of poses over the workspace by source; None where there
+        are no intervals.
     examination : outliers, lack of fit, correlations and expected gain; None where the fit did not
         converge.
     suggestions : further measurements that determine open parameter combinations.
@@ -151,6 +152,15 @@ class CalibrationReport:
         return choose_next_step(self.verdict, self.findings, outliers)
 
     @property
+    def states_expected_error(self) -> bool:
+        """Whether the budget is the expected error of the machine: not where the residuals
+        contradict the noise, and no discrepancy of the model explains that.
+        """
+        fit = self.identification
+        explained = fit.posterior.discrepancy is not None
+        return self.budget is not None and (explained or not fit.residual_test.failed)
+
+    @property
     def headline(self) -> str:
         """The verdict in one sentence."""
         fit = self.identification
@@ -163,7 +173,7 @@ class CalibrationReport:
     def __str__(self) -> str:
         """Return verdict, expected and validated errors, important findings and the next step."""
         errors = self.validation or self.fitted_errors
-        lines = [self.headline, *([] if self.budget is None else [str(self.budget)])]
+        lines = [self.headline, *([str(self.budget)] if self.states_expected_error else [])]
         if errors is not None:
             lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]
             lines += errors.describe_rms()

@@ -131,10 +131,7 @@ class WithPrior:
         measured = self.measured.linearize(deviation, start)
         if not len(self.slope):
             return measured
-        slope = np.broadcast_to(self.slope, (len(deviation), *self.slope.shape))
-        if self.unknown.shape[1]:
-            triangles = measured.factor[:, :-1, :-1]
-            slope = np.stack([self._consistent_slope(triangle) for triangle in triangles])
+        slope = self.list_slopes(measured)
         residual = np.matmul(slope, (deviation - self.center)[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
         return replace(
@@ -143,6 +140,13 @@ class WithPrior:
             cost=measured.cost + (residual**2).sum(axis=1),
             equations=measured.equations + len(self.slope),
         )
+
+    def list_slopes(self, measured: Linearization) -> FloatArray:
+        """Return the rows (t, r, p) of the prior beside those of the measurements."""
+        if not self.unknown.shape[1]:
+            return np.broadcast_to(self.slope, (len(measured.deviation), *self.slope.shape))
+        triangles = measured.factor[:, :-1, :-1]
+        return np.stack([self._consistent_slope(triangle) for triangle in triangles])
 
     def _consistent_slope(self, triangle: FloatArray) -> FloatArray:
         """Return the rows of the prior without the null directions of the measured rows that it

@@ -214,9 +214,13 @@ def sets_not_compared(data: Data) -> str:
 
 SOURCES = {
     "instrument": "instrument",
+    "readings": "actuator readings",
     "setup": "set-up",
     "tolerances": "undetermined tolerances",
+    "earlier": "earlier calibration",
     "repeatability": "repeatability",
+    "discrepancy": "model discrepancy",
+    "other": "other errors that the residuals show",
 }
 """Source of an expected error -> words."""
 

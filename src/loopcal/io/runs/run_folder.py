@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import FileError
-from loopcal.findings import Finding
+from loopcal.errors import DataError, FileError
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
 from loopcal.io.core.text_file import as_path, read_text, sha256
@@ -239,6 +239,18 @@ class Run:
         return uncertainty_from_arrays(
             self.robot, tuple(self.nuisance_values), self.arrays, 1.0 if scale is None else scale
         )
+
+    def load_budget(self) -> dict[str, Any]:
+        """Return the uncertainty budget, see `ErrorBudget.to_dict`.
+
+        Raises
+        ------
+        DataError : the run has no intervals, or was made by an earlier version.
+        """
+        budget = self.result.get("expected_error")
+        if budget is None or "sources" not in budget:
+            raise DataError(report_finding("files.no-budget", run=str(self.path)))
+        return dict(budget)
 
     def load_measurements(self, **allowed: bool) -> tuple[Measurements, Measurements | None]:
         """Return the fitted and the held-out measurements, from the unchanged input files.
