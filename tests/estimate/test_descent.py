@@ -3,12 +3,21 @@
 ending.
 """
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from loopcal.estimate.fit_findings import report_status
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
 from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of_trials
+from loopcal.io import load_robot
+from loopcal.measure import Distance, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
+from loopcal.mechanism import sample_workspace
 from loopcal.numerics.gauss_newton import DescentStatus
 from tests.estimate.problems import fold_rows
 
@@ -125,6 +134,131 @@ def test_trial_with_a_bad_start_is_marked_and_does_not_change_others():
 def test_descent_without_a_finite_step_is_reported():
     fit = descend(make_problem(Unreachable()), np.zeros((1, 1)), LeastSquares())
     assert fit.status[0] == DescentStatus.NO_DESCENT
+
+
+class Valley:
+    """Two residuals of a bent valley, 10 (y - x^2) and 1 - x, at several starts of x."""
+
+    parameters = 2
+
+    def __init__(self, starts: np.ndarray, steepness: float = 1e3) -> None:
+        self.starts, self.steepness = starts, steepness
+        self.equations, self.count = np.full(len(starts), 2), np.zeros(len(starts), dtype=int)
+
+    def evaluate(self, deviation, trials):
+        self.count[trials] += 1
+        x, y = (self.starts[trials] + deviation).T
+        k, zero = self.steepness, np.zeros_like(x)
+        residual = np.stack([k * (y - x**2), 1.0 - x], axis=1)
+        slopes = [np.stack([-2.0 * k * x, zero - 1.0], axis=1), np.stack([zero + k, zero], axis=1)]
+        return fold_rows(np.stack([*slopes, residual], axis=2)), (residual**2).sum(axis=1)
+
+
+STARTS = np.array([[0.3, 0.1], [3.0, -7.0], [1.0, 1.0], [-30.0, 900.0]])
+
+
+def test_chain_of_full_steps_crosses_a_bent_valley():
+    """Damping alone follows its bottom in 109 evaluations, and in more than 1000."""
+    valley = Valley(STARTS)
+    fit = descend(make_problem(valley), np.zeros((4, 2)), LeastSquares())
+    assert (fit.status == DescentStatus.CONVERGED).all()
+    np.testing.assert_allclose(STARTS + fit.deviation, 1.0, atol=1e-9)
+    assert valley.count.max() <= 6
+
+
+def test_stacked_trials_with_chains_equal_single_trials_bit_for_bit():
+    y = np.random.default_rng(3).uniform(-40.0, 40.0, (30, 2))
+    together = descend(make_problem(Valley(y)), np.zeros((30, 2)), Ridge(1e-6))
+    assert len(set(together.iterations.tolist())) > 1
+    for i in range(30):
+        alone = descend(make_problem(Valley(y[i : i + 1])), np.zeros((1, 2)), Ridge(1e-6))
+        assert np.array_equal(together.deviation[i], alone.deviation[0])
+        assert together.iterations[i] == alone.iterations[0]
+        assert together.status[i] == alone.status[0]
+
+
+class RunsAway:
+    """exp(-z) has no minimum: every full step is as long as the last one, or blocked at z = 6."""
+
+    parameters, equations = 1, np.array([2])
+
+    def evaluate(self, deviation, trials):
+        z = deviation[:, 0]
+        residual = np.stack([1.0 + 1e-3 * np.exp(-z), 0.0 * z], axis=1)
+        rows = np.stack([-1e-3 * np.exp(-z), residual[:, 0]], axis=1)[:, None]
+        cost = np.where(z < 6.0, (residual**2).sum(axis=1), np.inf)
+        return fold_rows(rows), cost
+
+
+def test_fit_without_progress_ends_early():
+    fit = descend(make_problem(RunsAway()), np.zeros((1, 1)), LeastSquares())
+    assert fit.status[0] == DescentStatus.NO_PROGRESS
+    assert len(fit.cost_history) <= 25
+    finding = report_status(DescentStatus(fit.status[0]), int(fit.iterations[0]))
+    assert finding.code == "fit.no-progress"
+
+
+def test_slow_progress_goes_on():
+    """exp(-z) without noise: every step gains a share of the sum of squares, for long."""
+    count = [0]
+
+    def evaluate(deviation, trials):
+        count[0] += 1
+        residual = np.exp(-0.01 * deviation[:, 0]) - np.exp(-9.0)
+        rows = np.stack([-0.01 * np.exp(-0.01 * deviation[:, 0]), residual], axis=1)[:, None]
+        return fold_rows(rows), residual**2
+
+    problem = FunctionProblem(1, evaluate, np.array([1]))
+    fit = descend(problem, np.zeros((1, 1)), LeastSquares())
+    assert fit.status[0] == DescentStatus.CONVERGED
+    assert fit.deviation[0, 0] == pytest.approx(900.0)
+
+
+class CountedProblem:
+    """A problem that counts the evaluations of every trial."""
+
+    def __init__(self, problem: Problem, count: np.ndarray, numbers: np.ndarray) -> None:
+        self.problem, self.count, self.numbers = problem, count, numbers
+        self.parameters, self.start = problem.parameters, problem.start
+
+    def linearize(self, deviation, start):
+        self.count[self.numbers] += 1
+        return self.problem.linearize(deviation, start)
+
+    def take(self, trials):
+        return CountedProblem(self.problem.take(trials), self.count, self.numbers[trials])
+
+
+def test_one_wire_with_an_unknown_anchor_converges_by_least_squares():
+    """A 3-PRS with 9 of 33 directions undetermined and others hardly: scipy needs more evaluations
+    and finds the same minimum."""
+    robot, t = load_robot("3-prs"), 10
+    count = np.zeros(t, dtype=int)
+    place, anchor = np.array([[0.05, 0.02, 0.0]]), np.array([1.0, -0.6, 0.2])
+    wire = Distance(anchor=anchor, places=place, unknown=("anchor",))
+    instrument = Instrument((Sensor(wire, Gaussian(np.array([1e-5]))),))
+    poses = sample_workspace(robot, 80, 5).coordinates
+    trials = simulate_trials(robot, sample_truth(robot, t, 1), poses, instrument, seed=7)
+    problem = problem_of_trials(select_free_parameters(robot), trials)
+    counted, p = CountedProblem(problem, count, np.arange(t)), problem.parameters
+    fit = descend(counted, np.zeros((t, p)), LeastSquares())
+    assert (fit.status == DescentStatus.CONVERGED).mean() >= 0.95
+    assert np.median(count) <= 15
+    one = problem.take(np.array([5]))
+
+    @lru_cache(1)
+    def evaluate(z):
+        return one.linearize(np.array([z]), fit.start.take(np.array([5]))).factor[0]
+
+    found = least_squares(
+        lambda z: evaluate(tuple(z))[:, -1],
+        np.zeros(p),
+        lambda z: evaluate(tuple(z))[:, :-1],
+        method="trf",
+        ftol=1e-6,
+    )
+    assert fit.cost[5] <= 2.0 * found.cost
+    assert count[5] <= found.nfev
 
 
 def test_noise_free_rows_converge_to_rounding_error():

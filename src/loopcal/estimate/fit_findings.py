@@ -26,6 +26,7 @@ STATUS_CODES = {
     DescentStatus.OUT_OF_ITERATIONS: "fit.out-of-iterations",
     DescentStatus.NO_DESCENT: "fit.no-descent",
     DescentStatus.BAD_START: "fit.bad-start",
+    DescentStatus.NO_PROGRESS: "fit.no-progress",
 }
 
 

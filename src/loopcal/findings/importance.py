@@ -19,6 +19,7 @@ SEVERITIES = (
 IMPORTANCE = (
     "fit.bad-start",
     "fit.no-descent",
+    "fit.no-progress",
     "fit.out-of-iterations",
     "gates.poses-unreachable",
     "gates.errors-grew",

@@ -5,14 +5,13 @@ A point is one value for all t trials of a batch: where they are, their sums of 
 linear model there. Two controls of the step exist:
 
     damping    Levenberg-Marquardt: every trial has its own damping, is accepted or rejected on its
-               own, and leaves the batch when it ends (`minimize`)
+               own, and leaves the batch when it ends (`minimize`); chains of full steps shorten the
+               way through narrow valleys (`full_steps`)
     halving    the full step, halved where it does not lower the sum of squares; for problems whose
                full step is right in nearly all cases (`minimize_by_halving`)
 
 A step is negligible, and its trial converged, when it changes the whitened residuals by less than a
 stated share of their norm (the relative offset of Bates and Watts, Technometrics 23, 1981).
-Damping is adapted as by Nielsen: Madsen, Nielsen, Tingleff, "Methods for non-linear least squares
-problems" (2004).
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from loopcal.numerics.damping import PATIENCE, Damping, FixedFactors, Progress
+from loopcal.numerics.full_steps import FullSteps
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ROUNDING = 1e-12
@@ -38,6 +39,7 @@ class DescentStatus(IntEnum):
     NO_DESCENT = 2
     BAD_START = 3
     RUNNING = 4
+    NO_PROGRESS = 5
 
 
 class Point(Protocol):
@@ -58,53 +60,13 @@ class Point(Protocol):
 
 
 class Step(Protocol):
-    """A proposed step of some trials."""
+    """A proposed step of some trials; with `full_length` (a,) of the undamped step and `predicted`
+    (a,), the decrease by the linear model, where chains of full steps are tried.
+    """
 
     def take(self, trials: np.ndarray) -> Self:
         """Return some trials."""
         ...
-
-
-class Damping:
-    """Levenberg-Marquardt damping of t trials by Nielsen's rule: working memory of one iteration.
-
-    Parameters
-    ----------
-    first : (t,) damping of the first step.
-    floor : (t,) damping after the first rejected step, at least.
-    """
-
-    value: FloatArray
-    floor: FloatArray
-    growth: FloatArray
-
-    def __init__(self, first: FloatArray, floor: FloatArray) -> None:
-        self.value, self.floor = np.array(first), floor
-        self.growth = np.full(len(self.value), 2.0)
-
-    def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
-        """Lower the damping after a good step; raise it ever faster after rejected ones.
-
-        `ratio` (a,) is the decrease over the predicted one.
-        """
-        less = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
-        more = np.maximum(self.value[trials] * self.growth[trials], self.floor[trials])
-        self.value[trials] = np.where(accepted, self.value[trials] * less, more)
-        self.growth[trials] = np.where(accepted, 2.0, 2.0 * self.growth[trials])
-
-
-class FixedFactors:
-    """Damping that is divided by ten after an accepted step and multiplied by ten otherwise."""
-
-    value: FloatArray
-
-    def __init__(self, first: FloatArray) -> None:
-        self.value = np.array(first)
-
-    def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
-        """Adapt the damping of some trials."""
-        del ratio
-        self.value[trials] *= np.where(accepted, 0.1, 10.0)
 
 
 class Model(Protocol):
@@ -130,6 +92,10 @@ class Model(Protocol):
         """Return which candidates are accepted (a,), and decrease over predicted decrease (a,)."""
         ...
 
+    def objective(self, point: Any) -> FloatArray:
+        """Return what is minimized (a,), the sum of squares with penalties."""
+        ...
+
     def ending(self, point: Any, step: Any, candidate: Any, accepted: BoolArray) -> IntArray:
         """Return the status (a,) of every trial after this step, RUNNING where it goes on."""
         ...
@@ -149,6 +115,86 @@ class Minimum:
     iterations: IntArray
 
 
+class _Run:
+    """One iteration over all trials: working memory of `minimize`."""
+
+    def __init__(self, model: Model, point: Any, damping: Damping | FixedFactors) -> None:
+        t = len(point.cost)
+        good = np.isfinite(point.cost)
+        self.model, self.point, self.damping = model, point, damping
+        self.status = np.where(good, DescentStatus.RUNNING, DescentStatus.BAD_START).astype(int)
+        self.taken = np.zeros(t, dtype=np.int64)
+        self.chains = FullSteps(t, isinstance(damping, Damping))
+        self.progress = Progress(t)
+
+    def list_running(self) -> IntArray:
+        """Return the trials (a,) that go on."""
+        return np.flatnonzero(self.status == DescentStatus.RUNNING)
+
+    def accept_chains(self) -> bool:
+        """Move trials to the lower points that chains of full steps reached; return whether any."""
+        if not self.chains.is_ahead.any():
+            return False
+        arrived, lower = self.chains.find_arrived(self.model)
+        if not arrived.size:
+            return False
+        self.point = self.point.put(arrived, lower)
+        self.damping.release(arrived)
+        self.taken[arrived] += 1
+        return True
+
+    def propose(self, active: IntArray) -> tuple[IntArray, Any, Any]:
+        """Return the trials (a,) that go on, their points and steps; end those that converged."""
+        damping = self.damping.value[active]
+        self.chains.start_due(self.point, active, damping)
+        current = self.chains.replace_points(self.point.take(active), active)
+        damping = np.where(self.chains.is_ahead[active], 0.0, damping)
+        step = self.model.propose(current, damping)
+        is_last = ~self.chains.is_away(active) & self.model.is_negligible(current, step)
+        if is_last.any():
+            last, going = np.flatnonzero(is_last), np.flatnonzero(~is_last)
+            self.chains.is_ahead[active[last]] = False
+            self.status[active[last]] = DescentStatus.CONVERGED
+            self.taken[active[last]] += 1
+            finished = self.model.finish(current.take(last), step.take(last))
+            self.point = self.point.put(active[last], finished)
+            active, current, step = active[going], current.take(going), step.take(going)
+        return active, current, step
+
+    def evaluate(self, active: IntArray, current: Any, step: Any, round_number: int) -> bool:
+        """Evaluate steps of trials (a,) and take those that are accepted; return whether any."""
+        model, chains, reference = self.model, self.chains, current
+        candidate = model.evaluate(current, step, active)
+        ahead = chains.is_ahead[active]
+        if ahead.any():
+            reference, step = self.point.take(active), chains.expect(step, active)
+        accepted, ratio = model.judge(reference, step, candidate)
+        status = model.ending(reference, step, candidate, accepted)
+        was_full = self.damping.value[active] == 0.0
+        single = np.flatnonzero(~ahead)
+        self.damping.adapt(active[single], accepted[single], ratio[single])
+        self.status[active] = np.where(ahead, DescentStatus.RUNNING, status)
+        if chains.is_enabled:
+            chains.record(self.point, step, candidate, active, accepted, ratio, was_full)
+            if round_number >= PATIENCE:
+                finite = np.isfinite(candidate.cost)[single]
+                self._end_stalled(active[single], finite, reference.take(single), step.take(single))
+        is_taken = accepted & ~ahead
+        if not is_taken.any():
+            return False
+        moved = active[is_taken]
+        self.taken[moved] += 1
+        self.point = self.point.put(moved, candidate.take(np.flatnonzero(is_taken)))
+        return True
+
+    def _end_stalled(self, trials: IntArray, is_finite: BoolArray, point: Any, step: Any) -> None:
+        """End trials (a,) that made no progress for too long."""
+        measures = self.model.objective(point), step.full_length, self.damping.value[trials]
+        stalled = self.progress.find_stalled(trials, is_finite, *measures)
+        running = self.status[trials] == DescentStatus.RUNNING
+        self.status[trials[stalled & running]] = DescentStatus.NO_PROGRESS
+
+
 def minimize(
     model: Model,
     point: Any,
@@ -160,7 +206,9 @@ def minimize(
 
     Parameters
     ----------
-    model : rules of the problem. point : the start of all trials. damping : of the steps.
+    model : rules of the problem. point : the start of all trials.
+    damping : of the steps. With `Damping`, chains of full steps are tried, see
+        `loopcal.numerics.full_steps`, and trials that make no progress end, see `Progress`.
     iterations : evaluations after the first, at most.
     observe : called with the points after every evaluation by which one of them moved.
 
@@ -168,37 +216,20 @@ def minimize(
     -------
     Minimum; a trial that fails is marked in `status` and never stops the others.
     """
-    good = np.isfinite(point.cost)
-    status = np.where(good, DescentStatus.RUNNING, DescentStatus.BAD_START).astype(np.int64)
-    taken = np.zeros(len(status), dtype=np.int64)
+    run = _Run(model, point, damping)
     for i in range(iterations + 1):
-        active = np.flatnonzero(status == DescentStatus.RUNNING)
+        if run.accept_chains():
+            observe(run.point)
+        active = run.list_running()
         if not active.size:
             break
-        current = point.take(active)
-        step = model.propose(current, damping.value[active])
-        is_last = model.is_negligible(current, step)
-        if is_last.any():
-            last, going = np.flatnonzero(is_last), np.flatnonzero(~is_last)
-            status[active[last]] = DescentStatus.CONVERGED
-            taken[active[last]] += 1
-            point = point.put(active[last], model.finish(current.take(last), step.take(last)))
-            if not going.size:
-                break
-            active, current, step = active[going], current.take(going), step.take(going)
-        if i == iterations:
+        active, current, step = run.propose(active)
+        if not active.size or i == iterations:
             break
-        candidate = model.evaluate(current, step, active)
-        accepted, ratio = model.judge(current, step, candidate)
-        damping.adapt(active, accepted, ratio)
-        status[active] = model.ending(current, step, candidate, accepted)
-        if accepted.any():
-            moved = active[accepted]
-            taken[moved] += 1
-            point = point.put(moved, candidate.take(np.flatnonzero(accepted)))
-            observe(point)
-    status[status == DescentStatus.RUNNING] = DescentStatus.OUT_OF_ITERATIONS
-    return Minimum(point, status, taken)
+        if run.evaluate(active, current, step, i):
+            observe(run.point)
+    run.status[run.list_running()] = DescentStatus.OUT_OF_ITERATIONS
+    return Minimum(run.point, run.status, run.taken)
 
 
 @dataclass(frozen=True)

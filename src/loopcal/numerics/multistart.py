@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
+from loopcal.numerics.damping import FixedFactors
+from loopcal.numerics.gauss_newton import DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -115,6 +116,10 @@ class _Descent:
         """Accept every decrease."""
         del step
         return candidate.cost < point.cost, np.ones(len(point.cost))
+
+    def objective(self, point: _Point) -> FloatArray:
+        """Return the sum of squares."""
+        return point.cost
 
     def ending(
         self, point: _Point, step: _Step, candidate: _Point, accepted: BoolArray

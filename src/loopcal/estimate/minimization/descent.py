@@ -4,7 +4,8 @@
 At every accepted point the whitened, scaled rows are one triangular factor and that factor one
 decomposition. The first step tried is the full one to the filtered solution for the TOTAL deviation
 z from nominal. Where it does not lower the sum of squares plus penalty, Levenberg-Marquardt damping
-shortens it (`filtered_step`). See docs/theory/estimation.md.
+shortens it (`filtered_step`). A trial ends without a solution where it makes no progress. See
+docs/theory/identification.md.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.penalties import Method, decompose_for
 from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
 from loopcal.measure.array_checks import check_number, check_type
+from loopcal.numerics.damping import Damping
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
-from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
+from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -33,6 +35,9 @@ ROUNDING_STEP, SMALL_STEP, SHORTEST_STEP = 1e-6, 1e-3, 1e-9
 """Lengths in tolerances, relative to 1 + |z|. A full step below ROUNDING_STEP that brings no
 decrease has met rounding: the trial converged. So has one that was damped below SHORTEST_STEP
 without a decrease, if its full step is below SMALL_STEP."""
+
+MOST_ITERATIONS = 1000
+"""Evaluations of the rows: far more than fits need, since those without progress end early."""
 
 FIRST_DAMPING = 1e-6
 """Damping after the first rejected step, in units of the largest squared singular value."""
@@ -114,7 +119,7 @@ class StepControl:
     EstimationError : a setting is out of its range.
     """
 
-    iterations: int = 50
+    iterations: int = MOST_ITERATIONS
     relative: float = 1e-6
     absolute: float = 1e-12
     damping: float = 0.0
@@ -245,11 +250,13 @@ class _Point(TrialBatch):
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """The linearization at proposed deviations; decomposed where it is accepted."""
+    """The linearization at proposed deviations, cost (a,) infinite where it is not finite;
+    decomposed where it is needed.
+    """
 
     model: _FilteredDescent
     linearized: Linearization
-    is_valid: BoolArray
+    cost: FloatArray
 
     def take(self, trials: IntArray) -> _Point:
         """Return the points of some trials."""
@@ -292,16 +299,14 @@ class _FilteredDescent:
         """Linearize at the deviations of the steps."""
         linearized = self.problem.take(trials).linearize(step.deviation, point.start)
         good = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
-        return _Candidate(self, linearized, good)
+        return _Candidate(self, linearized, np.where(good, linearized.cost, np.inf))
 
     def judge(
         self, point: _Point, step: FilteredStep, candidate: _Candidate
     ) -> tuple[BoolArray, FloatArray]:
         """Accept steps that bring a share of the decrease that was predicted."""
-        decomposition, penalty = point.decomposition, point.penalty
-        before = point.cost + penalize(decomposition, penalty, point.z)
-        cost = np.where(candidate.is_valid, candidate.linearized.cost, np.inf)
-        after = cost + penalize(decomposition, penalty, step.deviation)
+        before = self.objective(point)
+        after = candidate.cost + penalize(point.decomposition, point.penalty, step.deviation)
         gained = before - after + ROUNDING * before
         # a truncated direction on its way back to nominal may cost something: up to twice what was
         # predicted
@@ -309,11 +314,15 @@ class _FilteredDescent:
         smallest = np.finfo(np.float64).tiny
         return gained >= needed, gained / np.maximum(np.abs(step.predicted), smallest)
 
+    def objective(self, point: _Point) -> FloatArray:
+        """Return the sum of squares plus penalty."""
+        return point.cost + penalize(point.decomposition, point.penalty, point.z)
+
     def ending(
         self, point: _Point, step: FilteredStep, candidate: _Candidate, accepted: BoolArray
     ) -> IntArray:
         """End trials that met rounding, or whose steps became too short."""
-        spread, good = point.spread, candidate.is_valid
+        spread, good = point.spread, np.isfinite(candidate.cost)
         met_rounding = good & (step.full_length <= ROUNDING_STEP * spread)
         is_stuck = ~accepted & (met_rounding | (step.length <= SHORTEST_STEP * spread))
         converged = good & (step.full_length <= SMALL_STEP * spread)

@@ -24,8 +24,9 @@ from loopcal.mechanism import (
     inverse_trials,
     read_coordinates,
 )
+from loopcal.numerics.damping import FixedFactors
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
+from loopcal.numerics.gauss_newton import DescentStatus, minimize
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
