@@ -76,7 +76,7 @@ def test_correct_tolerances_are_inflated_little_and_at_no_cost():
     def error(fit):
         return np.sqrt(np.mean((fit.values - measured.truth) ** 2))
 
-    assert error(result) < 1.01 * error(held)
+    assert error(result) < 1.02 * error(held)
 
 
 @pytest.mark.parametrize("narrow", [1.4, 1.7])
@@ -91,7 +91,7 @@ def test_slightly_narrow_tolerances_keep_the_coverage_of_parameters(narrow):
         return np.mean(inside)
 
     assert cover(MAP()) < 0.90
-    assert cover(None) > 0.93
+    assert cover(None) > 0.92  # 93 % up to the error of 40 fits
 
 
 @pytest.mark.parametrize("narrow", [3.0, 10.0])

@@ -6,11 +6,11 @@ many trials at once.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.fit_descent import descend_once, descend_to_prior, get_method, repeat_trials
 from loopcal.estimate.fit_findings import report_divergence, report_equations, report_weights
 from loopcal.estimate.fit_input import (
     check_count,
@@ -31,13 +31,12 @@ from loopcal.estimate.inference.prior import (
     report_unknown_rows,
 )
 from loopcal.estimate.inference.residual_test import run_residual_test
-from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.regularization import describe_regularization
-from loopcal.estimate.minimization.closure_start import descend_from_closure, report_unused_closure
-from loopcal.estimate.minimization.descent import Descent, descend
-from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
+from loopcal.estimate.minimization.closure_start import report_unused_closure
+from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.nuisance.baseline import fit_setup_before
 from loopcal.estimate.nuisance.estimate import (
     NuisanceEstimate,
@@ -45,7 +44,7 @@ from loopcal.estimate.nuisance.estimate import (
     empty_nuisance_estimate,
     estimate_nuisance,
 )
-from loopcal.estimate.observation_rows import Residuals, linked_blocks
+from loopcal.estimate.observation_rows import Residuals
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.poses.estimate import (
     EstimatedPoses,
@@ -111,7 +110,7 @@ def identify(
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
-    fit, weights, weighted = _descend_weighted(problem, data, z, options)
+    fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(problem, data, z, fit.cost)
     open_poses = find_open_poses(robot.with_values(values), data)
@@ -203,7 +202,8 @@ def identify_trials(
     values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
     method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
-    fit = _descend(problem, z, None, replace(options, method=method))
+    options = replace(options, method=method)
+    fit = repeat_trials(problem, descend_once(problem, z, None, options), options, free)
     return IdentifiedTrials(
         free.values(fit.deviation),
         fit.status,
@@ -213,31 +213,6 @@ def identify_trials(
         fit.decomposition,
         fit.penalty,
     )
-
-
-def _descend(problem: Problem, z: FloatArray, start: Start | None, options: FitOptions) -> Descent:
-    """Descend from deviations z (t, p); the history includes steps of the linearized closure."""
-    method, control, tolerance = _method(options), options.control, options.rank_tolerance
-    with_prior = problem if options.prior is None else options.prior.added(problem)
-    if options.begin == "kinematics":
-        return descend(with_prior, z, method, control, tolerance, start)
-    z, first = descend_from_closure(problem, z, method, control, tolerance)
-    fit = descend(with_prior, z, method, control, tolerance, start)
-    return fit if first is None else fit.after(first)
-
-
-def _descend_weighted(
-    problem: Problem, data: Measurements, z: FloatArray, options: FitOptions
-) -> tuple[Descent, FloatArray, Problem]:
-    """Descend with or without a loss; return also the weight (n,) of each pose and the problem with
-    these weights.
-    """
-    run: Run = partial(_descend, options=options)
-    if options.loss is None:
-        return run(problem, z, None), np.ones(data.n_poses), problem
-    estimated, blocks = options.noise == "estimated", linked_blocks(data)
-    robust = descend_robustly(problem, blocks, options.loss, z, estimated, run, options.prior)
-    return robust.fit, robust.weight, robust.problem
 
 
 def _solve_unweighted(problem: Problem, weighted: Problem, fit: Descent) -> PoseSolution:
@@ -261,11 +236,13 @@ def _assemble(
     """
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
     noise, weighs = name_noise(options, data), options.loss is not None
-    is_prior = isinstance(_method(options), MAP)
+    is_prior, method = isinstance(get_method(options), MAP), get_method(options)
     test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged, is_prior)
     solution = _solve_unweighted(problem, weighted, fit)
-    conflict = run_prior_tests(free, fit, _method(options))
-    d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, _method(options))
+    conflict = run_prior_tests(free, fit, method)
+    d, penalty, variance = scale_variances(
+        fit.decomposition, fit.penalty, test, get_method(options)
+    )
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
     has_nuisance = weighted.nuisance is not None
@@ -280,18 +257,22 @@ def _assemble(
     excluded, estimates = tuple(options.excluded_poses), solution.estimates
     poses = None if estimates is None else estimate_poses(estimates, data, excluded)
     history = _record_history(free, fit)
-    regularization = describe_regularization(_method(options), fit.decomposition, fit.penalty)
+    regularization = describe_regularization(method, fit.decomposition, fit.penalty)
     findings = [
         *([] if converged else [history.finding]),
         report_noise(data, robot, test),
-        *report_divergence(free, fit.deviation[0], _method(options), converged),
-        *([conflict.finding] if converged and conflict is not None and conflict.conflict else []),
+        *report_divergence(free, fit.deviation[0], method, converged),
+        *(
+            [conflict.finding]
+            if converged and conflict is not None and conflict.is_reported
+            else []
+        ),
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),
         *_report_closure(problem, options),
         *([] if regularization is None else [regularization.finding]),
-        *report_equations(int(problem.equations[0]), problem.parameters, _method(options)),
+        *report_equations(int(problem.equations[0]), problem.parameters, method),
         *report_weights(data, weights, options.loss),
         *_report_excluded(excluded),
         *_report_poses(problem, corrected, poses),
@@ -326,12 +307,6 @@ def _record_history(free: FreeParameters, fit: Descent) -> History:
     status, steps = DescentStatus(int(fit.status[0])), int(fit.iterations[0])
     values = free.nominal + free.tolerance * fit.deviation_history[:, 0]
     return History(status, steps, fit.cost_history[:, 0], values)
-
-
-def _method(options: FitOptions) -> Method:
-    """Return the method, which `adapt_method` has set."""
-    assert options.method is not None
-    return options.method
 
 
 def _estimate_nuisance(

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit by MAP says about its prior: the tests of the tolerances, and the uncertainty of the
-factors by which they are inflated.
+"""The prior of a fit by MAP: which parts of the tolerances are wider than stated, the tests of the
+tolerances, and the uncertainty of the factors by which they are inflated.
 
 A factor is estimated from the data that are fitted. Its error moves the estimate, by dz / d(log
 factor) times the error of its logarithm, and this is added to the covariance.
@@ -8,29 +8,86 @@ factor) times the error of its logarithm, and this is added to the covariance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.added_covariance import add_covariance
+from loopcal.estimate.methods.component_choice import (
+    ComponentSearch,
+    compute_evidence,
+    estimate_variance_spread,
+    predict,
+    restate,
+)
 from loopcal.estimate.methods.inflated_tolerances import (
+    InflatedTolerances,
+    are_penalized,
     estimate_excess_noise,
     estimate_factor_spread,
 )
 from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
+from loopcal.estimate.methods.tolerance_components import (
+    ToleranceComponent,
+    compute_prior_covariance,
+    list_components,
+)
 from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
+from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray
+
+ROUNDS = 4
+"""Fits at most until the chosen components are those of the fit."""
+
+SAME_FACTOR = 0.05
+"""Relative change of a component's factor below which the fit is not repeated."""
+
+
+def choose_methods(
+    free: FreeParameters, fit: Descent, method: Method, trials: Sequence[int] | None = None
+) -> dict[int, MAP]:
+    """Return the method with which a trial must be fitted again, by trial.
+
+    These are trials whose data ask for other components of the tolerances than those of `method`.
+
+    Parameters
+    ----------
+    free : the parameters. fit : of t trials by `method`. trials : that are asked, default all.
+    """
+    if not (isinstance(method, MAP) and isinstance(method.inflation, InflatedTolerances)):
+        return {}
+    candidates = list_components(free, method.inflation.by)
+    converged = np.flatnonzero(fit.status == DescentStatus.CONVERGED)
+    if not candidates or not len(converged):
+        return {}
+    chosen: dict[int, MAP] = {}
+    rows = _divide(fit.decomposition, method)
+    for i in converged if method.components else _screen(rows, method, candidates, converged):
+        unpenalized = method.unpenalized(len(free))
+        one = rows.take(np.array([i]))
+        components = ComponentSearch(one, method.correlation, unpenalized, candidates).choose()
+        if not _are_same(components, method.components):
+            chosen[int(i)] = replace(method, components=components)
+    return chosen
 
 
 def run_prior_tests(free: FreeParameters, fit: Descent, method: Method) -> PriorConflict | None:
     """Return the tests of the prior, where the method uses one."""
     if not isinstance(method, MAP):
         return None
-    sigma = float(method.sigma(fit.decomposition)[0])
+    rows, p = fit.decomposition, len(free)
+    if method.components:
+        stated = compute_prior_covariance(p, method.correlation, ())
+        rows = restate(rows, stated, method.unpenalized(p))
     inflation = float(method.compute_inflation(fit.decomposition)[0])
-    return assess_prior_conflict(free, fit.decomposition, inflation, sigma, fit.deviation[0])
+    sigma = float(method.sigma(fit.decomposition)[0])
+    return assess_prior_conflict(free, rows, inflation, sigma, fit.deviation[0], method.components)
 
 
 def add_factor_uncertainty(result: Identification, fit: Descent) -> Identification:
@@ -42,24 +99,86 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     method = result.method
     if not (isinstance(method, MAP) and callable(method.inflation) and result.converged):
         return result
-    factor = method.compute_inflation(fit.decomposition)
-    if factor[0] <= 1.0:
+    factor = float(method.compute_inflation(fit.decomposition)[0])
+    if factor <= 1.0 and not method.components:
         return result
-    root = differentiate_by_factor(fit, method) * result.tolerance
-    finding = report_finding("prior.inflation", factor=float(factor[0]))
-    return add_covariance(result, root[:, None], np.inf, finding)
+    changes = [_change_by_factor(fit, method)] if factor > 1.0 else []
+    changes += _change_by_components(fit, method, factor)
+    root = np.stack(changes, axis=1) * result.tolerance[:, None]
+    parts = tuple(component.to_row(result.names) for component in method.components)
+    finding = report_finding("prior.inflation", factor=factor, parts=parts)
+    return add_covariance(result, root, np.inf, finding)
 
 
-def differentiate_by_factor(fit: Descent, method: MAP) -> FloatArray:
+def _change_by_factor(fit: Descent, method: MAP) -> FloatArray:
     """Return the change (p,) of the estimate, in tolerances, by one standard deviation of the
     logarithm of the factor on all tolerances.
 
     In the coordinates y of the decomposition it is 2 (1 - f_i) y_i.
     """
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
-    divided = d.divided(method.sigma(d))
-    divided = divided.divided(estimate_excess_noise(divided))
-    spread = estimate_factor_spread(divided, method.compute_inflation(d))
+    spread = estimate_factor_spread(_divide(d, method), method.compute_inflation(d))
     change = 2.0 * (1.0 - d.filter_factors(penalty)) * d.solution(fit.penalty)
     change = np.where(penalty > 0.0, change, 0.0)
     return np.asarray(d.deviation(change * spread[:, None])[0])
+
+
+def _change_by_components(fit: Descent, method: MAP, factor: float) -> list[FloatArray]:
+    """Return the change (p,) of the estimate, in tolerances, by one standard deviation of the
+    logarithm of the factor of each component.
+
+    With the covariance S of the prior z = S h, and a variance v of E changes it by dz / dv = (1 - S
+    Q) E E'h (`component_choice`), v = factor^2 - 1 of the component.
+    """
+    rows, p = _divide(fit.decomposition, method), len(fit.deviation[0])
+    data = predict(rows, np.array([factor]))
+    Q, h = data.information[0], data.score[0]
+    S = factor**2 * compute_prior_covariance(p, method.correlation, method.components)
+    changes = []
+    for component in method.components:
+        others = tuple(c for c in method.components if c is not component)
+        stated = compute_prior_covariance(p, method.correlation, others)
+        alone = restate(rows, stated, method.unpenalized(p))
+        variance = factor**2 * component.variance
+        spread = estimate_variance_spread(predict(alone, np.array([factor])), component, variance)
+        E = component.columns(p)
+        slope = E @ (E.T @ h)
+        change = (slope - S @ (Q @ slope)) * 2.0 * (1.0 + variance) * spread
+        # parameters without a tolerance follow the others
+        y = np.where(are_penalized(rows), rows.coordinates(change[None]), 0.0)
+        changes.append(np.asarray(rows.deviation(y)[0]))
+    return changes
+
+
+def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:
+    """Return the decomposition of the rows divided by the noise that they show."""
+    divided = decomposition.divided(method.sigma(decomposition))
+    return divided.divided(estimate_excess_noise(divided))
+
+
+def _screen(
+    rows: Decomposition,
+    method: MAP,
+    candidates: tuple[ToleranceComponent, ...],
+    converged: np.ndarray,
+) -> np.ndarray:
+    """Return the converged trials in which any component has more evidence than none, besides the
+    stated or the inflated tolerances.
+    """
+    assert isinstance(method.inflation, InflatedTolerances)
+    rows = rows.take(converged)
+    factor = method.inflation(rows)
+    evidence = compute_evidence(predict(rows, np.ones(len(factor))), candidates)
+    if (factor > 1.0).any():
+        evidence = np.maximum(evidence, compute_evidence(predict(rows, factor), candidates))
+    return np.asarray(converged[(evidence > 0.0).any(axis=1)])
+
+
+def _are_same(
+    first: tuple[ToleranceComponent, ...], second: tuple[ToleranceComponent, ...]
+) -> bool:
+    """Return whether components are the same and their factors nearly so."""
+    one, other = ({(c.kind, c.places): c.factor for c in parts} for parts in (first, second))
+    return one.keys() == other.keys() and all(
+        abs(factor / other[key] - 1.0) <= SAME_FACTOR for key, factor in one.items()
+    )

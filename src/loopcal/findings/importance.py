@@ -39,6 +39,7 @@ IMPORTANCE = (
     "prior.machine-changed",
     "prior.tolerances-inflated",
     "prior.tolerances-too-narrow",
+    "prior.components-inflated",
     "fit.beyond-tolerance",
     "model.no-expected-gain",
     "model.nothing-gained",

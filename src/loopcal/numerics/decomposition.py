@@ -152,6 +152,15 @@ class Decomposition(TrialBatch):
         cut = np.where(self.used, 0.0, s).max(axis=1, initial=0.0)
         return np.divide(kept, cut, out=np.full(len(s), np.inf), where=cut > 0.0)
 
+    @property
+    def inverse(self) -> FloatArray:
+        """(t, p, p) inverse of V."""
+        return self.directions.swapaxes(-1, -2) if self.dual is None else self.dual
+
+    def with_dual(self) -> Decomposition:
+        """Return this decomposition with its dual stated, as one of trials of oblique V is."""
+        return replace(self, dual=self.inverse)
+
     def coordinates(self, deviation: FloatArray) -> FloatArray:
         """Return y = V' (z / scale), (t, p), of a deviation z (t, p)."""
         scaled = deviation / self.scale
@@ -287,8 +296,7 @@ class Decomposition(TrialBatch):
 
     def mixed(self, root: FloatArray) -> Decomposition:
         """Return the decomposition for z / scale = root u, where this is the one for u."""
-        inverse = self.directions.swapaxes(-1, -2) if self.dual is None else self.dual
-        dual = np.linalg.solve(root.T, inverse.swapaxes(-1, -2)).swapaxes(-1, -2)
+        dual = np.linalg.solve(root.T, self.inverse.swapaxes(-1, -2)).swapaxes(-1, -2)
         return replace(self, directions=root @ self.directions, dual=dual)
 
     def divided(self, sigma: FloatArray) -> Decomposition:

@@ -14,10 +14,11 @@ that exp(-L/2) is its distribution afterwards. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from loopcal.errors import EstimationError
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
@@ -29,11 +30,11 @@ LARGEST_FACTOR = 1e6
 WIDEST = 30.0
 """Factor on an estimated factor up to which its distribution is integrated."""
 
-GRID = np.log(LARGEST_FACTOR) * np.linspace(0.0, 1.0, 40) ** 1.5
+GRID = np.log(LARGEST_FACTOR) * np.linspace(0.0, 1.0, 30) ** 1.5
 """Logarithms of factors among which the minimum is bracketed."""
 
-NEWTON_STEPS = 3
-"""Steps that refine a minimum inside its bracket; the fifth changes the factor by rounding only."""
+NEWTON_STEPS = 6
+"""Steps at most that refine a minimum inside its bracket; four are enough but for rounding."""
 
 By = Literal["auto", "global", "groups", "heavy-tailed"]
 """What may get a factor of its own; see `InflatedTolerances`."""
@@ -61,6 +62,13 @@ class InflatedTolerances:
     """
 
     by: By = "auto"
+
+    def __post_init__(self) -> None:
+        if self.by not in get_args(By):
+            raise EstimationError(
+                f"inflated tolerances by {self.by!r}; give 'global', 'groups', 'heavy-tailed' or "
+                "'auto'"
+            )
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return the factor (t,) on all tolerances."""
@@ -92,7 +100,9 @@ def find_most_probable_factor(decomposition: Decomposition) -> FloatArray:
         # the minimum is on the side towards which L falls
         low, high = np.where(slope < 0.0, x, low), np.where(slope > 0.0, x, high)
         step = slope / np.where(curvature > 0.0, curvature, np.inf)
-        x = np.where(curvature > 0.0, np.clip(x - step, low, high), 0.5 * (low + high))
+        before, x = x, np.where(curvature > 0.0, np.clip(x - step, low, high), 0.5 * (low + high))
+        if np.abs(x - before).max() < 1e-6:  # the error is the square of this
+            break
     return np.asarray(np.exp(0.5 * x))
 
 

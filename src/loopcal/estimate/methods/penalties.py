@@ -28,6 +28,11 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
 from loopcal.estimate.methods.inflated_tolerances import InflatedTolerances
+from loopcal.estimate.methods.tolerance_components import (
+    ToleranceComponent,
+    compute_prior_covariance,
+    compute_symmetric_root,
+)
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -201,6 +206,8 @@ class MAP(Method):
         can explain, so that data and prior get their right weights.
     correlation : (p, p) of the deviations from nominal; `identify` enters the one of the common
         errors that the robot states. None takes the tolerances as independent.
+    components : parts of the tolerances that are wider than stated; `identify` enters those that
+        `InflatedTolerances` chose.
 
     Raises
     ------
@@ -211,6 +218,7 @@ class MAP(Method):
     free: tuple[bool, ...] = ()
     noise: Literal["given", "estimated"] = "given"
     correlation: FloatArray | None = field(default=None, repr=False, compare=False)
+    components: tuple[ToleranceComponent, ...] = ()
 
     def __post_init__(self) -> None:
         if not callable(self.inflation) and not 0.0 < self.inflation < np.inf:
@@ -228,11 +236,11 @@ class MAP(Method):
         return np.array(self.free) if any(self.free) else None
 
     def root(self, parameters: int) -> FloatArray | None:
-        """Return the symmetric root of the correlation."""
-        if self.correlation is None:
+        """Return the symmetric root of the covariance of the deviations, in tolerances."""
+        if self.correlation is None and not self.components:
             return None
-        square, vectors = np.linalg.eigh(self.correlation)
-        return np.asarray((vectors * np.sqrt(square)) @ vectors.T)
+        covariance = compute_prior_covariance(parameters, self.correlation, self.components)
+        return compute_symmetric_root(covariance)
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return sigma^2 / inflation^2, with sigma = 1 where the noise is given."""

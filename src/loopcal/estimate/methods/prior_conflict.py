@@ -27,6 +27,7 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.inflated_tolerances import are_penalized, estimate_excess_noise
+from loopcal.estimate.methods.tolerance_components import ToleranceComponent
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
@@ -74,6 +75,8 @@ class PriorConflict:
     direction, parameter : the tests of the worst direction and of the worst parameter.
     joint_p_value : probability that the most significant of the three tests is more significant.
     inflation : factor by which all tolerances were inflated for the estimate.
+    components : parts of them that were inflated further.
+    component_rows : kind, name, names of the parameters and factor of each.
     farthest : names of the parameters farthest from nominal, and their deviations in tolerances.
     """
 
@@ -85,6 +88,7 @@ class PriorConflict:
         "worst_parameter": "parameter",
         "joint_p_value": "joint_p_value",
         "spread": "inflation",
+        "components": "component_rows",
         "conflict": "conflict",
         "farthest": "farthest",
         "sentence": "sentence",
@@ -98,6 +102,8 @@ class PriorConflict:
     joint_p_value: float
     inflation: float
     farthest: tuple[tuple[str, float], ...]
+    components: tuple[ToleranceComponent, ...]
+    component_rows: tuple[dict[str, object], ...]
 
     @property
     def conflict(self) -> bool:
@@ -109,9 +115,13 @@ class PriorConflict:
         """Whether the tolerances agree with the data, and what the method did."""
         if self.degrees < 0.5:
             return report_finding("prior.untested")
+        inflated, worst = self.inflation > 1.0 or bool(self.components), self._worst
+        if not self.conflict and self.components:
+            return report_finding(
+                "prior.components-inflated", parts=self.component_rows, factor=self.inflation
+            )
         if not self.conflict:
             return report_finding("prior.consistent", p_value=self.joint_p_value, level=LEVEL)
-        inflated, worst = self.inflation > 1.0, self._worst
         return report_finding(
             "prior.tolerances-inflated" if inflated else "prior.tolerances-too-narrow",
             ratio=float(np.sqrt(self.statistic / self.degrees)),
@@ -119,10 +129,16 @@ class PriorConflict:
             deviations=tuple(deviation for _, deviation in self.farthest),
             worst=() if worst is None else worst.names,
             worst_statistic=0.0 if worst is None else worst.statistic,
-            inflation=self.inflation,
+            factor=self.inflation,
+            parts=self.component_rows,
             p_value=self.joint_p_value,
             level=LEVEL,
         )
+
+    @property
+    def is_reported(self) -> bool:
+        """Whether the finding says more than that the tolerances agree with the data."""
+        return self.conflict or bool(self.components)
 
     @property
     def _worst(self) -> LargestDeviation | None:
@@ -142,6 +158,7 @@ def assess_prior_conflict(
     inflation: float,
     sigma: float,
     deviation: FloatArray,
+    components: tuple[ToleranceComponent, ...] = (),
 ) -> PriorConflict:
     """Test the prior of a fit (t = 1).
 
@@ -150,13 +167,14 @@ def assess_prior_conflict(
     free : the parameters. decomposition : of the fit, for the stated tolerances.
     inflation : factor by which the method inflated all of them.
     sigma : factor on the stated sigmas. deviation : (p,) of the estimate, in tolerances.
+    components : parts of the tolerances that the method inflated further.
     """
     scaled = decomposition.divided(np.full(1, sigma))
     scaled = scaled.divided(estimate_excess_noise(scaled))
     statistic, degrees = (float(value[0]) for value in compute_prior_statistic(scaled))
     p_value = float(compute_chi_square_tail(degrees, statistic))
     direction, parameter = _test_directions(free, scaled), _test_parameters(free, scaled)
-    order = np.argsort(-np.abs(deviation))
+    order, names = np.argsort(-np.abs(deviation)), free.names
     far = [i for i in order if abs(deviation[i]) > FAR and not free.assumed[i]][:NAMED]
     return PriorConflict(
         statistic=statistic,
@@ -166,7 +184,9 @@ def assess_prior_conflict(
         parameter=parameter,
         joint_p_value=_correct(min(p_value, direction.p_value, parameter.p_value), 3),
         inflation=inflation,
-        farthest=tuple((free.names[i], float(deviation[i])) for i in far),
+        farthest=tuple((names[i], float(deviation[i])) for i in far),
+        components=components,
+        component_rows=tuple(component.to_row(names) for component in components),
     )
 
 
@@ -192,7 +212,8 @@ def _test_directions(free: FreeParameters, d: Decomposition) -> LargestDeviation
     worst = int(np.argmax(values))
     part = np.where(free.assumed, 0.0, np.abs(d.scale * d.directions[0][:, worst]))
     order = [i for i in np.argsort(-part) if part[i] > MAIN_PART * part.max()]
-    return _largest(values, testable, tuple(free.names[i] for i in order))
+    names = free.names
+    return _largest(values, testable, tuple(names[i] for i in order))
 
 
 def _test_parameters(free: FreeParameters, d: Decomposition) -> LargestDeviation:

@@ -174,6 +174,17 @@ class Descent:
             cost_history=np.concatenate([first.cost_history, self.cost_history[1:]]),
         )
 
+    def put(self, trials: IntArray, other: Descent) -> Descent:
+        """Return this descent with where some trials ended taken from another one; start and
+        history stay.
+        """
+        names = ("deviation", "penalty", "cost", "status", "iterations")
+        arrays = {name: np.array(getattr(self, name)) for name in names}
+        for name, array in arrays.items():
+            array[trials] = getattr(other, name)
+        decomposition = self.decomposition.with_dual().put(trials, other.decomposition.with_dual())
+        return replace(self, **arrays, decomposition=decomposition)
+
 
 def descend(
     problem: LeastSquaresProblem,

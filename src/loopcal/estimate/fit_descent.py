@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The descents of one fit: with or without a loss, from the closure or the kinematics, and again
+where the data ask for other tolerances than those of the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.linearization import Start
+from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.closure_start import descend_from_closure
+from loopcal.estimate.minimization.descent import Descent, descend
+from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
+from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.prior_inflation import ROUNDS, choose_methods
+from loopcal.estimate.problem import Problem
+from loopcal.measure import Measurements
+from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.typing import FloatArray
+
+
+def descend_once(
+    problem: Problem, z: FloatArray, start: Start | None, options: FitOptions
+) -> Descent:
+    """Descend from deviations z (t, p); the history includes steps of the linearized closure."""
+    method, control, tolerance = get_method(options), options.control, options.rank_tolerance
+    with_prior = problem if options.prior is None else options.prior.added(problem)
+    if options.begin == "kinematics":
+        return descend(with_prior, z, method, control, tolerance, start)
+    z, first = descend_from_closure(problem, z, method, control, tolerance)
+    fit = descend(with_prior, z, method, control, tolerance, start)
+    return fit if first is None else fit.after(first)
+
+
+def descend_weighted(
+    problem: Problem, data: Measurements, z: FloatArray, options: FitOptions
+) -> tuple[Descent, FloatArray, Problem]:
+    """Descend with or without a loss; return also the weight (n,) of each pose and the problem with
+    these weights.
+    """
+    run: Run = partial(descend_once, options=options)
+    if options.loss is None:
+        return run(problem, z, None), np.ones(data.n_poses), problem
+    estimated, blocks = options.noise == "estimated", linked_blocks(data)
+    robust = descend_robustly(problem, blocks, options.loss, z, estimated, run, options.prior)
+    return robust.fit, robust.weight, robust.problem
+
+
+def descend_to_prior(
+    problem: Problem, data: Measurements, z: FloatArray, options: FitOptions, free: FreeParameters
+) -> tuple[Descent, FloatArray, Problem, FitOptions]:
+    """Descend, and again as long as the data ask for other components of the tolerances; return
+    also the options with these.
+    """
+    fit, weights, weighted = descend_weighted(problem, data, z, options)
+    for _ in range(ROUNDS):
+        method = choose_methods(free, fit, get_method(options)).get(0)
+        if method is None:
+            break
+        other = replace(options, method=method)
+        again, new_weights, new_problem = descend_weighted(problem, data, fit.deviation, other)
+        if again.status[0] != DescentStatus.CONVERGED:
+            break
+        fit, weights, weighted, options = again.after(fit), new_weights, new_problem, other
+    return fit, weights, weighted, options
+
+
+def repeat_trials(
+    problem: Problem, fit: Descent, options: FitOptions, free: FreeParameters
+) -> Descent:
+    """Descend again in trials whose data ask for components of the tolerances."""
+    for i, method in choose_methods(free, fit, get_method(options)).items():
+        alone, chosen = np.array([i]), replace(options, method=method)
+        own = problem.take(alone)
+        again = descend_once(own, fit.deviation[alone], None, chosen)
+        for _ in range(ROUNDS - 1):
+            other = choose_methods(free, again, get_method(chosen)).get(0)
+            if other is None:
+                break
+            chosen = replace(options, method=other)
+            again = descend_once(own, again.deviation, None, chosen)
+        if again.status[0] == DescentStatus.CONVERGED:
+            fit = fit.put(alone, again)
+    return fit
+
+
+def get_method(options: FitOptions) -> Method:
+    """Return the method, which `adapt_method` has set."""
+    assert options.method is not None
+    return options.method
