@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.component_choice import (

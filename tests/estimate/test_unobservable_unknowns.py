@@ -25,7 +25,7 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.numerics.column_elimination import eliminate_columns
-from loopcal.numerics.decomposition import ROUNDING, without_rounding
+from loopcal.numerics.rounding import ROUNDING, without_rounding
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, noise
 

@@ -240,9 +240,7 @@ def _assemble(
     test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged, is_prior)
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = run_prior_tests(free, fit, method)
-    d, penalty, variance = scale_variances(
-        fit.decomposition, fit.penalty, test, get_method(options)
-    )
+    d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, method)
     plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
     has_nuisance = weighted.nuisance is not None
@@ -262,11 +260,7 @@ def _assemble(
         *([] if converged else [history.finding]),
         report_noise(data, robot, test),
         *report_divergence(free, fit.deviation[0], method, converged),
-        *(
-            [conflict.finding]
-            if converged and conflict is not None and conflict.is_reported
-            else []
-        ),
+        *(conflict.report() if converged and conflict is not None else []),
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),

@@ -41,11 +41,6 @@ NULL_COMPONENT = 1e-8
 (sqrt of rounding).
 """
 
-ROUNDING = 1e-12
-"""Share of the size of its terms below which a sum of a few products is rounding: some thousand
-units of the last place.
-"""
-
 
 def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) -> BoolArray:
     """Return which singular values (.., k), largest first, count as nonzero: the rank rule.
@@ -54,23 +49,6 @@ def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) 
     columns.
     """
     return np.asarray(singular_values > tolerance * singular_values[..., :1])
-
-
-def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
-    """Return derivatives with zeros where they are rounding.
-
-    They are rounding where they are at most ROUNDING of the size of the terms whose sum they are.
-    A column that is rounding must be set to zero BEFORE columns are scaled to length one: after
-    that, a few units of the last place look like any other direction and produce an unbounded step.
-
-    Parameters
-    ----------
-    values : any shape. size : of the terms, broadcast to it; with a size of zero, or not finite,
-        values stay.
-    """
-    return np.where(
-        (np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values
-    )
 
 
 @dataclass(frozen=True)

@@ -135,10 +135,9 @@ class PriorConflict:
             level=LEVEL,
         )
 
-    @property
-    def is_reported(self) -> bool:
-        """Whether the finding says more than that the tolerances agree with the data."""
-        return self.conflict or bool(self.components)
+    def report(self) -> list[Finding]:
+        """Return the finding where it says more than that the tolerances agree with the data."""
+        return [self.finding] if self.conflict or self.components else []
 
     @property
     def _worst(self) -> LargestDeviation | None:

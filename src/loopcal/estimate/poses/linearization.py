@@ -31,7 +31,7 @@ from loopcal.mechanism import (
     forward_trials,
     joints_from_readings,
 )
-from loopcal.numerics.decomposition import without_rounding
+from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 

@@ -189,21 +189,16 @@ def contradicted_tolerances(data: Data) -> str:
 
 def inflated_tolerances(data: Data) -> str:
     """Return by which factors tolerances, or parts of them, are inflated."""
-    parts = [_word_part(part) for part in data["parts"]]
-    if data["factor"] > 1.0 or not parts:
-        others = "all other tolerances" if parts else "tolerances"
-        parts.append(fill_template(f"{others} {{factor}} times as wide as stated", **data))
-    return list_names(parts, len(parts))
-
-
-def _word_part(part: Data) -> str:
-    """Return which parameters have wider tolerances."""
     templates = {
         "shift": "a common deviation of {names:list} ({factor} tolerances)",
         "group": "the tolerances of {names:list} {factor} times as wide as stated",
-        "single": "the tolerance of {name} {factor} times as wide as stated",
     }
-    return fill_template(templates[part["kind"]], **part)
+    templates["single"] = templates["group"]
+    parts = [fill_template(templates[part["kind"]], **part) for part in data["parts"]]
+    if data["factor"] > 1.0 or not parts:
+        others = "the others" if parts else "tolerances"
+        parts.append(fill_template(others + " {factor} times as wide as stated", **data))
+    return list_names(parts, len(parts))
 
 
 def strongest_pair(data: Data) -> str:
