@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, without_rounding
+from loopcal.numerics.decomposition import NUISANCE_TOLERANCE
+from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SMALLEST_ROW = 1e-14

@@ -189,16 +189,13 @@ def contradicted_tolerances(data: Data) -> str:
 
 def inflated_tolerances(data: Data) -> str:
     """Return by which factors tolerances, or parts of them, are inflated."""
-    templates = {
-        "shift": "a common deviation of {names:list} ({factor} tolerances)",
-        "group": "the tolerances of {names:list} {factor} times as wide as stated",
-    }
-    templates["single"] = templates["group"]
-    parts = [fill_template(templates[part["kind"]], **part) for part in data["parts"]]
-    if data["factor"] > 1.0 or not parts:
-        others = "the others" if parts else "tolerances"
-        parts.append(fill_template(others + " {factor} times as wide as stated", **data))
-    return list_names(parts, len(parts))
+    wide = "the tolerances of {names:list} {factor} times as wide as stated"
+    shift = "a common deviation of {names:list} ({factor} tolerances)"
+    found = [fill_template(shift if p["kind"] == "shift" else wide, **p) for p in data["parts"]]
+    if data["factor"] > 1.0 or not found:
+        others = "the others" if found else "tolerances"
+        found.append(fill_template(others + " {factor} times as wide as stated", **data))
+    return list_names(found, len(found))
 
 
 def strongest_pair(data: Data) -> str:

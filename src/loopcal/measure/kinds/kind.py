@@ -30,7 +30,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
 from loopcal.measure.kinds.setup_parameters import SetupItem
-from loopcal.numerics.decomposition import without_rounding
+from loopcal.numerics.rounding import without_rounding
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
