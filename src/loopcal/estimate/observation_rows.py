@@ -37,6 +37,8 @@ class ObservationRows:
     poses : (r,) pose that each row observed; (r, links) where rows compare several poses.
     measured : (t | 1, r, c) [SI]. whitener : (t | 1, r, m, m), zero rows for absent components.
     nuisance : (r, u) which nuisance parameters each row uses.
+    offset : (t | 1, r, m), optional; it is added to the whitened residuals, as an error drawn for a
+        resample.
     """
 
     kind: Kind
@@ -44,6 +46,7 @@ class ObservationRows:
     measured: FloatArray
     whitener: FloatArray
     nuisance: IntArray = field(default_factory=_no_nuisance)
+    offset: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if not self.nuisance.size:
@@ -69,18 +72,33 @@ class ObservationRows:
         if len(rows) == len(self.poses):
             return replace(self, poses=place[self.poses])
         parts = (self.measured[:, rows], self.whitener[:, rows], self.nuisance[rows])
-        return ObservationRows(self.kind, place[self.poses[rows]], *parts)
+        offset = None if self.offset is None else self.offset[:, rows]
+        return ObservationRows(self.kind, place[self.poses[rows]], *parts, offset)
 
     def take_trials(self, trials: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return measured values and whiteners of some trials; one set stands for all of them."""
         measured = self.measured if len(self.measured) == 1 else self.measured[trials]
         return measured, self.whitener if len(self.whitener) == 1 else self.whitener[trials]
 
+    def whiten(self, whitener: FloatArray, residual: FloatArray, trials: IntArray) -> FloatArray:
+        """Return whitened residuals (a, r, m) of some trials (a,), with their offset."""
+        white = whiten(whitener, residual)
+        if self.offset is None:
+            return white
+        return white + (self.offset if len(self.offset) == 1 else self.offset[trials])
+
     def weighted(self, weight: FloatArray) -> ObservationRows:
-        """Return the rows with a factor (n,) on each pose's squares; linked poses share it."""
-        linked = np.sqrt(weight)[self.poses_by_link]
-        each = linked.prod(axis=1) ** (1.0 / linked.shape[1])
-        return replace(self, whitener=self.whitener * each[:, None, None])
+        """Return the rows with a factor (n,) or (t, n) on each pose's squares; linked poses share
+        it.
+        """
+        linked = np.sqrt(weight)[..., self.poses_by_link]
+        each = linked.prod(axis=-1) ** (1.0 / linked.shape[-1])
+        return replace(self, whitener=self.whitener * np.atleast_2d(each)[:, :, None, None])
+
+
+def whiten(whitener: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return whitened residuals (.., m) of whiteners (.., m, m) and residuals (.., m)."""
+    return np.matmul(whitener, residual[..., None])[..., 0]
 
 
 class Residuals(NamedTuple):

@@ -33,7 +33,7 @@ from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
 from loopcal.estimate.poses.leverage import spread_rows
-from loopcal.estimate.poses.linearization import evaluate_rows, whiten
+from loopcal.estimate.poses.linearization import evaluate_rows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.measure import Measurements, list_sensed_joints
@@ -131,11 +131,33 @@ class Problem:
         return other
 
     def weighted(self, weight: FloatArray) -> Problem:
-        """Return the problem with a factor (n,) on each pose's squares, its readings included.
+        """Return the problem with a factor (n,) on each pose's squares, its readings included, or
+        with factors (t, n) of each trial.
 
         A weight of 0 makes the rows of a pose absent.
         """
         return replace(self, rows=tuple(r.weighted(weight) for r in self.rows))
+
+    def resampled(
+        self,
+        weight: FloatArray | None,
+        offset: Sequence[FloatArray] | None,
+        prior_mean: FloatArray,
+    ) -> Problem:
+        """Return the problem of t resamples of its rows (one trial).
+
+        Parameters
+        ----------
+        weight : (t, n) factors on each pose's squares. offset : of every kind (t, r, m), added to
+            the whitened residuals. prior_mean : (t, U) [SI] of the nuisance parameters.
+        """
+        rows = self.rows if weight is None else tuple(r.weighted(weight) for r in self.rows)
+        if offset is not None:
+            rows = tuple(replace(r, offset=o) for r, o in zip(rows, offset, strict=True))
+        nuisance = self.nuisance
+        if nuisance is not None:
+            nuisance = replace(nuisance, prior_mean=prior_mean)
+        return replace(self, rows=rows, nuisance=nuisance, trials=np.arange(len(prior_mean)))
 
     def start(self, deviation: FloatArray | None = None, seek: bool = True) -> Start:
         """Return the first start.
@@ -216,7 +238,8 @@ class Problem:
                 evaluated, white = evaluate_rows(rows, poses, self.trials, solution.nuisance)
                 ok = np.all(poses.is_reached[:, rows.poses_by_link], axis=2, keepdims=True)
                 raw = np.where(ok, evaluated.residual, np.nan)
-                kind.raw[:, numbers], kind.whitened[:, numbers] = raw, whiten(white, raw)
+                kind.raw[:, numbers] = raw
+                kind.whitened[:, numbers] = rows.whiten(white, raw, self.trials)
         return tuple(kinds)
 
     def leverage_rows(self, linearization: Linearization) -> Iterator[list[LeverageRows]]:
@@ -283,7 +306,8 @@ class Problem:
         self, solution: PoseSolution, z: FloatArray, trials: IntArray, start: Start
     ) -> Linearization:
         """Fold all rows at a solution and eliminate the nuisance parameters."""
-        a, p, nuisance = len(trials), self.parameters, self.nuisance
+        a, p = len(trials), self.parameters
+        nuisance = None if self.nuisance is None else self.nuisance.take(trials)
         factor, is_lost = empty_factor(a, p), np.zeros(a, dtype=bool)
         factors = None if nuisance is None else NodeFactors(nuisance.tree, a, p)
         for parts, lost in self.poses.iterate_rows(solution, z, trials):

@@ -60,9 +60,12 @@ class Prior:
         """Return the numbers of rows and parameters."""
         return f"<Prior: {len(self.rows)} rows on {len(self.names)} parameters>"
 
-    def added(self, problem: Problem) -> WithPrior:
-        """Return the problem of these rows and the rows of the prior, for the descent."""
-        return WithPrior(problem, self)
+    def added(self, problem: Problem, errors: FloatArray | None = None) -> WithPrior:
+        """Return the problem of these rows and the rows of the prior, for the descent.
+
+        `errors` (t, r) are added to the rows of the prior, as errors drawn for resamples.
+        """
+        return WithPrior(problem, self, errors)
 
     def without(self, names: Sequence[str]) -> Prior:
         """Return the marginal prior of the other parameters, without information on these."""
@@ -99,7 +102,7 @@ class WithPrior:
     constant: FloatArray
     unknown: FloatArray
 
-    def __init__(self, problem: Problem, prior: Prior) -> None:
+    def __init__(self, problem: Problem, prior: Prior, errors: FloatArray | None = None) -> None:
         free = problem.free
         table = free.robot.parameters
         places = np.array([table.index(name) for name in prior.names], dtype=np.int64)
@@ -113,7 +116,9 @@ class WithPrior:
         self.slope[:, : len(free.places)] = B[:, free.places] * free.tolerance
         self.center = free.deviation(mean[None])
         # parameters that are no longer free contribute their difference from the mean
-        self.constant = B @ (free.values(self.center)[0] - mean)
+        self.constant = np.atleast_2d(B @ (free.values(self.center)[0] - mean))
+        if errors is not None:
+            self.constant = self.constant + errors
         self.unknown = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
 
     def start(self, deviation: FloatArray) -> Start:
@@ -124,7 +129,14 @@ class WithPrior:
         """Return the problem of some trials."""
         other = copy(self)
         other.measured = self.measured.take(trials)
+        if len(self.constant) > 1:
+            other.constant = self.constant[trials]
         return other
+
+    def residuals(self, deviation: FloatArray) -> FloatArray:
+        """Return the residuals (t, r) of the rows of the prior at deviations (t, p)."""
+        change = np.matmul(self.slope, (deviation - self.center)[..., None])[..., 0]
+        return change + self.constant
 
     def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
         """Linearize the measurements and append the rows of the prior."""

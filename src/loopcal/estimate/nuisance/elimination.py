@@ -90,12 +90,14 @@ class NuisanceElimination:
     ----------
     local : their table, and which rows use them. tree : in which order they are eliminated.
     is_free : (U,). has_prior : (U,) free with a tolerance.
+    prior_mean : (T | 1, U) [SI] means of the priors of T trials.
     """
 
     local: NuisanceParameters
     tree: EliminationTree
     is_free: BoolArray
     has_prior: BoolArray
+    prior_mean: FloatArray
 
     def __len__(self) -> int:
         return len(self.local)
@@ -109,6 +111,12 @@ class NuisanceElimination:
     def unpenalized_count(self) -> int:
         """Number of free parameters without a prior."""
         return int((self.is_free & ~self.has_prior).sum())
+
+    def take(self, trials: IntArray) -> NuisanceElimination:
+        """Return this value with the means of the priors of some trials (a,)."""
+        if len(self.prior_mean) == 1:
+            return self
+        return replace(self, prior_mean=self.prior_mean[trials])
 
     def members(self, rows: ObservationRows) -> tuple[NodeMembers, ...]:
         """Return the rows of a kind by the structure of the node that each belongs to."""
@@ -175,22 +183,22 @@ class NuisanceElimination:
 
     def prior_cost(self, values: FloatArray) -> FloatArray:
         """Return the sum of squares (a,) of the priors at values (a, U)."""
-        table, known = self.local.table, self.has_prior
-        off = (values[:, known] - table.nominal[known]) / table.tolerance[known]
+        known = self.has_prior
+        off = (values - self.prior_mean)[:, known] / self.local.table.tolerance[known]
         return (off**2).sum(axis=1)
 
     def fold_priors(self, factors: NodeFactors, values: FloatArray) -> None:
         """Fold the priors at values (a, U) into the factors of their nodes."""
-        table = self.local.table
+        off = values - self.prior_mean
         for i, structure in enumerate(self.tree.structures):
             place, column = np.nonzero(self.has_prior[structure.unknowns])
             if not len(place):
                 continue
             unknown = structure.unknowns[place, column]
-            tolerance = table.tolerance[unknown]
+            tolerance = self.local.table.tolerance[unknown]
             rows = np.zeros((len(values), len(place), structure.width + factors.parameters + 1))
             rows[:, np.arange(len(place)), column] = 1.0 / tolerance
-            rows[:, :, -1] = (values[:, unknown] - table.nominal[unknown]) / tolerance
+            rows[:, :, -1] = off[:, unknown] / tolerance
             factors.add(i, rows, place)
 
     def eliminate(
@@ -219,7 +227,8 @@ def plan_elimination(
         return None
     is_free = np.asarray(local.table.free, dtype=bool)
     tree = build_tree(is_free, [p.scope for p in local.table.entries], _sets(rows, member))
-    return NuisanceElimination(local, tree, is_free, is_free & ~np.isnan(local.table.tolerance))
+    has_prior = is_free & ~np.isnan(local.table.tolerance)
+    return NuisanceElimination(local, tree, is_free, has_prior, local.table.nominal[None])
 
 
 def list_members(

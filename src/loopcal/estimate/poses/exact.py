@@ -146,8 +146,8 @@ class ExactPoses:
     ) -> Iterator[tuple[list[NodeRows], BoolArray]]:
         """Give, block by block, the rows of the nodes, and which trials (a,) lack a needed pose."""
         tree = None if self.nuisance is None else self.nuisance.tree
-        for block, members in zip(self.blocks, self.members, strict=True):
-            poses = solution.linearized or self._linearize(block, z, trials, None)[0]
+        linearized = self.iterate_linearized(solution, z, trials)
+        for (block, poses), members in zip(linearized, self.members, strict=True):
             parts = []
             for i, (rows, nodes) in enumerate(zip(block.rows, members, strict=True)):
                 if len(rows.poses):
@@ -165,6 +165,13 @@ class ExactPoses:
         """Give every block with its solved poses."""
         for block in self.blocks:
             yield block, solution.linearized or self._locate(block, z)
+
+    def iterate_linearized(
+        self, solution: PoseSolution, z: FloatArray, trials: IntArray
+    ) -> Iterator[tuple[PoseBlock, LinearizedPoses]]:
+        """Give every block with its poses, linearized."""
+        for block in self.blocks:
+            yield block, solution.linearized or self._linearize(block, z, trials, None)[0]
 
     def find_unreached(self, z: FloatArray, start: Start) -> IntArray:
         """Return the poses that a row needs and that cannot be reached at deviation z (1, p)."""
@@ -190,8 +197,8 @@ class ExactPoses:
         self, located: list[LinearizedPoses], values: FloatArray, trials: IntArray, control: Halving
     ) -> FloatArray:
         """Return the values (a, U) that fit best at the poses of all blocks."""
-        nuisance = self.nuisance
-        assert nuisance is not None
+        assert self.nuisance is not None
+        nuisance = self.nuisance.take(trials)
 
         def fold_at(tried: FloatArray) -> NodeFactors:
             factors = NodeFactors(nuisance.tree, len(trials), 0)

@@ -272,7 +272,7 @@ def linearize_rows(
             white, np.broadcast_to(evaluated.nuisance, (a, r, m, evaluated.nuisance.shape[-1]))
         )
     return KindRows(
-        residual=whiten(white, residual),
+        residual=rows.whiten(white, residual, trials),
         by_parameters=_parameter_columns(rows, evaluated, white, poses)
         if by_parameters
         else np.zeros((a, r, m, 0)),
@@ -281,11 +281,6 @@ def linearize_rows(
         if poses.by_coordinates is None
         else _coordinate_columns(rows, evaluated, white, poses, poses.by_coordinates),
     )
-
-
-def whiten(whitener: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return whitened residuals (.., m) of whiteners (.., m, m) and residuals (.., m)."""
-    return np.matmul(whitener, residual[..., None])[..., 0]
 
 
 def coordinate_derivative(jacobian: FloatArray, Y: FloatArray) -> FloatArray:

@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.estimate.observation_rows import ObservationRows
-from loopcal.estimate.poses.linearization import whiten
+from loopcal.estimate.observation_rows import ObservationRows, whiten
 from loopcal.mechanism import (
     Mechanism,
     Status,

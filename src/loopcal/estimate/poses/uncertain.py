@@ -176,9 +176,8 @@ class UncertainPoses:
         """Give, block by block, the rows left for the nodes once the coordinates are eliminated,
         and which trials (a,) lack a needed pose.
         """
-        for (block, poses), groups in zip(
-            self.iterate_poses(solution, z), self.groups, strict=True
-        ):
+        linearized = self.iterate_linearized(solution, z, trials)
+        for (block, poses), groups in zip(linearized, self.groups, strict=True):
             kinds = self._linearize_kinds(block, poses, trials, solution.nuisance)
             parts = []
             for group in groups:
@@ -203,6 +202,13 @@ class UncertainPoses:
                 states = solution.states.take_poses(block.poses)
                 poses = self.coordinates.linearize(values, states, block.poses)
             yield block, poses
+
+    def iterate_linearized(
+        self, solution: PoseSolution, z: FloatArray, trials: IntArray
+    ) -> Iterator[tuple[PoseBlock, LinearizedPoses]]:
+        """Give every block with its poses, linearized."""
+        del trials
+        yield from self.iterate_poses(solution, z)
 
     def find_unreached(self, z: FloatArray, start: Start) -> IntArray:
         """Return the poses that a row needs and that cannot be reached at deviation z (1, p)."""
@@ -272,8 +278,9 @@ class UncertainPoses:
                     fold_node_rows(empty_factor(0, 0), factors, [rows])
         cost = squares.sum(axis=1)
         if factors is not None and self.nuisance is not None and nuisance is not None:
-            cost = cost + self.nuisance.prior_cost(nuisance)
-            self.nuisance.fold_priors(factors, nuisance)
+            unknowns = self.nuisance.take(problem.trials)
+            cost = cost + unknowns.prior_cost(nuisance)
+            unknowns.fold_priors(factors, nuisance)
         order = self._pose_order()
         return _Point(
             states=PoseStates.join_poses(closed, order),

@@ -34,6 +34,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "data": ("conventions", "data"),
     "mechanism": ("kinematics", "limits", "singularity", "mechanism"),
     "apply": ("validation", "accuracy", "compensation"),
+    "sampling": ("sampling",),
     "plan": ("plan",),
     "files": ("files",),
 }

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit resamples of the rows of one fit, all at once.
+
+A resample weighs the blocks of rows anew, or draws new errors of the rows, and of the prior. All
+resamples have the structure of the rows that were fitted, so that they are a batch of trials. Each
+begins at the estimate of the fit. With the drawn center m of the prior the penalty acts on z - m:
+a prior is an observation, too, and its error is drawn from its stated distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.minimization.descent import LeastSquaresProblem, descend
+from loopcal.estimate.result import Identification
+from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.numerics.trial_batch import TrialBatch, map_arrays
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+LEAST_DEGREES = 0.5
+"""Degrees of freedom below which residuals show no noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Resamples(TrialBatch):
+    """What t resamples change in the rows of a fit.
+
+    Attributes
+    ----------
+    weight : (t, n) factors on the squares of each pose; None where the rows keep theirs.
+    offset : of every kind (t, r, m), added to the whitened residuals; None without any.
+    center : (t, p) drawn center of the prior, in tolerances from nominal.
+    prior : (t, r) errors of the rows of an earlier calibration; None without one.
+    nuisance : (t, U) [SI] drawn means of the priors of nuisance parameters.
+    equations : (t,) number of equations of each resample.
+    """
+
+    weight: FloatArray | None
+    offset: tuple[FloatArray, ...] | None
+    center: FloatArray
+    prior: FloatArray | None
+    nuisance: FloatArray
+    equations: IntArray
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+
+@dataclass(frozen=True, eq=False)
+class ResampleFits(TrialBatch):
+    """Estimates of t resamples.
+
+    Attributes
+    ----------
+    deviation : (t, p) in tolerances from nominal. linear : (t, p) the same to first order about the
+        estimate of the fit.
+    status : (t,) DescentStatus.
+    sd : (t, p) standard deviations in tolerances, for rows of unit variance.
+    noise : (t,) variance of the rows that the residuals show; NaN without degrees of freedom.
+    """
+
+    deviation: FloatArray
+    linear: FloatArray
+    status: IntArray
+    sd: FloatArray
+    noise: FloatArray
+
+    @property
+    def converged(self) -> BoolArray:
+        """(t,) which resamples converged."""
+        return self.status == DescentStatus.CONVERGED
+
+
+class CenteredProblem:
+    """A problem of t trials whose deviations count from a center (t, p) of their own.
+
+    It is a problem of the descent. `equations` (t,) replace those that the rows count.
+    """
+
+    def __init__(
+        self, problem: LeastSquaresProblem, center: FloatArray, equations: IntArray
+    ) -> None:
+        self.problem, self.center, self.equations = problem, center, equations
+
+    @property
+    def parameters(self) -> int:
+        """Number of unknowns p."""
+        return self.problem.parameters
+
+    def start(self, deviation: FloatArray) -> Start:
+        """Return the warm start of a descent from deviations (t, p)."""
+        return self.problem.start(deviation + self.center)
+
+    def take(self, trials: IntArray) -> CenteredProblem:
+        """Return the problem of some trials."""
+        other = copy(self)
+        other.problem = self.problem.take(trials)
+        other.center, other.equations = self.center[trials], self.equations[trials]
+        return other
+
+    def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
+        """Linearize at deviations (t, p) from the centers."""
+        linearized = self.problem.linearize(deviation + self.center, start)
+        return Linearization(
+            deviation,
+            linearized.factor,
+            linearized.cost,
+            self.equations,
+            linearized.next_start,
+        )
+
+
+def fit_resamples(
+    fit: Identification, linear: FitLinearization, resamples: Resamples
+) -> ResampleFits:
+    """Fit resamples of the rows of a fit, each from its estimate.
+
+    Parameters
+    ----------
+    fit : a fit that converged. linear : its rows, see `linearize_fit`.
+    """
+    t, method = len(resamples), fit.method
+    problem = linear.problem.resampled(resamples.weight, resamples.offset, resamples.nuisance)
+    if fit.options.prior is not None:
+        problem = fit.options.prior.added(problem, resamples.prior)
+    centered = CenteredProblem(problem, resamples.center, resamples.equations)
+    start = repeat_trial(linear.linearization.next_start, t)
+    estimate = np.repeat(linear.linearization.deviation, t, axis=0)
+    z = estimate - resamples.center
+    rows = replace(problem.linearize(estimate, start), deviation=z, equations=resamples.equations)
+    first = _decompose(fit, rows)
+    solution = first.deviation(first.solution(method.penalty(first)))
+    descent = _descend(fit, centered, solution, rows.next_start)
+    again = np.flatnonzero(descent.status != DescentStatus.CONVERGED)
+    if again.size:  # the linear solution may be out of reach, the estimate is not
+        other = _descend(fit, centered.take(again), z[again], rows.next_start.take(again))
+        descent = descent.put(again, other)
+    return replace(
+        descent,
+        deviation=descent.deviation + resamples.center,
+        linear=solution + resamples.center,
+    )
+
+
+def _descend(
+    fit: Identification, problem: CenteredProblem, z: FloatArray, start: Start
+) -> ResampleFits:
+    """Return where descents from deviations z (t, p) end."""
+    control, tolerance = fit.options.control, fit.spectrum.tolerance
+    descent = descend(problem, z, fit.method, control, tolerance, start)
+    d, penalty = descent.decomposition, descent.penalty
+    left = d.rows - d.filter_factors(penalty).sum(axis=1)
+    noise = np.full(len(z), np.nan)
+    np.divide(d.remaining(penalty), left, out=noise, where=left > LEAST_DEGREES)
+    return ResampleFits(
+        descent.deviation, z, descent.status, d.standard_deviations(penalty), noise
+    )
+
+
+def draw_centers(linear: FitLinearization, count: int, rng: np.random.Generator) -> FloatArray:
+    """Draw centers (count, p) of the prior of a fit by MAP, in tolerances from nominal."""
+    d, penalty = linear.scaled.decomposition, linear.scaled.penalty[0]
+    is_penalized = np.isfinite(penalty) & (penalty > 0.0)
+    sd = np.where(is_penalized, 1.0 / np.sqrt(np.where(is_penalized, penalty, 1.0)), 0.0)
+    return d.deviation(rng.standard_normal((count, len(penalty))) * sd)
+
+
+def repeat_trial(start: Start, count: int) -> Start:
+    """Return a start of one trial as that of `count` trials."""
+    return map_arrays(lambda array: np.repeat(array[:1], count, axis=0), start)
+
+
+def join_fits(parts: Sequence[ResampleFits]) -> ResampleFits:
+    """Return the fits of all parts."""
+    return TrialBatch.join(parts)
+
+
+def _decompose(fit: Identification, linearization: Linearization) -> Decomposition:
+    """Return the decomposition of linearized rows by the method of a fit."""
+    p, method = linearization.deviation.shape[1], fit.method
+    return decompose(
+        linearization.factor,
+        linearization.equations,
+        linearization.deviation,
+        method.scale(p),
+        fit.spectrum.tolerance,
+        method.unpenalized(p),
+    )
