@@ -124,6 +124,15 @@ if TYPE_CHECKING:
     from loopcal.planning import SurfacePlan as SurfacePlan
     from loopcal.planning import plan as plan
     from loopcal.planning import plan_surfaces as plan_surfaces
+    from loopcal.sampling import Bootstrap as Bootstrap
+    from loopcal.sampling import Intervals as Intervals
+    from loopcal.sampling import JointRegion as JointRegion
+    from loopcal.sampling import PosteriorSample as PosteriorSample
+    from loopcal.sampling import SimultaneousIntervals as SimultaneousIntervals
+    from loopcal.sampling import bootstrap as bootstrap
+    from loopcal.sampling import compute_joint_region as compute_joint_region
+    from loopcal.sampling import compute_simultaneous_intervals as compute_simultaneous_intervals
+    from loopcal.sampling import sample_posterior as sample_posterior
     from loopcal.workflow import CalibrationOptions as CalibrationOptions
     from loopcal.workflow import CalibrationReport as CalibrationReport
     from loopcal.workflow import Verdict as Verdict
@@ -170,6 +179,10 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         "loopcal.planning": """
             Constraints LineOfSight Plan PlanOptions SurfaceOptions SurfacePlan plan
             plan_surfaces
+        """,
+        "loopcal.sampling": """
+            Bootstrap Intervals JointRegion PosteriorSample SimultaneousIntervals bootstrap
+            compute_joint_region compute_simultaneous_intervals sample_posterior
         """,
         "loopcal.workflow": "CalibrationOptions CalibrationReport Verdict calibrate",
     }.items()

@@ -139,10 +139,7 @@ class Problem:
         return replace(self, rows=tuple(r.weighted(weight) for r in self.rows))
 
     def resampled(
-        self,
-        weight: FloatArray | None,
-        offset: Sequence[FloatArray] | None,
-        prior_mean: FloatArray,
+        self, weight: FloatArray | None, offset: Sequence[FloatArray] | None, prior_mean: FloatArray
     ) -> Problem:
         """Return the problem of t resamples of its rows (one trial).
 

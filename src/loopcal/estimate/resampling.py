@@ -17,9 +17,9 @@ import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.minimization.descent import LeastSquaresProblem, descend
 from loopcal.estimate.result import Identification
-from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -109,11 +109,7 @@ class CenteredProblem:
         """Linearize at deviations (t, p) from the centers."""
         linearized = self.problem.linearize(deviation + self.center, start)
         return Linearization(
-            deviation,
-            linearized.factor,
-            linearized.cost,
-            self.equations,
-            linearized.next_start,
+            deviation, linearized.factor, linearized.cost, self.equations, linearized.next_start
         )
 
 
@@ -135,7 +131,8 @@ def fit_resamples(
     estimate = np.repeat(linear.linearization.deviation, t, axis=0)
     z = estimate - resamples.center
     rows = replace(problem.linearize(estimate, start), deviation=z, equations=resamples.equations)
-    first = _decompose(fit, rows)
+    tolerance = fit.spectrum.tolerance
+    first = decompose_for(method, rows.factor, rows.equations, z, tolerance)
     solution = first.deviation(first.solution(method.penalty(first)))
     descent = _descend(fit, centered, solution, rows.next_start)
     again = np.flatnonzero(descent.status != DescentStatus.CONVERGED)
@@ -143,9 +140,7 @@ def fit_resamples(
         other = _descend(fit, centered.take(again), z[again], rows.next_start.take(again))
         descent = descent.put(again, other)
     return replace(
-        descent,
-        deviation=descent.deviation + resamples.center,
-        linear=solution + resamples.center,
+        descent, deviation=descent.deviation + resamples.center, linear=solution + resamples.center
     )
 
 
@@ -159,9 +154,7 @@ def _descend(
     left = d.rows - d.filter_factors(penalty).sum(axis=1)
     noise = np.full(len(z), np.nan)
     np.divide(d.remaining(penalty), left, out=noise, where=left > LEAST_DEGREES)
-    return ResampleFits(
-        descent.deviation, z, descent.status, d.standard_deviations(penalty), noise
-    )
+    return ResampleFits(descent.deviation, z, descent.status, d.standard_deviations(penalty), noise)
 
 
 def draw_centers(linear: FitLinearization, count: int, rng: np.random.Generator) -> FloatArray:
@@ -180,16 +173,3 @@ def repeat_trial(start: Start, count: int) -> Start:
 def join_fits(parts: Sequence[ResampleFits]) -> ResampleFits:
     """Return the fits of all parts."""
     return TrialBatch.join(parts)
-
-
-def _decompose(fit: Identification, linearization: Linearization) -> Decomposition:
-    """Return the decomposition of linearized rows by the method of a fit."""
-    p, method = linearization.deviation.shape[1], fit.method
-    return decompose(
-        linearization.factor,
-        linearization.equations,
-        linearization.deviation,
-        method.scale(p),
-        fit.spectrum.tolerance,
-        method.unpenalized(p),
-    )

@@ -21,8 +21,8 @@ import numpy as np
 from loopcal.diagnose.fit_checks.independent_units import Clusters
 from loopcal.diagnose.fit_checks.influence import TESTABLE
 from loopcal.estimate.fit_linearization import FitLinearization
-from loopcal.estimate.observed_columns import ObservedColumns, list_observed_columns
 from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.estimate.observed_columns import ObservedColumns, list_observed_columns
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
 from loopcal.typing import FloatArray, IntArray
 
@@ -33,7 +33,7 @@ class BlockErrors:
 
     Attributes
     ----------
-    residual : (M,) whitened residuals of the fit. error : (M,) corrected for leverage.
+    residual : (M,) whitened residuals at the truth of the resamples. error : (M,) corrected for leverage.
     block : (M,) number of the block of each, ascending. count : of blocks.
     untested : of every block (M_g, d) an orthonormal basis of the directions without residuals.
     places : of every kind, where (r, m) its components are among the M; -1 where absent.
@@ -78,8 +78,16 @@ class BlockErrors:
         return tuple(padded[:, places] for places in self.places)
 
 
-def compute_block_errors(linear: FitLinearization, clusters: Clusters) -> BlockErrors:
-    """Return the errors of the rows of a fit, by independent blocks of poses."""
+def compute_block_errors(
+    linear: FitLinearization, clusters: Clusters, shift: FloatArray
+) -> BlockErrors:
+    """Return the errors of the rows of a fit, by independent blocks of poses.
+
+    Parameters
+    ----------
+    shift : (p,) in tolerances, from the estimate to the truth of the resamples, at which the rows
+        have the residuals that the errors replace.
+    """
     problem, kinds = linear.problem, list_observed_columns(linear.problem, linear.linearization)
     cells = _list_cells(problem.rows, clusters)
     V = linear.decomposition.scale[:, None] * linear.decomposition.directions[0]
@@ -97,6 +105,7 @@ def compute_block_errors(linear: FitLinearization, clusters: Clusters) -> BlockE
         half = np.concatenate([by_nuisance, by_parameters @ V], axis=1)
         poses = _pose_columns(problem.rows, kinds, parts)
         error[mine], lost = _correct(residual[mine], half, poses)
+        residual[mine] += by_parameters @ shift
         untested.append(lost)
     places = tuple(cells.places(i, kind.residual.shape) for i, kind in enumerate(kinds))
     return BlockErrors(residual, error, cells.block, clusters.count, tuple(untested), places)

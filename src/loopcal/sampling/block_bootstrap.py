@@ -16,7 +16,7 @@ See docs/theory/resampling.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -24,23 +24,26 @@ from loopcal.diagnose.fit_checks.independent_units import Clusters
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
-from loopcal.estimate.methods.penalties import MAP
-from loopcal.estimate.resampling import (
-    ResampleFits,
-    Resamples,
-    draw_centers,
-    fit_resamples,
-    join_fits,
-)
+from loopcal.estimate.inference.residual_test import LEVEL
+from loopcal.estimate.methods.penalties import MAP, LeastSquares
+from loopcal.estimate.resampling import Resamples, draw_centers, fit_resamples, join_fits
 from loopcal.estimate.result import Identification
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.sampling.block_errors import compute_block_errors
+from loopcal.sampling.block_scatter import BlockScatter, describe_scatter
 from loopcal.sampling.blocks import choose_blocks
+from loopcal.sampling.intervals import Intervals, compare_ends, half_widths, report_intervals
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 
 Scheme = Literal["wild", "pairs", "normal"]
 """How resamples are drawn."""
+
+IntervalKind = Literal["widened", "percentile", "bias-corrected", "studentized"]
+"""How intervals are read from the resamples, see `Bootstrap.intervals`."""
+
+MOST_FAILED = 0.02
+"""Share of resamples that do not converge above which it is reported."""
 
 BATCH = 250
 """Resamples that are fitted at once; progress is reported between them."""
@@ -67,6 +70,7 @@ class Bootstrap:
     sd : (T, p) [SI] standard deviations that each resample states by its own residuals; NaN without
         degrees of freedom.
     failed : number of resamples that did not converge; they are left out.
+    scatter : the scatter of the blocks' errors against the stated uncertainty.
     """
 
     fit: Identification
@@ -77,6 +81,106 @@ class Bootstrap:
     linear: FloatArray
     sd: FloatArray
     failed: int
+    scatter: BlockScatter
+
+    def __repr__(self) -> str:
+        """Return scheme, blocks and number of resamples."""
+        blocks = f"{self.blocks.count} {self.blocks.unit}s"
+        return f"<Bootstrap: {len(self.draws)} resamples of {blocks}, scheme {self.scheme}>"
+
+    @property
+    def is_known(self) -> BoolArray:
+        """(p,) parameters whose standard deviation the fit states."""
+        return np.isfinite(self.fit.standard_deviations)
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """(p,) of the resamples [SI]; infinite where the data determine no parameter."""
+        return np.where(self.is_known, self.draws.std(axis=0, ddof=1), np.inf)
+
+    def intervals(self, level: float = LEVEL, kind: IntervalKind = "widened") -> Intervals:
+        """Return intervals of the parameters.
+
+        Parameters
+        ----------
+        level : coverage of each. kind : "percentile": between quantiles of the resamples.
+            "widened" (default): the same, its ends moved away from the estimate by t(nu) / 1.96,
+            because the scatter was estimated from few blocks (nu: see `BlockScatter`).
+            "bias-corrected": quantiles shifted by the share of resamples below the estimate (Efron,
+            1981). "studentized": quantiles of (resample - estimate) / sd, each with its own noise.
+        """
+        if kind not in get_args(IntervalKind):
+            words = ", ".join(get_args(IntervalKind))
+            raise EstimationError(f"kind of interval is {kind!r}; it must be one of {words}")
+        estimate, weight = self.fit.estimate, np.full(len(self.draws), 1.0 / len(self.draws))
+        ends = compare_ends(self.draws, weight, self.linear, weight, level)
+        known = np.where(self.is_known, 1.0, np.nan)
+        half = 0.5 * (ends.linear[1] - ends.linear[0])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shift, error = (ends.quantile - ends.linear) / half, ends.error / half
+        lower, upper = self._ends(kind, level, ends.quantile)
+        degrees = self.scatter.degrees if self.scheme != "normal" else np.inf
+        widen = half_widths(level, degrees) / half_widths(level)
+        linear = estimate + (ends.linear - estimate) * (widen if kind == "widened" else 1.0)
+        return Intervals(
+            names=self.fit.names,
+            level=level,
+            source=f"{self.scheme} bootstrap, {kind}",
+            center=self.draws.mean(axis=0) * known,
+            sd=self.draws.std(axis=0, ddof=1) * known,
+            lower=lower * known,
+            upper=upper * known,
+            linear_lower=linear[0] * known,
+            linear_upper=linear[1] * known,
+            shift=shift * known,
+            shift_error=error * known,
+        )
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """How many resamples failed, and whether the stated intervals agree with the scatter."""
+        total = len(self.draws) + self.failed
+        found = []
+        if self.failed > MOST_FAILED * total:
+            found.append(report_finding("sampling.failures", failed=self.failed, count=total))
+        found += report_intervals(self.intervals(kind="percentile"), "sampling.bootstrap")
+        if not isinstance(self.fit.method, MAP | LeastSquares):
+            name = type(self.fit.method).__name__
+            found.append(report_finding("sampling.bias-not-drawn", method=name))
+        if self.scheme == "normal" or not isinstance(self.fit.method, MAP | LeastSquares):
+            return tuple(found)
+        stated = np.where(self.is_known, self.fit.standard_deviations, np.nan)
+        ratio = self.standard_deviations / stated
+        return (*found, self.scatter.report(self.fit.names, ratio, self.blocks))
+
+    def _ends(
+        self, kind: IntervalKind, level: float, quantile: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the ends (p,) of intervals; `quantile` (2, p) are those of the resamples."""
+        estimate, tails = self.fit.estimate, np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
+        if kind == "percentile" or (kind == "widened" and self.scheme == "normal"):
+            return quantile[0], quantile[1]
+        if kind == "widened":
+            factor = half_widths(level, self.scatter.degrees) / half_widths(level)
+            return tuple(estimate + (quantile - estimate) * factor)
+        if kind == "studentized":
+            ratio = (self.draws - estimate) / self.sd
+            q = np.quantile(ratio, tails, axis=0)
+            own = self.scatter.noise * self.scatter.unit_sd
+            return estimate - q[1] * own, estimate - q[0] * own
+        return self._bias_corrected(tails)
+
+    def _bias_corrected(self, tails: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return quantiles (p,) shifted by the share of resamples below the estimate."""
+        from scipy.special import ndtr, ndtri
+
+        share = (self.draws < self.fit.estimate).mean(axis=0)
+        least = 0.5 / len(self.draws)
+        z = 2.0 * ndtri(np.clip(share, least, 1.0 - least)) + ndtri(tails)[:, None]
+        columns = range(self.draws.shape[1])
+        at = ndtr(z)
+        ends = [[np.quantile(self.draws[:, j], at[i, j]) for j in columns] for i in (0, 1)]
+        return np.array(ends[0]), np.array(ends[1])
 
 
 def bootstrap(
@@ -112,6 +216,10 @@ def bootstrap(
         raise EstimationError(f"{count} resamples: give at least 2")
     if not fit.converged:
         raise EstimationError(report_finding("sampling.not-converged"))
+    if not np.isfinite(fit.standard_deviations).any():
+        raise EstimationError(report_finding("sampling.without-intervals"))
+    if scheme == "pairs" and isinstance(fit.method, MAP) and callable(fit.method.inflation):
+        raise EstimationError(report_finding("sampling.pairs-with-rule"))
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
     draw = _Draw(fit, linear, blocks, scheme, np.random.default_rng(np.random.SeedSequence(seed)))
@@ -135,6 +243,7 @@ def bootstrap(
         linear=nominal + unit_of * kept.linear,
         sd=unit_of * kept.sd * noise,
         failed=count - len(kept.deviation),
+        scatter=describe_scatter(fit, data, blocks, linear),
     )
 
 
@@ -151,7 +260,10 @@ class _Draw:
     ) -> None:
         self.fit, self.linear, self.blocks = fit, linear, blocks
         self.scheme, self.rng = scheme, rng
-        self.errors = None if scheme == "pairs" else compute_block_errors(linear, blocks)
+        self.is_prior = isinstance(fit.method, MAP)
+        self.errors = None
+        if scheme != "pairs":
+            self.errors = compute_block_errors(linear, blocks, self._shift_truth())
 
     def __call__(self, count: int) -> Resamples:
         """Draw `count` resamples."""
@@ -170,6 +282,18 @@ class _Draw:
         center, prior, nuisance = self._draw_priors(count)
         return Resamples(weight, offset, center, prior, nuisance, equations)
 
+    def _shift_truth(self) -> FloatArray:
+        """Return the step (p,) from the estimate to the truth of the resamples.
+
+        The penalty of a ridge or a truncation is no observation and stays as it is. Then the truth
+        is the least-squares solution, so that the resamples scatter about the estimate.
+        """
+        d, z = self.linear.decomposition, self.linear.linearization.deviation
+        if self.is_prior:
+            return np.zeros(z.shape[1])
+        unpenalized = np.where(d.used, 0.0, np.inf)
+        return (d.deviation(d.solution(unpenalized)) - z)[0]
+
     def _draw_factors(self, count: int) -> FloatArray:
         """Return random factors (count, G) of mean 0 and variance 1."""
         sign = self.rng.choice([-1.0, 1.0], (count, self.blocks.count))
@@ -181,15 +305,15 @@ class _Draw:
         """Return drawn centers of the tolerances, errors of the rows of an earlier calibration, and
         means of the priors of nuisance parameters.
 
-        They scatter about the truth: the estimate where errors of rows are drawn, and the
-        unknown one, whose best guess is nominal, where the residuals keep their bias.
+        They scatter about the truth of the resamples where errors of rows are drawn, and about the
+        given values where the residuals keep their bias.
         """
         linear, fit, rng = self.linear, self.fit, self.rng
         is_recentered = self.errors is not None
         z, nuisance = linear.linearization.deviation, linear.problem.nuisance
-        center = np.repeat(z if is_recentered else np.zeros_like(z), count, axis=0)
-        if isinstance(fit.method, MAP):
-            center = center + draw_centers(linear, count, rng)
+        center = np.zeros((count, z.shape[1]))
+        if self.is_prior:
+            center = draw_centers(linear, count, rng) + (z if is_recentered else 0.0)
         prior = None
         if fit.options.prior is not None:
             rows = fit.options.prior.added(linear.problem)
