@@ -112,19 +112,19 @@ def test_a_curved_posterior_equals_that_of_a_markov_chain_and_is_reported() -> N
     fit = identify(robot, data, lc.MAP())
     known = find_nozzle(fit.robot.values[None], data.readings)[0]
     assert known == pytest.approx(lc.forward(fit.robot, data.readings).T[:, :3, 3], abs=1e-9)
-    sample = lc.sample_posterior(fit, data, 3000)
-    assert sample.effective_size > 500
+    sample = lc.sample_posterior(fit, data, 5000)
+    assert sample.effective_size > 800
     intervals = sample.intervals()
     rng = np.random.default_rng(0)
     chosen = rng.choice(len(sample.draws), 100, p=sample.weight, replace=False)
     begin = (sample.draws[chosen] - fit.nominal) / fit.tolerance
     chain = fit.nominal + fit.tolerance * sample_by_walkers(robot, data, 20 * MM, begin, 1200)
     sd = chain.std(axis=0)
-    assert (np.abs(intervals.center - chain.mean(axis=0)) < 0.12 * sd).all()
-    assert intervals.sd / sd == pytest.approx(1.0, abs=0.12)
+    assert (np.abs(intervals.center - chain.mean(axis=0)) < 0.15 * sd).all()
+    assert intervals.sd / sd == pytest.approx(1.0, abs=0.15)
     low, high = np.quantile(chain, [0.025, 0.975], axis=0)
-    assert (np.abs(intervals.lower - low) < 0.25 * sd).all()
-    assert (np.abs(intervals.upper - high) < 0.25 * sd).all()
+    assert (np.abs(intervals.lower - low) < 0.35 * sd).all()
+    assert (np.abs(intervals.upper - high) < 0.35 * sd).all()
     # what the linear posterior misses is more than that: the radius moves by an sd
     (finding,) = sample.findings
     assert finding.code == "sampling.posterior-differs"
@@ -135,7 +135,7 @@ def test_a_curved_posterior_equals_that_of_a_markov_chain_and_is_reported() -> N
         np.abs(intervals.linear_lower - low)[radius],
         np.abs(intervals.linear_upper - high)[radius],
     )
-    assert max(worse) > 0.25 * sd[radius]
+    assert max(worse) > 0.35 * sd[radius]
 
 
 def test_linear_intervals_of_linear_problems_are_confirmed_to_a_percent() -> None:

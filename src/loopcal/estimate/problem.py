@@ -138,24 +138,6 @@ class Problem:
         """
         return replace(self, rows=tuple(r.weighted(weight) for r in self.rows))
 
-    def resampled(
-        self, weight: FloatArray | None, offset: Sequence[FloatArray] | None, prior_mean: FloatArray
-    ) -> Problem:
-        """Return the problem of t resamples of its rows (one trial).
-
-        Parameters
-        ----------
-        weight : (t, n) factors on each pose's squares. offset : of every kind (t, r, m), added to
-            the whitened residuals. prior_mean : (t, U) [SI] of the nuisance parameters.
-        """
-        rows = self.rows if weight is None else tuple(r.weighted(weight) for r in self.rows)
-        if offset is not None:
-            rows = tuple(replace(r, offset=o) for r, o in zip(rows, offset, strict=True))
-        nuisance = self.nuisance
-        if nuisance is not None:
-            nuisance = replace(nuisance, prior_mean=prior_mean)
-        return replace(self, rows=rows, nuisance=nuisance, trials=np.arange(len(prior_mean)))
-
     def start(self, deviation: FloatArray | None = None, seek: bool = True) -> Start:
         """Return the first start.
 

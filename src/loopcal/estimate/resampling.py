@@ -19,6 +19,7 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.minimization.descent import LeastSquaresProblem, descend
+from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
@@ -113,6 +114,28 @@ class CenteredProblem:
         )
 
 
+def resample_rows(
+    problem: Problem,
+    weight: FloatArray | None,
+    offset: Sequence[FloatArray] | None,
+    prior_mean: FloatArray,
+) -> Problem:
+    """Return the problem of t resamples of the rows of a problem (one trial).
+
+    Parameters
+    ----------
+    weight : (t, n) factors on each pose's squares. offset : of every kind (t, r, m), added to the
+        whitened residuals. prior_mean : (t, U) [SI] of the nuisance parameters.
+    """
+    rows = problem.rows if weight is None else tuple(r.weighted(weight) for r in problem.rows)
+    if offset is not None:
+        rows = tuple(replace(r, offset=o) for r, o in zip(rows, offset, strict=True))
+    nuisance = problem.nuisance
+    if nuisance is not None:
+        nuisance = replace(nuisance, prior_mean=prior_mean)
+    return replace(problem, rows=rows, nuisance=nuisance, trials=np.arange(len(prior_mean)))
+
+
 def fit_resamples(
     fit: Identification, linear: FitLinearization, resamples: Resamples
 ) -> ResampleFits:
@@ -123,7 +146,8 @@ def fit_resamples(
     fit : a fit that converged. linear : its rows, see `linearize_fit`.
     """
     t, method = len(resamples), fit.method
-    problem = linear.problem.resampled(resamples.weight, resamples.offset, resamples.nuisance)
+    changed = (resamples.weight, resamples.offset, resamples.nuisance)
+    problem = resample_rows(linear.problem, *changed)
     if fit.options.prior is not None:
         problem = fit.options.prior.added(problem, resamples.prior)
     centered = CenteredProblem(problem, resamples.center, resamples.equations)

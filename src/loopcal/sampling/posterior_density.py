@@ -24,7 +24,7 @@ import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.inference.prior import WithPrior
-from loopcal.estimate.resampling import repeat_trial
+from loopcal.estimate.resampling import repeat_trial, resample_rows
 from loopcal.estimate.result import Identification
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
@@ -76,7 +76,7 @@ class PosteriorDensity:
         """Return log p (T,) at coordinates (T, k + u); -inf where a pose is not reached."""
         z, x = self.parameters(coordinates), self.setup(coordinates)
         count = len(z)
-        problem = self.linear.problem.resampled(None, None, self._prior_mean(count))
+        problem = resample_rows(self.linear.problem, None, None, self._prior_mean(count))
         start = repeat_trial(self.linear.linearization.next_start, count)
         has_setup = x.shape[1] > 0
         if has_setup:
