@@ -143,7 +143,8 @@ class Bootstrap:
         found = []
         if self.failed > MOST_FAILED * total:
             found.append(report_finding("sampling.failures", failed=self.failed, count=total))
-        found += report_intervals(self.intervals(kind="percentile"), "sampling.bootstrap")
+        codes = ("sampling.bootstrap-agrees", "sampling.bootstrap-differs")
+        found += report_intervals(self.intervals(kind="percentile"), *codes)
         if not isinstance(self.fit.method, MAP | LeastSquares):
             name = type(self.fit.method).__name__
             found.append(report_finding("sampling.bias-not-drawn", method=name))

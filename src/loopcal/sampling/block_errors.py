@@ -33,7 +33,8 @@ class BlockErrors:
 
     Attributes
     ----------
-    residual : (M,) whitened residuals at the truth of the resamples. error : (M,) corrected for leverage.
+    residual : (M,) whitened residuals at the truth of the resamples.
+    error : (M,) those at the estimate, corrected for leverage.
     block : (M,) number of the block of each, ascending. count : of blocks.
     untested : of every block (M_g, d) an orthonormal basis of the directions without residuals.
     places : of every kind, where (r, m) its components are among the M; -1 where absent.

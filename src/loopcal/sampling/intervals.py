@@ -148,17 +148,17 @@ def half_widths(level: float, degrees: FloatArray | float = np.inf) -> FloatArra
     return np.asarray(np.where(finite, by_t, ndtri(quantile)))
 
 
-def report_intervals(intervals: Intervals, subject: str) -> list[Finding]:
-    """Return whether linear intervals hold; `subject` begins the code."""
+def report_intervals(intervals: Intervals, agrees: str, differs: str) -> list[Finding]:
+    """Return whether linear intervals hold, with the codes for yes and no."""
     off, size = np.flatnonzero(intervals.is_off), intervals.largest_shift
     share = {"limit": OFF, "level": intervals.level}
     if not len(off):
-        return [report_finding(f"{subject}-agrees", **share, count=len(intervals.names))]
+        return [report_finding(agrees, **share, count=len(intervals.names))]
     order = off[np.argsort(-size[off])]
     names = tuple(intervals.names[i] for i in order)
     return [
         report_finding(
-            f"{subject}-differs",
+            differs,
             **share,
             count=len(off),
             total=len(intervals.names),

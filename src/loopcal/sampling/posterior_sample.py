@@ -113,7 +113,8 @@ class PosteriorSample:
         if size < FEWEST_DRAWS or self.tail_shape > LARGEST_SHAPE:
             size_or_tail = {"size": size, "count": len(self.draws), "shape": self.tail_shape}
             return (report_finding("sampling.few-effective-draws", **size_or_tail),)
-        return (*report_intervals(intervals, "sampling.posterior"),)
+        codes = ("sampling.posterior-agrees", "sampling.posterior-differs")
+        return (*report_intervals(intervals, *codes),)
 
     def _standard_deviations(self) -> FloatArray:
         """Return standard deviations (p,) of the weighted draws."""
