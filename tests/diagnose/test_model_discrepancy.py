@@ -11,8 +11,10 @@ import loopcal as lc
 from loopcal import geometry
 from loopcal.apply import pose_uncertainty
 from loopcal.diagnose import adjust_uncertainty
+from loopcal.diagnose.fit_checks.held_out_rows import Predictor
 from loopcal.diagnose.fit_checks.model_discrepancy import LEVEL, add_model_discrepancy
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
+from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.measure import (
     Component,
@@ -284,3 +286,20 @@ def test_a_calibration_states_the_discrepancy_and_keeps_it_with_the_fit():
     assert report.identification.posterior.discrepancy is not None
     assert DISCREPANCY in [f.code for f in report.findings]
     assert "discrepancy_root" in report.arrays()
+
+
+def test_held_out_rows_are_predicted_with_the_discrepancy():
+    """Rows x, y, z at the tool have the covariance of the poses, divided by their noise."""
+    robot = delta()
+    data = measure(robot)
+    at = places(robot, data.readings)
+    data = displaced(data, bend(at, at, 60 * UM, 3))
+    fit = add_model_discrepancy(identify(robot, data, MAP()), data)
+    assert find(fit)
+    other = measure(fit.robot, 40).take(np.arange(30, 40))
+    blocks = Predictor(fit.robot, {}, (), collect_uncertainty(fit), ()).make_blocks(other)
+    u = pose_uncertainty(fit, forward(fit.robot, other.readings), frame="base")
+    noise = fit.residual_test.sigma_scale * SIGMA
+    for numbers, H, _, _ in blocks.groups:
+        variance = noise**2 * np.einsum("bmk,bmk->b", H, H)
+        assert np.allclose(np.sqrt(variance), u.position[numbers], rtol=0.02)

@@ -166,13 +166,20 @@ class Predictor:
         return HeldOutBlocks(poses, member, tuple(groups))
 
     def _predict(self, names: tuple[str, ...], dimensions: tuple[Dimension, ...]) -> FloatArray:
-        """Return the derivative (U + p, k) of nuisance and free parameters by y."""
+        """Return the derivative (U + p + m, k) of nuisance parameters, free parameters and the
+        errors of a model discrepancy by y.
+        """
         fit, U = self.uncertainty, len(names)
         p, w = (0, 0) if fit is None else (len(fit.posterior.unit), len(fit.names))
-        by_y = np.zeros((U + p, p + w + len(self.unknown)))
+        own = None if fit is None else fit.posterior.discrepancy
+        m = 0 if own is None else own.errors.count
+        by_y = np.zeros((U + p + m, p + w + len(self.unknown) + m))
         if fit is not None:
             spread = fit.spread
-            by_y[U:, :p] = spread / fit.posterior.unit[:, None]
+            by_y[U : U + p, :p] = spread / fit.posterior.unit[:, None]
+            if own is not None:  # parameters follow the errors, which predictions lack
+                by_y[U : U + p, -m:] = own.root / fit.posterior.unit[:, None]
+                by_y[U + p :, -m:] = -np.eye(m)
             follow, places = fit.slope @ spread, {name: i for i, name in enumerate(fit.names)}
             for i, name in enumerate(names):
                 if name in self.kept and name in places:

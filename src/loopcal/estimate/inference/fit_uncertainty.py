@@ -50,18 +50,27 @@ class FitUncertainty:
 
     @property
     def spread(self) -> FloatArray:
-        """(p, p) E [SI]; zero where the fit states no intervals."""
-        variance = self.posterior.variance
+        """(p, p) E [SI] without a model discrepancy; zero where the fit states no intervals."""
+        posterior = self.posterior.without_discrepancy
+        variance = posterior.variance
         sd = np.where(np.isinf(variance), UNKNOWN, np.sqrt(np.nan_to_num(variance, posinf=0.0)))
-        return self.posterior.unit[:, None] * self.posterior.directions * sd
+        return posterior.unit[:, None] * posterior.directions * sd
 
     @property
     def free(self) -> FreeParameters:
-        """The free parameters at the estimate, in units of the posterior."""
+        """The free parameters at the estimate, in units of the posterior, and the errors of a model
+        discrepancy.
+        """
         posterior = self.posterior
         stated = np.zeros(len(posterior.unit), dtype=bool)
+        own = posterior.discrepancy
         return FreeParameters(
-            posterior.robot, posterior.places, posterior.estimate, posterior.unit, stated
+            posterior.robot,
+            posterior.places,
+            posterior.estimate,
+            posterior.unit,
+            stated,
+            errors=None if own is None else own.errors,
         )
 
 
