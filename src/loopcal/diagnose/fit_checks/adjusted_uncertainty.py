@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.correlated_errors import estimate_correlated_errors
-from loopcal.diagnose.fit_checks.model_discrepancy import add_model_discrepancy
+from loopcal.diagnose.fit_checks.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.fit_checks.residual_effects import READING, SESSION, TEMPERATURE, TIME
 from loopcal.diagnose.fit_checks.residual_patterns import (
     EffectSizes,
@@ -62,17 +62,24 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
         return fit
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     rows = collect_residual_rows(fit, data)
-    fit = fit if rows is None else _add_patterns(fit, data, rows)
-    return add_model_discrepancy(fit, data)
+    slow = find_slow_errors(fit, data)
+    if rows is not None:
+        fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
+    return fit if slow is None else add_slow_errors(fit, slow)
 
 
-def _add_patterns(fit: Identification, data: Measurements, rows: ResidualRows) -> Identification:
-    """Return a fit whose covariance allows for the patterns of its residuals."""
+def _add_patterns(
+    fit: Identification, data: Measurements, rows: ResidualRows, *, is_slow: bool
+) -> Identification:
+    """Return a fit whose covariance allows for the patterns of its residuals. A dependence on a
+    reading is a slow error of the poses, and counts once where such errors were found.
+    """
     patterns = find_patterns(rows, data, fit.robot)
-    if not (patterns.effects or patterns.is_correlated):
+    effects = [e for e in patterns.effects if not (is_slow and e.effect.source == READING)]
+    if not (effects or patterns.is_correlated):
         return fit
     tool = state_tool_uncertainty(fit, data)
-    for effect in patterns.effects:
+    for effect in effects:
         root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
         finding = _report_effect(effect, tool.measure_growth(root))
         fit = add_covariance(fit, root, np.inf, finding)

@@ -12,6 +12,7 @@ See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,10 +21,10 @@ from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
-from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
+from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.poses.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import forward
 from loopcal.numerics.variance_component import (
@@ -69,6 +70,19 @@ class SlowErrorRows:
     degrees: int
 
 
+@dataclass(frozen=True, eq=False)
+class SlowErrors:
+    """Slow errors that residuals show.
+
+    Attributes
+    ----------
+    rows : that show them. found : number of the errors, of rotation or place -> size, probability.
+    """
+
+    rows: SlowErrorRows
+    found: Mapping[int, tuple[VarianceComponent, float]]
+
+
 def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
     """Return a fit whose uncertainty includes a model discrepancy, where its residuals show one.
 
@@ -79,21 +93,31 @@ def add_model_discrepancy(fit: Identification, data: Measurements) -> Identifica
     ----------
     fit : an identification. data : the measurements it was made from.
     """
+    slow = find_slow_errors(fit, data)
+    return fit if slow is None else add_slow_errors(fit, slow)
+
+
+def find_slow_errors(fit: Identification, data: Measurements) -> SlowErrors | None:
+    """Return the slow errors that the residuals of a fit show; None without any, or where nothing
+    can be tested.
+    """
     if not (fit.converged and fit.residual_test.intervals):
-        return fit
+        return None
     rows = project_slow_errors(fit, data)
-    if rows is None:
-        return fit
-    found = detect_slow_errors(rows, _known_degrees(fit))
-    if not found:
-        return fit
-    amplitude, degrees, first = np.zeros(6), np.full(2, np.inf), fit.posterior
-    for part, (component, _) in found.items():
+    found = {} if rows is None else detect_slow_errors(rows, _known_degrees(fit))
+    return None if rows is None or not found else SlowErrors(rows, found)
+
+
+def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
+    """Return a fit whose uncertainty includes slow errors that were found in its residuals."""
+    rows, first = slow.rows, fit.posterior
+    amplitude, degrees = np.zeros(6), np.full(2, np.inf)
+    for part, (component, _) in slow.found.items():
         amplitude[3 * part : 3 * part + 3] = np.sqrt(component.variance)
         degrees[part] = component.degrees
     errors = rows.errors.scaled(amplitude)
     root = rows.slope * np.repeat(amplitude, rows.errors.count // 6)
-    for part, (component, p_value) in found.items():
+    for part, (component, p_value) in slow.found.items():
         own = root[:, _columns(rows.errors, part)]
         finding = _report(fit, part, float(amplitude[3 * part]), component.degrees, p_value)
         fit = add_covariance(fit, own, component.degrees, finding)
@@ -208,12 +232,11 @@ def _known_degrees(fit: Identification) -> float:
 def _report(
     fit: Identification, part: int, amplitude: float, degrees: float, p_value: float
 ) -> Finding:
-    """Return the size of the errors of rotation or of place, and that they are in the uncertainty.
-
-    The intervals of parameters contain what errors of this size do to them.
+    """Return the size of the errors of rotation or of place, and that they are in the uncertainty;
+    a warning where they are beyond doubt.
     """
     dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
-    return report_finding(
+    finding = report_finding(
         DISCREPANCY,
         quantity=("orientation", "position")[part],
         amplitude=fit.robot.to_quantity(amplitude, dimension),
@@ -221,6 +244,7 @@ def _report(
         p_value=p_value,
         level=LEVEL,
     )
+    return replace(finding, severity=Severity.WARNING) if p_value < SIGNIFICANCE else finding
 
 
 def _is_seen(rows: SlowErrorRows, part: int) -> bool:
