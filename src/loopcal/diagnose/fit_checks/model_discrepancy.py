@@ -47,6 +47,9 @@ FEWEST_POSES = 5
 UNSEEN = 1e-8
 """Share of the effect of errors on the rows below which the parameters take up all of it."""
 
+NEGLIGIBLE = 1e-12
+"""Share of the largest variance by slow errors below which one is rounding."""
+
 ROTATION, PLACE = 0, 1
 """Number of the errors of rotation and of place."""
 
@@ -58,7 +61,7 @@ class SlowErrorRows:
     Attributes
     ----------
     errors : of unit amplitude. slope : (p, m) change of the estimates [SI] with the coefficients.
-    rows : (k, m) S. residuals : (k,) y. rest : sum of squares that no slow error touches.
+    rows : (m, m) S. residuals : (m,) y. rest : sum of squares that no slow error touches.
     degrees : number of residuals, those of `rest` included.
     """
 
@@ -138,24 +141,22 @@ def detect_slow_errors(
     while parts:
         y = whitening @ rows.residuals
         turned = {
-            part: np.linalg.svd(
-                whitening @ rows.rows[:, _columns(rows.errors, part)], full_matrices=False
-            )[:2]
+            part: _find_axes(whitening @ rows.rows[:, _columns(rows.errors, part)])
             for part in parts
         }
         tests = {
-            part: (s**2, u.T @ y, rows.rest + _square_outside(u, y), rows.degrees)
-            for part, (u, s) in turned.items()
+            part: (w, u.T @ y, rows.rest + _square_outside(u, y), rows.degrees)
+            for part, (u, w) in turned.items()
         }
         p_values = {part: compute_component_tail(*test) for part, test in tests.items()}
         part = min(parts, key=lambda each: p_values[each])
         if p_values[part] >= level:
             break
-        u, s = turned[part]
+        u, w = turned[part]
         component = estimate_variance_component(*tests[part], known)
         found[part] = (component, p_values[part])
-        # u diag(1 / sqrt(1 + ratio s^2)) u' + (I - u u')
-        shrink = 1.0 / np.sqrt(1.0 + component.ratio * s**2) - 1.0
+        # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
+        shrink = 1.0 / np.sqrt(1.0 + component.ratio * w) - 1.0
         whitening = (np.eye(len(y)) + (u * shrink) @ u.T) @ whitening
         parts.remove(part)
     return found
@@ -201,22 +202,22 @@ def project_slow_errors(fit: Identification, data: Measurements) -> SlowErrorRow
     size = np.linalg.norm(factor[:, p : p + m])
     if not np.linalg.norm(triangle) > UNSEEN * size:
         return None
-    u, s, vt = np.linalg.svd(triangle, full_matrices=False)
-    seen = s > UNSEEN * size
-    return SlowErrorRows(
-        errors,
-        slope,
-        s[seen, None] * vt[seen],
-        (u.T @ residuals)[seen],
-        rest + float(((u.T @ residuals)[~seen] ** 2).sum()),
-        degrees,
-    )
+    return SlowErrorRows(errors, slope, triangle, residuals, rest, degrees)
 
 
 def _columns(errors: SmoothErrors, part: int) -> slice:
     """Return the coefficients of the errors of rotation or of place."""
     half = errors.count // 2
     return slice(part * half, (part + 1) * half)
+
+
+def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the axes u (k, r) of the variances that rows (k, m) times independent errors have, and
+    these variances (r,). Weak ones need no accuracy: they weigh little.
+    """
+    variances, axes = np.linalg.eigh(rows @ rows.T)
+    kept = variances > NEGLIGIBLE * variances[-1]
+    return axes[:, kept], variances[kept]
 
 
 def _square_outside(u: FloatArray, y: FloatArray) -> float:
