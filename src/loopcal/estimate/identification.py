@@ -31,6 +31,7 @@ from loopcal.estimate.inference.prior import (
     report_unknown_rows,
 )
 from loopcal.estimate.inference.residual_test import run_residual_test
+from loopcal.estimate.inference.shown_noise import find_shown_noise
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
@@ -122,7 +123,8 @@ def identify(
     if open_poses.poses:
         findings.append(open_poses.report("fit.poses-open-at-start"))
     rows = collect_used_rows(robot, data, options.prior)
-    posterior = replace(result.posterior, fitted_rows=rows)
+    shown = find_shown_noise(fit.decomposition, result.residual_test)
+    posterior = replace(result.posterior, fitted_rows=rows, shown_noise=shown)
     return replace(result, posterior=posterior, findings=tuple(findings))
 
 

@@ -6,12 +6,14 @@ Two fits of the new rows with the earlier posterior are compared: one keeps all 
 earlier calibration, one has no information on those in question. If nothing has changed, the
 decrease of chi-square from the first to the second has a chi-square distribution; its degrees of
 freedom are the directions that the second fit frees and the rows determine. It is the chi-square of
-the change against its predicted covariance. See docs/theory/uncertainty.md.
+the change against its predicted covariance. The noise of both calibrations is the one that their
+residuals show, so that a wrong sigma moves no machine; the probability allows for the uncertainty
+of that noise. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -22,8 +24,7 @@ from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.inference.prior import Prior, limb_parameters, prior_from
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE
+from loopcal.estimate.inference.prior import Prior, limb_parameters, prior_from, with_shown_noise
 from loopcal.estimate.methods.penalties import LeastSquares
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.result import Identification
@@ -37,6 +38,12 @@ from loopcal.typing import FloatArray, Progress, report_no_progress
 MOST_TRIED = 60
 """Number of parameters up to which each is tried alone as the explanation of a change."""
 
+CHANGE_LEVEL = 0.05
+"""Probability of finding a change of a machine that has not changed."""
+
+NODES = 101
+"""Values of the true noise of each calibration over which a probability is averaged."""
+
 EXPLAINED = 0.5
 """A single parameter explains a change if freeing it leaves less than this share of chi-square."""
 
@@ -49,8 +56,9 @@ class Change:
     ----------
     subject : a limb, or "the machine". names : the parameters in question.
     change : (k,) estimate without the earlier calibration minus the earlier estimate [SI].
-    chi_square, degrees, p_value : of the change; p_value is NaN where the new rows determine none
-        of these parameters, or a fit did not converge.
+    chi_square, degrees : of the change, in units of the noise that both calibrations show.
+    p_value : probability of a larger chi_square, which allows for the uncertainty of that noise;
+        NaN where the new rows determine none of these parameters, or a fit did not converge.
     moved : whether they have changed; None where it cannot be decided.
     finding : the result with its code.
     """
@@ -116,7 +124,7 @@ def recalibrate(
     prior = prior_from(earlier)
     _check_names(robot, prior)
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
-    change = assess_change(robot, data, prior, names, free_limb or MACHINE, options, progress)
+    change = assess_change(robot, data, earlier, names, free_limb or MACHINE, options, progress)
     used = _used_prior(robot, prior, free_limb, names)
     fit = identify(robot, data, LeastSquares(), options=replace(options, prior=used))
     return replace(fit, findings=(*fit.findings, change.finding)), change
@@ -125,7 +133,7 @@ def recalibrate(
 def assess_change(
     robot: Mechanism,
     data: Measurements,
-    prior: Prior,
+    earlier: Posterior,
     names: tuple[str, ...],
     subject: str,
     options: FitOptions | None = None,
@@ -135,30 +143,108 @@ def assess_change(
 
     Parameters
     ----------
-    robot, data : as for `identify`. prior : the earlier calibration.
+    robot, data : as for `identify`. earlier : the earlier calibration.
     names : the parameters in question. subject : their common name for the finding.
-    options : of the fits; the noise is taken as given.
+    options : of the fits. Both calibrations count with the noise that their residuals show.
     """
     options = replace(options or FitOptions(), method=LeastSquares(), noise="given")
-    kept = identify(robot, data, options=replace(options, prior=prior))
-    freed = identify(robot, data, options=replace(options, prior=prior.without(names)))
+    prior = prior_from(with_shown_noise(earlier))
+
+    def fit_with(used: Prior) -> Identification:
+        return identify(robot, data, options=replace(options, prior=used))
+
+    alone = fit_with(prior.without(prior.names))
+    sigma, noise_degrees = _find_new_noise(alone, earlier)
+    prior = prior.scaled(sigma)
+    is_whole = len(names) == len(prior.names)
+    kept, freed = fit_with(prior), alone if is_whole else fit_with(prior.without(names))
     of_prior, of_fit = ([table.index(n) for n in names] for table in (prior.names, freed.names))
     change = freed.estimate[of_fit] - prior.mean[of_prior]
     degrees = kept.residual_test.degrees - freed.residual_test.degrees
-    gain = max(kept.chi_square - freed.chi_square, 0.0)
+    gain = max(kept.chi_square - freed.chi_square, 0.0) / sigma**2
     if degrees < 1.0 or not (kept.converged and freed.converged):
         code = "prior.change-not-observable" if degrees < 1.0 else "prior.change-not-converged"
         finding = report_finding(code, subject=subject)
         return Change(subject, names, change, gain, degrees, np.nan, None, finding)
-    p_value = float(compute_chi_square_tail(degrees, gain))
-    moved = p_value < SIGNIFICANCE
-    result = {"subject": subject, "chi_square": gain, "degrees": degrees, "p_value": p_value}
+    by_noise, known = _divide_by_source(prior, names, kept, freed)
+    by_new = max(degrees - by_noise - known, 0.0)
+    sources = ((by_noise, prior.noise_degrees), (known, np.inf), (by_new, noise_degrees))
+    p_value = _average_tail(gain, degrees, sources)
+    moved = p_value < CHANGE_LEVEL
+    numbers = {"chi_square": gain, "degrees": degrees, "p_value": p_value, "level": CHANGE_LEVEL}
+    code, single = "prior.machine-unchanged", {}
     if moved:
+        code = "prior.machine-changed"
         single = _explain_by_one(robot, data, prior, names, kept.chi_square, options, progress)
-        finding = report_finding("prior.machine-changed", **result, **single)
-    else:
-        finding = report_finding("prior.machine-unchanged", **result)
+    finding = report_finding(code, subject=subject, **numbers, **single)
     return Change(subject, names, change, gain, degrees, p_value, moved, finding)
+
+
+def _find_new_noise(alone: Identification, earlier: Posterior) -> tuple[float, float]:
+    """Return the noise of the new rows, in units of the stated sigma, and its degrees of freedom.
+
+    It is what the residuals of a fit without the earlier calibration show. Where they leave fewer
+    than five degrees of freedom, it is the larger of the stated noise, as far as they correct it,
+    and the one that the residuals of the earlier calibration show.
+    """
+    own, before = alone.posterior.shown_noise, earlier.shown_noise
+    if own is not None and own.is_known:
+        return float(np.sqrt(own.variance)), own.degrees
+    test = alone.residual_test
+    stated = (test.sigma_scale, test.noise_degrees) if test.converged else (1.0, np.inf)
+    if before is None or not before.is_known or before.variance <= stated[0] ** 2:
+        return stated
+    return float(np.sqrt(before.variance)), before.degrees
+
+
+def _divide_by_source(
+    prior: Prior, names: tuple[str, ...], kept: Identification, freed: Identification
+) -> tuple[float, float]:
+    """Return how many degrees of freedom of the chi-square of a change the noise of the earlier
+    rows causes, and how many the known uncertainty of the earlier calibration, such as tolerances;
+    the new rows cause the rest.
+
+    The chi-square is the squared length of the projection of all rows, those of the prior and the
+    new ones, on as many dimensions as it has degrees of freedom. The part of a row is its leverage
+    in the fit that allows a change, less that in the fit without one.
+    """
+    depending, others = prior.split(names)
+    part = (depending**2).sum(axis=1)
+    part += _compute_leverage(others @ prior.without(names).rows, freed)
+    part = np.maximum(part - _compute_leverage(prior.rows, kept), 0.0)
+    share = np.ones(len(part)) if prior.noise_share is None else prior.noise_share
+    return float(share @ part), float((1.0 - share) @ part)
+
+
+def _average_tail(
+    chi_square: float, degrees: float, sources: Sequence[tuple[float, float]]
+) -> float:
+    """Return the probability of a larger chi-square where noise was estimated: the mean over the
+    true noise, given the estimated one (Behrens and Fisher; with one source the F distribution).
+
+    The true variance of a source is nu / chi-square(nu) times the estimated one.
+
+    Parameters
+    ----------
+    sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
+        of freedom nu of its variance.
+    """
+    from scipy.special import chdtri
+
+    total = sum(part for part, _ in sources)
+
+    probability = (np.arange(NODES) + 0.5) / NODES
+    true = np.zeros(1)
+    for part, nu in sources:
+        times = np.ones(1) if np.isinf(nu) else nu / chdtri(nu, probability)
+        true = (true[:, None] + part / total * times).ravel()
+    return float(compute_chi_square_tail(degrees, chi_square / true).mean())
+
+
+def _compute_leverage(rows: FloatArray, fit: Identification) -> FloatArray:
+    """Return the leverage (r,) of rows (r, p) [1 / SI] of unit variance in a fit."""
+    root = fit.posterior.root / fit.residual_test.sigma_scale
+    return np.asarray(((rows @ root) ** 2).sum(axis=1))
 
 
 def _explain_by_one(

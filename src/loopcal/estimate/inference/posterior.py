@@ -22,6 +22,7 @@ from loopcal.estimate.inference.model_discrepancy import (
     discrepancy_from_arrays,
 )
 from loopcal.estimate.inference.residual_test import ResidualTest
+from loopcal.estimate.inference.shown_noise import ShownNoise, shown_noise_from_arrays
 from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.findings import report_finding
 from loopcal.measure import FittedRows, fitted_rows_from_arrays
@@ -77,6 +78,7 @@ class Posterior:
         they are not known.
     discrepancy : slow errors of the poses that no geometry explains; None where none were found.
         Their effect on the parameters is one of the parts.
+    shown_noise : the noise that the residuals alone show; None where it is not known.
     """
 
     robot: Mechanism
@@ -89,6 +91,7 @@ class Posterior:
     parts: tuple[CovariancePart, ...] = ()
     fitted_rows: FittedRows | None = None
     discrepancy: ModelDiscrepancy | None = None
+    shown_noise: ShownNoise | None = None
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -165,7 +168,7 @@ class Posterior:
             np.repeat(np.arange(len(parts)), [part.root.shape[1] for part in parts]),
         )
         own |= {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
-        for value in (self.frames, self.fitted_rows, self.discrepancy):
+        for value in (self.frames, self.fitted_rows, self.discrepancy, self.shown_noise):
             own |= {} if value is None else value.arrays()
         return own
 
@@ -259,6 +262,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         _parts_from_arrays(arrays),
         fitted_rows_from_arrays(arrays),
         discrepancy_from_arrays(arrays),
+        shown_noise_from_arrays(arrays),
     )
 
 

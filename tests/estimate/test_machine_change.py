@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a machine has moved is judged by the noise that both calibrations show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from, recalibrate
+from loopcal.estimate.inference.posterior import posterior_from_arrays
+from loopcal.estimate.inference.prior import with_shown_noise
+from loopcal.estimate.recalibration import CHANGE_LEVEL, Change, _average_tail
+from loopcal.io import load_robot
+from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate
+from loopcal.mechanism import Mechanism, sample_workspace
+from tests.estimate.problems import UM, noise
+
+DELTA = load_robot("linear-delta")
+SIGMA = 20 * UM
+
+
+def measure(
+    machine: Mechanism, seed: int, ratio: float, poses: int = 20, unknown: tuple[str, ...] = ()
+) -> Measurements:
+    """Return positions whose noise is `ratio` times the stated sigma; other numbers are equal."""
+    coordinates = sample_workspace(DELTA, poses, seed).coordinates
+    stated, exact = (
+        Instrument((Sensor(Position(unknown=unknown), noise(*[sd] * 3)),)) for sd in (SIGMA, 1e-12)
+    )
+    data = simulate(machine, coordinates, stated, seed)
+    rows = simulate(machine, coordinates, exact, seed).observations[0]
+    error = ratio * SIGMA * np.random.default_rng(seed + 10**6).standard_normal((poses, 3))
+    rows = replace(data.observations[0], measured=rows.measured + error)
+    return replace(data, observations=(rows,))
+
+
+def compare(seed: int, before: float, after: float, limb=None, poses=20, unknown=()) -> Change:
+    """Calibrate an unmoved machine twice, with noise of these ratios to the stated sigma."""
+    truth = DELTA.with_values(sample_truth(DELTA, 1, seed)[0])
+    first = identify(DELTA, measure(truth, seed, before, unknown=unknown), LeastSquares())
+    data = measure(truth, seed + 5000, after, poses, unknown)
+    return recalibrate(DELTA, data, first.posterior, limb)[1]
+
+
+@pytest.mark.parametrize("limb", [None, "tower1"])
+def test_a_wrong_sigma_does_not_change_the_test(limb) -> None:
+    """Sigmas that are three times too small and twice too large, in one calibration or in both."""
+    for seed in range(2):
+        right = compare(seed, 1.0, 1.0, limb)
+        assert right.moved == (right.p_value < CHANGE_LEVEL)
+        for before, after in [(3.0, 3.0), (0.5, 0.5), (2.0, 1.0), (1.0, 3.0)]:
+            wrong = compare(seed, before, after, limb)
+            assert wrong.degrees == right.degrees
+            if before == after:
+                assert wrong.p_value == pytest.approx(right.p_value, rel=0.1)
+            assert wrong.chi_square / wrong.degrees < 4.0
+
+
+@pytest.mark.parametrize(("ratio", "poses", "unknown"), [(2.0, 20, ()), (0.5, 8, ("frame",))])
+def test_unmoved_machines_are_declared_moved_at_the_stated_rate(ratio, poses, unknown) -> None:
+    """5 % of 24; p-values are uniform. Before, a sigma twice too small moved nearly every one."""
+    changes = [compare(s, ratio, ratio, poses=poses, unknown=unknown) for s in range(24)]
+    p_values = [change.p_value for change in changes]
+    assert sum(change.moved for change in changes) <= stats.binom.ppf(0.999, 24, CHANGE_LEVEL)
+    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
+    assert all(change.finding.data["level"] == CHANGE_LEVEL for change in changes)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0])
+def test_moved_machines_are_found(ratio) -> None:
+    """One parameter by 5 standard deviations of its difference, and a limb."""
+    truth = DELTA.with_values(sample_truth(DELTA, 1, 4)[0])
+    first = identify(DELTA, measure(truth, 4, ratio), LeastSquares())
+    place = first.names.index("tower2.stop")
+    stated = [identify(DELTA, measure(truth, seed, 1.0), LeastSquares()) for seed in (4, 14)]
+    sd = ratio * np.hypot(*(fit.standard_deviations[place] for fit in stated))
+    values = truth.values.copy()
+    values[first.posterior.places[place]] += 5.0 * sd
+    data = measure(truth.with_values(values), 14, ratio)
+    for limb in (None, "tower2"):
+        change = recalibrate(DELTA, data, first.posterior, limb)[1]
+        assert change.moved
+        assert change.p_value < 1e-2
+    assert change.finding.data["parameter"] == "tower2.stop"
+
+
+def test_the_shown_noise_replaces_that_of_a_wrong_sigma() -> None:
+    """The covariance of least squares is then that of an independent calculation, and survives a
+    run folder.
+    """
+    truth = DELTA.with_values(sample_truth(DELTA, 1, 2)[0])
+    data = measure(truth, 2, 0.4)
+    fit = identify(DELTA, data, LeastSquares())
+    stored = posterior_from_arrays(fit.robot, fit.arrays())
+    for earlier in (fit.posterior, stored):
+        prior = prior_from(with_shown_noise(earlier))
+        stated = identify(DELTA, data, LeastSquares()).residual_test
+        square = sum(float((r.whitened**2).sum()) for r in fit.residuals)
+        left = sum(r.whitened.size for r in fit.residuals) - fit.rank
+        expected = fit.covariance * (square / left) / stated.sigma_scale**2
+        np.testing.assert_allclose(np.linalg.inv(prior.rows.T @ prior.rows), expected, rtol=1e-5)
+        assert prior.noise_degrees == left
+        np.testing.assert_allclose(prior.noise_share, 1.0, rtol=1e-9)
+
+
+def test_probability_with_estimated_noise_is_the_f_distribution_for_one_source() -> None:
+    for ratio in (0.5, 1.0, 2.0, 3.0):
+        for nu in (6.0, 30.0):
+            p_value = _average_tail(7.0 * ratio, 7.0, [(7.0, nu)])
+            assert p_value == pytest.approx(stats.f.sf(ratio, 7.0, nu), rel=0.02, abs=1e-4)
+        known = _average_tail(7.0 * ratio, 7.0, [(3.0, np.inf), (4.0, np.inf)])
+        assert known == pytest.approx(stats.chi2.sf(7.0 * ratio, 7.0), rel=1e-12)
+    two = _average_tail(14.0, 7.0, [(3.0, 8.0), (4.0, np.inf)])
+    assert stats.chi2.sf(14.0, 7.0) < two < stats.f.sf(2.0, 7.0, 8.0)
+
+
+def test_tolerances_in_an_earlier_calibration_are_no_noise() -> None:
+    """With the tolerances as a prior part of the earlier covariance is known."""
+    truth = DELTA.with_values(sample_truth(DELTA, 1, 2)[0])
+    fit = identify(DELTA, measure(truth, 2, 1.0, 3))
+    share = prior_from(fit.posterior).noise_share
+    assert share is not None
+    assert share.min() < 0.9
+    assert share.max() > 0.9
+    assert (share >= 0.0).all()
+    options = FitOptions(prior=prior_from(fit.posterior))
+    assert identify(DELTA, measure(truth, 9, 1.0), options=options).converged
