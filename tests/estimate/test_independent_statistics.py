@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from evidence.broken_assumptions import SETUPS, Case, simulate_case
+from evidence.assumptions.cases import SETUPS, Case
+from evidence.assumptions.simulation import simulate_case
 from loopcal import load_robot
 from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_correlated_errors

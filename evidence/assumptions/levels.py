@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stated false-alarm levels of the findings, by groups of codes that share one level."""
+
+from __future__ import annotations
+
+STATED_LEVELS = {
+    "noise.doubtful": 0.01,
+    "noise.residuals-too-large": 0.001,
+    "outliers": 0.05,
+    "prior.tolerances": 0.01,
+    "residuals.common-errors": 0.01,
+    "residuals.model-discrepancy": 0.05,
+    "residuals.patterns": 0.01,
+}
+"""Stated probabilities of alarms where every assumption holds, by group of codes."""
+
+PATTERNS = ("drift", "trend", "sessions-differ", "depend-on", "correlated")
+"""Beginnings of the codes of the residuals that share one level."""
+
+
+def name_group(code: str) -> str:
+    """Return the group of codes that share the level of a code; the code itself without one."""
+    subject, name = code.split(".", 1)
+    if subject == "outliers":
+        return "outliers"
+    if subject == "residuals" and name.startswith(PATTERNS):
+        return "residuals.patterns"
+    return next((group for group in STATED_LEVELS if code.startswith(group)), code)
