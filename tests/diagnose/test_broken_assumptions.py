@@ -121,6 +121,8 @@ def test_codes_of_one_level_form_one_group():
 def document(request, root):
     """Return the committed results of one robot."""
     path = root / "docs" / "evidence" / f"broken_assumptions_{request.param}.json"
+    if not path.exists():
+        pytest.skip(f"{path.name} is made by `make evidence`")
     return json.loads(path.read_text("utf-8"))
 
 

@@ -74,6 +74,8 @@ def fit_delta(readings, measured, sigma, penalty=0.0):
         D = differentiate(NOMINAL + TOLERANCE * z, readings)[1]
         return np.vstack([D.reshape(-1, 9) / sigma, np.sqrt(penalty) * np.eye(9)])
 
-    result = least_squares(residual, np.zeros(9), slope, xtol=1e-14, ftol=1e-15, gtol=1e-14)
+    result = least_squares(
+        residual, np.zeros(9), slope, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
     m = measured.size
     return DenseFit(NOMINAL + TOLERANCE * result.x, -result.fun[:m], slope(result.x)[:m])
