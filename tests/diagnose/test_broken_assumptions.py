@@ -130,7 +130,9 @@ def test_intervals_hold_or_a_finding_explains_why_not(document):
     statistics = document["statistics"]
     assert set(statistics) == {case.name for case in list_cases()}
     assert {s["fits"] for s in statistics.values()} == {400}
-    missed = [case.name for case in list_cases() if not is_met(statistics[case.name], case.is_clean)]
+    missed = [
+        case.name for case in list_cases() if not is_met(statistics[case.name], case.is_clean)
+    ]
     assert missed == document["known to be missed"]
 
 
