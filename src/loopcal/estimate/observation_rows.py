@@ -36,7 +36,8 @@ class ObservationRows:
     kind : what was measured.
     poses : (r,) pose that each row observed; (r, links) where rows compare several poses.
     measured : (t | 1, r, c) [SI]. whitener : (t | 1, r, m, m), zero rows for absent components.
-    nuisance : (r, u) which nuisance parameters each row uses.
+    nuisance : (r, u) which nuisance parameters each row uses. factor : (r, u) the parts of them
+        that it takes; None where all are 1.
     offset : (t | 1, r, m), optional; it is added to the whitened residuals, as an error drawn for a
         resample.
     """
@@ -46,6 +47,7 @@ class ObservationRows:
     measured: FloatArray
     whitener: FloatArray
     nuisance: IntArray = field(default_factory=_no_nuisance)
+    factor: FloatArray | None = None
     offset: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -72,8 +74,9 @@ class ObservationRows:
         if len(rows) == len(self.poses):
             return replace(self, poses=place[self.poses])
         parts = (self.measured[:, rows], self.whitener[:, rows], self.nuisance[rows])
+        factor = None if self.factor is None else self.factor[rows]
         offset = None if self.offset is None else self.offset[:, rows]
-        return ObservationRows(self.kind, place[self.poses[rows]], *parts, offset)
+        return ObservationRows(self.kind, place[self.poses[rows]], *parts, factor, offset)
 
     def take_trials(self, trials: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return measured values and whiteners of some trials; one set stands for all of them."""

@@ -49,8 +49,15 @@ def problem_of(
     """
     nuisance = data.nuisance_parameters if stated is None else stated
     rows = tuple(
-        ObservationRows(o.kind, o.rows, o.measured[None], o.whitener[None], places)
-        for o, places in zip(data.observations, nuisance.indices, strict=True)
+        ObservationRows(
+            o.kind,
+            o.rows,
+            o.measured[None],
+            o.whitener[None],
+            nuisance.indices[i],
+            nuisance.factor(i),
+        )
+        for i, o in enumerate(data.observations)
         if len(o)
     )
     return make_problem(
@@ -63,15 +70,15 @@ def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
     sensors, first = trials.instrument.sensors, trials.trial(0)
     local = collect_nuisance_parameters(first.observations, first.labels)
     rows = []
-    for sensor, measured, places in zip(sensors, trials.measured, local.indices, strict=True):
-        kind = sensor.kind
+    for i, (sensor, measured) in enumerate(zip(sensors, trials.measured, strict=True)):
+        kind, places, factor = sensor.kind, local.indices[i], local.factor(i)
         present = kind.detect_present(measured)
         N = kind.linearize_noise(measured)
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
         white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
-        rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places))
+        rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places, factor))
     recorded = trials.readings[None] if trials.recorded is None else trials.recorded
     return make_problem(
         free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial

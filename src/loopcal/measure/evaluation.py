@@ -83,9 +83,7 @@ def evaluate_measurements(
     """
     collected = measurements.nuisance_parameters if nuisance is None else nuisance
     return tuple(
-        _evaluate_kind(
-            rows, T, collected.select(i, values), collected.indices[i], collected, joints or {}
-        )
+        _evaluate_kind(rows, T, collected.select(i, values), i, collected, joints or {})
         for i, rows in enumerate(measurements.observations)
     )
 
@@ -135,18 +133,18 @@ def _evaluate_kind(
     rows: Observations,
     T: FloatArray,
     values: FloatArray,
-    indices: IntArray,
+    number: int,
     nuisance: NuisanceParameters,
     joints: Mapping[str, FloatArray],
 ) -> EvaluatedRows:
-    kind = rows.kind
+    kind, indices, factor = rows.kind, nuisance.indices[number], nuisance.factor(number)
     evaluation = rows.evaluate(T, values, kind.stack_joints(joints, rows.rows))
     t, r, m = evaluation.residual.shape
     jacobian = evaluation.jacobian
     by_nuisance = np.zeros((t, r, m, len(nuisance)))
     if evaluation.nuisance is not None:
-        free = nuisance.table.free[indices]
-        used = np.broadcast_to(evaluation.nuisance * free[:, None, :], (t, r, m, indices.shape[1]))
+        part = nuisance.table.free[indices] * (1.0 if factor is None else factor)
+        used = np.broadcast_to(evaluation.nuisance * part[:, None, :], (t, r, m, indices.shape[1]))
         columns = np.broadcast_to(indices[:, None, :], used.shape)
         np.put_along_axis(by_nuisance, columns, used, axis=-1)
     return EvaluatedRows(

@@ -91,7 +91,9 @@ def guess_nuisance_values_batch(
     sets = max((len(m) for m in measured), default=len(T))
     values = np.tile(nuisance.values(), (sets, 1))
     for i, members, indices in _list_groups(measurements, nuisance):
-        if known[indices].all():
+        # a drift begins at zero: every row takes another part of it
+        is_kept = known[indices] | measurements.observations[i].kind.is_drift
+        if is_kept.all():
             continue
         chosen = measurements.observations[i].take(members)
         values[:, indices] = _refine_best_candidate(
@@ -99,7 +101,7 @@ def guess_nuisance_values_batch(
             measured[i][:, members],
             T[:, chosen.rows],
             values[:, indices],
-            known[indices],
+            is_kept,
             most,
             steps,
         )
@@ -179,7 +181,7 @@ def _collect_candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> 
     offered = []
     for j, of_set in enumerate(measured):
         try:
-            guesses = kind.guess_values(poses[j if len(poses) > 1 else 0], of_set)
+            guesses = _guess_values(kind, poses[j if len(poses) > 1 else 0], of_set)
         except DataError:
             if len(measured) == 1:
                 raise
@@ -187,6 +189,15 @@ def _collect_candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> 
         offered.append(np.concatenate([guesses, kind.nominal_values[None]]))
     k = max(len(guesses) for guesses in offered)
     return np.stack([np.concatenate([g, np.repeat(g[-1:], k - len(g), axis=0)]) for g in offered])
+
+
+def _guess_values(kind: Kind, T: FloatArray, measured: FloatArray) -> FloatArray:
+    """Return candidates (k, u) of a kind, without a bias or drift."""
+    if not kind.shared_errors:
+        return kind.guess_values(T, measured)
+    own = kind.without_shared_errors().guess_values(T, measured)
+    shared = np.zeros((len(own), len(kind.nuisance_parameters) - own.shape[1]))
+    return np.concatenate([own, shared], axis=1)
 
 
 def _refine_together(

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
 from loopcal.measure.kinds import Kind
+from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
@@ -164,6 +165,11 @@ class Sensor:
             for name in ("session", "group")
         }
         return replace(self, rows=rows, **names)
+
+    @property
+    def drift_part(self) -> FloatArray:
+        """(r,) the part of its session's drift that each row takes, in their order."""
+        return measure_progress(self.session, None)
 
     @property
     def assigned_rows(self) -> IntArray:

@@ -75,10 +75,14 @@ class NuisanceParameters:
         alone; a fixed one keeps its value.
     indices : tuple of (r, u) int
         For each kind of the measurements, the parameters that each row uses.
+    factors : tuple of (r, u) or None, optional
+        The parts of these parameters that each row takes, such as its progress in a drift; None
+        where all are 1. Default: all are 1.
     """
 
     table: ParameterTable
     indices: tuple[IntArray, ...]
+    factors: tuple[FloatArray | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.table)
@@ -90,7 +94,14 @@ class NuisanceParameters:
 
     def select(self, kind: int, values: FloatArray) -> FloatArray:
         """Return values (t, r, u) for the rows of one kind, from those of all parameters (t, U)."""
-        return values[:, self.indices[kind]]
+        factor, used = self.factor(kind), values[:, self.indices[kind]]
+        return used if factor is None else used * factor
+
+    def factor(self, kind: int) -> FloatArray | None:
+        """Return the parts (r, u) of their parameters that the rows of one kind take; None where
+        all are 1.
+        """
+        return self.factors[kind] if self.factors else None
 
     def values(self, stated: Mapping[str, float] | None = None) -> FloatArray:
         """Return values (U,): nominal, or as stated by name; DataError for an unknown name."""
@@ -165,9 +176,10 @@ def collect_nuisance_parameters(
     """
     entries: dict[str, Parameter] = {}
     references: dict[str, FloatArray] = {}
-    indices = []
+    indices, factors = [], []
     for rows in observations:
         kind = rows.kind
+        factors.append(_take_parts(rows) if kind.is_drift.any() else None)
         _check_references(references, kind)
         _check_names(kind)
         owners = {
@@ -191,7 +203,13 @@ def collect_nuisance_parameters(
     for stated in stated_values:
         if stated.name in entries:
             entries[stated.name] = stated.apply_to(entries[stated.name])
-    return NuisanceParameters(ParameterTable(tuple(entries.values())), tuple(indices))
+    table = ParameterTable(tuple(entries.values()))
+    return NuisanceParameters(table, tuple(indices), tuple(factors))
+
+
+def _take_parts(rows: Observations | Sensor) -> FloatArray:
+    """Return the parts (r, u) of their parameters that rows take: of a drift, their progress."""
+    return np.where(rows.kind.is_drift, rows.drift_part[:, None], 1.0)
 
 
 def _list_owners(rows: Observations | Sensor, scope: str, labels: tuple[str, ...]) -> list[str]:

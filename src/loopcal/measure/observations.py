@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
 from loopcal.measure.kinds import Evaluation, Kind
+from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.whitening import compute_whitener
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -44,6 +45,9 @@ class Observations:
     context : name -> (r,), optional
         Notes to each row that enter no equation: `time` [s], `temperature` and `temperature.PLACE`
         [degC], NaN where missing.
+    progress : (r,), optional
+        Progress of each row through its session, from -0.5 to 0.5: the part that it takes of a
+        drift, see `drift_part`. Default: by the time of the rows, or else in their order.
     source : text, optional
         Where the rows come from, such as the name of a file; for messages.
     is_noise_assumed : bool, optional
@@ -73,6 +77,7 @@ class Observations:
     session: TextArray = field(default_factory=lambda: np.array(""))
     group: TextArray = field(default_factory=lambda: np.array(""))
     context: Mapping[str, FloatArray] = field(default_factory=dict)
+    progress: FloatArray = field(default_factory=lambda: np.empty(0))
     source: str = ""
     is_noise_assumed: bool = False
     present: BoolArray = field(init=False)
@@ -110,6 +115,9 @@ class Observations:
             name: check_array(v, f"the context {name!r}", (r,), allow_nan=True)
             for name, v in self.context.items()
         }
+        if len(self.progress):
+            progress = check_array(self.progress, "the progress of the rows", (r,))
+            set_fields(self, progress=progress)
         set_fields(self, rows=rows, measured=measured, covariance=covariance, weight=weight)
         set_fields(self, session=session, group=group, context=context)
         set_fields(self, present=present, whitener=W)
@@ -188,6 +196,15 @@ class Observations:
         """Number of residuals that count: present, in rows of weight above 0."""
         return int(np.count_nonzero(self.present & (self.weight > 0.0)[:, None]))
 
+    @property
+    def drift_part(self) -> FloatArray:
+        """(r,) the part of its session's drift that each row takes. Some rows of a session, such as
+        held-out ones, keep the parts that they have among all rows.
+        """
+        if len(self.progress):
+            return self.progress
+        return measure_progress(self.session, self.context.get("time"))
+
     def evaluate(
         self, T: FloatArray, nuisance: FloatArray | None = None, joints: FloatArray | None = None
     ) -> Evaluation:
@@ -212,6 +229,8 @@ class Observations:
         names = ("rows", "measured", "covariance", "weight", "session", "group")
         arrays: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
         context = {name: values[chosen] for name, values in self.context.items()}
+        if self.kind.is_drift.any():
+            arrays["progress"] = self.drift_part[chosen]
         return replace(self, context=context, **arrays)
 
     def with_weights(self, weight: ArrayLike) -> Self:

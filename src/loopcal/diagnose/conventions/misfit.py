@@ -173,8 +173,11 @@ def compare_with_robot(
         # a row that another interpretation leaves without some of its residuals is absent there
         same = (o.kind.detect_present(measured) == o.present).all(axis=-1)
         whitener = o.whitener * same[..., None, None]
-        rows.append(ObservationRows(o.kind, o.rows, measured, whitener, nuisance.indices[i]))
-    chosen = NuisanceParameters(nuisance.table, tuple(r.nuisance for r in rows))
+        places, factor = nuisance.indices[i], nuisance.factor(i)
+        rows.append(ObservationRows(o.kind, o.rows, measured, whitener, places, factor))
+    chosen = NuisanceParameters(
+        nuisance.table, tuple(r.nuisance for r in rows), tuple(r.factor for r in rows)
+    )
     if is_redundant(free):
         recorded = np.repeat(data.readings[None], count, axis=0)
         problem = make_problem(

@@ -7,6 +7,8 @@ from which it starts, so that before and after differ by the geometry only.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from loopcal.errors import DataError
@@ -64,7 +66,8 @@ def fit_setup_alone(
     stated = ParameterTable(tuple(entries[name] for name in of_some.table.names))
     nothing = np.zeros(0)
     fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-    problem, z = problem_of(fixed, some, NuisanceParameters(stated, of_some.indices)), nothing[None]
+    setup, z = replace(of_some, table=stated), nothing[None]
+    problem = problem_of(fixed, some, setup)
     try:
         fitted = problem.solve(z, problem.start(z)).nuisance
     except DataError:  # too few rows for a closed form

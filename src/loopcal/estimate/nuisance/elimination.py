@@ -143,14 +143,14 @@ class NuisanceElimination:
         """
         values = self.local.values()
         kinds = [
-            (o, places, self.tree.cluster[places].max(axis=1, initial=-1))
-            for o, places in zip(data.observations, self.local.indices, strict=True)
+            (o, i, self.tree.cluster[places].max(axis=1, initial=-1))
+            for i, (o, places) in enumerate(zip(data.observations, self.local.indices, strict=True))
             if len(o) and places.shape[1]
         ]
         for c in range(int(self.tree.cluster.max(initial=-1)) + 1):
             chosen = [
-                (o.take(cluster == c), places[cluster == c])
-                for o, places, cluster in kinds
+                (o.take(cluster == c), i, cluster == c)
+                for o, i, cluster in kinds
                 if (cluster == c).any()
             ]
             self._seek(values, data, chosen, T, joints)
@@ -160,16 +160,23 @@ class NuisanceElimination:
         self,
         values: FloatArray,
         data: Measurements,
-        chosen: list[tuple[Observations, IntArray]],
+        chosen: list[tuple[Observations, int, BoolArray]],
         T: FloatArray,
         joints: Mapping[str, FloatArray],
     ) -> None:
-        """Write the start values of one cluster, whose rows are chosen, into values (U,)."""
-        used = np.unique(np.concatenate([places.ravel() for _, places in chosen]))
-        table = ParameterTable(tuple(self.local.table.entries[i] for i in used))
-        places = tuple(np.searchsorted(used, places) for _, places in chosen)
-        part = replace(data, observations=tuple(rows for rows, _ in chosen))
-        values[used] = guess_nuisance_values(part, T, NuisanceParameters(table, places), joints)
+        """Write the start values of one cluster into values (U,): chosen are its rows, the number
+        of their kind, and which of its rows (r,) they are.
+        """
+        of_kinds = [self.local.indices[i][members] for _, i, members in chosen]
+        parts = [(self.local.factor(i), members) for _, i, members in chosen]
+        used = np.unique(np.concatenate([places.ravel() for places in of_kinds]))
+        setup = NuisanceParameters(
+            ParameterTable(tuple(self.local.table.entries[i] for i in used)),
+            tuple(np.searchsorted(used, places) for places in of_kinds),
+            tuple(None if factor is None else factor[members] for factor, members in parts),
+        )
+        part = replace(data, observations=tuple(rows for rows, _, _ in chosen))
+        values[used] = guess_nuisance_values(part, T, setup, joints)
 
     def keep_apart(
         self, parameters: int, nodes: IntArray

@@ -246,10 +246,15 @@ def evaluate_rows(
     T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
     used = nuisance is not None and rows.nuisance.shape[1]
     nuisance_values = nuisance[:, rows.nuisance] if nuisance is not None and used else None
+    if rows.factor is not None and nuisance_values is not None:
+        nuisance_values = nuisance_values * rows.factor
     joints = rows.kind.stack_joints(poses.joints, rows.poses)
     if joints is not None:
         joints = np.broadcast_to(joints, (len(trials), *joints.shape[1:]))
-    return rows.kind.evaluate(T, measured, nuisance_values, joints), white
+    evaluated = rows.kind.evaluate(T, measured, nuisance_values, joints)
+    if rows.factor is not None and evaluated.nuisance is not None:
+        evaluated = evaluated._replace(nuisance=evaluated.nuisance * rows.factor[:, None, :])
+    return evaluated, white
 
 
 def linearize_rows(

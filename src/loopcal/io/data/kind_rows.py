@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +28,8 @@ from loopcal.io.data.kind_settings import (
     read_noise,
     read_noise_source,
 )
+from loopcal.io.data.shared_error_settings import SETTINGS as SHARED_ERRORS
+from loopcal.io.data.shared_error_settings import read_shared_errors
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import EXAMPLES
@@ -47,6 +49,7 @@ SETTINGS: Mapping[str, str] = {
     '`"*.x": 5 um`',
     "noise_source": "`assumed` where nobody stated the noise, as in imported files; by default "
     "`stated`. Assumed noise decides no quality gate",
+    **SHARED_ERRORS,
     "unknowns": "name or pattern -> prior knowledge of a setup parameter (frame, target, surface, "
     "offset), or `fixed`",
     "session": "session of all rows whose column states none",
@@ -55,6 +58,9 @@ SETTINGS: Mapping[str, str] = {
     "the robot file by default",
     "poses": "another file, in the same folder, with the readings of the poses",
 }
+KIND_SETTINGS = ("noise", "noise_source", *SHARED_ERRORS)
+"""Settings beside those of the kind itself."""
+
 POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
 """Settings of a file without measured values."""
 
@@ -63,7 +69,8 @@ POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
 class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 
-    `is_noise_assumed` where the settings say that nobody stated the noise.
+    `is_noise_assumed` where the settings say that nobody stated the noise. `shared_errors` are
+    standard deviations of biases and drifts, see `read_shared_errors`.
     """
 
     kind: Kind
@@ -71,6 +78,7 @@ class KindRows:
     rows: IntArray
     location: Location
     is_noise_assumed: bool = False
+    shared_errors: Mapping[str, float] = field(default_factory=dict)
 
 
 def has_measured_values(table: Table) -> bool:
@@ -158,8 +166,9 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
             read_noise(file, content, kind, ()),
             read_noise_source(file, content, ()),
         )
-        return (KindRows(kind, noise, rows, (), is_assumed),)
-    allowed = [key for key in SETTINGS if key not in ("kind", "noise", "noise_source")]
+        kind, shared = read_shared_errors(file, content, kind, ())
+        return (KindRows(kind, noise, rows, (), is_assumed, shared),)
+    allowed = [key for key in SETTINGS if key not in ("kind", *KIND_SETTINGS)]
     refuse_unknown_keys(file, list(content), allowed)
     if not isinstance(several, dict) or not all(isinstance(n, dict) for n in several.values()):
         sentence = "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
@@ -173,10 +182,12 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     for label, node in several.items():
         place = ("kinds", label)
         kind = read_kind(file, node, place).with_tool(robot.tool)
-        allowed = ["kind", "noise", "noise_source", *list_kind_settings(type(kind))]
+        allowed = ["kind", *KIND_SETTINGS, *list_kind_settings(type(kind))]
         refuse_unknown_keys(file, list(node), allowed, place)
         noise, rows = read_noise(file, node, kind, place), np.flatnonzero(cells == label)
-        kinds.append(KindRows(kind, noise, rows, place, read_noise_source(file, node, place)))
+        is_assumed = read_noise_source(file, node, place)
+        kind, shared = read_shared_errors(file, node, kind, place)
+        kinds.append(KindRows(kind, noise, rows, place, is_assumed, shared))
     return tuple(kinds)
 
 

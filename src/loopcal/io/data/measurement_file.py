@@ -124,8 +124,8 @@ def _join_tables(
     ]
     read = _leave_out_unfilled(read)
     settings = [
-        (table.settings, [rows for rows, _ in of_file])
-        for table, of_file in zip(tables, read, strict=True)
+        (table.settings, [rows for rows, _ in of_file], _join_shared_errors(entries))
+        for table, of_file, entries in zip(tables, read, kinds, strict=True)
         if of_file
     ]
     with name_files(*(table.path for table in tables)):
@@ -144,6 +144,11 @@ def _join_tables(
         check_duplicates(data, allow=allow_duplicates, places=places)
     is_named = _find_named_poses(kinds, read, poses.members, len(poses.labels))
     return data if is_named.all() else data.take(is_named)
+
+
+def _join_shared_errors(entries: Sequence[KindRows]) -> dict[str, float]:
+    """Return the standard deviations of the biases and drifts of all kinds of a file."""
+    return {name: sd for entry in entries for name, sd in entry.shared_errors.items()}
 
 
 def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[int, str]:

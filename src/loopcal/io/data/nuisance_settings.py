@@ -14,7 +14,7 @@ session in front, a name denotes the parameter of every session. The last matchi
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
@@ -50,29 +50,36 @@ RECORDS = {
 
 
 def read_stated_values(
-    files: Sequence[tuple[YamlFile, Sequence[Observations]]], labels: tuple[str, ...]
+    files: Sequence[tuple[YamlFile, Sequence[Observations], Mapping[str, float]]],
+    labels: tuple[str, ...],
 ) -> tuple[StatedValue, ...]:
     """Return the knowledge that files state of the setup parameters of their own rows.
 
     Parameters
     ----------
-    files : settings of each file, and its rows. labels : names of the poses.
+    files : settings of each file, its rows, and the standard deviations of their biases and drifts
+        by name without the session, 0 where there is none. labels : names of the poses.
 
     Raises
     ------
     FileError : a name that is not a parameter of the file, a bad statement, contradicting files.
     DataError : two kinds of a file state one parameter differently.
     """
-    from loopcal.measure import collect_nuisance_parameters
+    from loopcal.measure import StatedValue, collect_nuisance_parameters
 
     known: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
-    for file, observations in files:
+    for file, observations, shared in files:
         stated = file.content.get(KEY, {})
         if not isinstance(stated, dict):
             sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
             raise file.error(sentence, (KEY,))
         of_file: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
-        entries = collect_nuisance_parameters(observations, labels).table.entries if stated else ()
+        entries: tuple[Parameter, ...] = ()
+        if stated or shared:
+            entries = collect_nuisance_parameters(observations, labels).table.entries
+        for name, sd in shared.items():
+            of_sessions = [e.name for e in entries if e.name == name or e.name.endswith(f".{name}")]
+            of_file |= {n: (StatedValue(n, sd), file, (KEY,)) for n in of_sessions}
         for pattern, node in stated.items():
             place = (KEY, pattern)
             matching = _match(file, entries, pattern)

@@ -8,10 +8,12 @@ their squares. Lengths are not position errors: they are known along one line on
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from loopcal.measure.kinds.kind import Kind
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.measure.kinds.kind import Kind
 
 
 class ErrorGroup(NamedTuple):

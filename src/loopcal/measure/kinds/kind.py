@@ -18,8 +18,8 @@ m residuals (often c), u nuisance parameters of the kind, j joints that it sense
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, fields
+from collections.abc import Mapping
+from dataclasses import Field, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self, cast
 
@@ -28,9 +28,17 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
-from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
+from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, drop_rounding
+from loopcal.measure.kinds.settings_text import list_changed_settings
 from loopcal.measure.kinds.setup_parameters import SetupItem
-from loopcal.numerics.rounding import without_rounding
+from loopcal.measure.kinds.shared_errors import (
+    DRIFT,
+    SHARED_ERRORS,
+    add_shared_errors,
+    make_shared_errors,
+    spread_components,
+    sum_shared_errors,
+)
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -77,17 +85,15 @@ class Kind(ABC):
 
     def __post_init__(self) -> None:
         names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
-        for name in names:
-            if name not in self.allowed_unknown:
-                raise DataError(
-                    f"{name!r} cannot be unknown in the kind {self.name!r}; allowed are "
-                    f"{', '.join(self.allowed_unknown)}"
-                )
+        allowed = (*self.allowed_unknown, *SHARED_ERRORS)
+        for name in (name for name in names if name not in allowed):
+            sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
+            raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
-        return f"{type(self).__name__}({', '.join(self._changed_settings())})"
+        return f"{type(self).__name__}({', '.join(list_changed_settings(self))})"
 
     # --- what a kind states about itself
 
@@ -120,12 +126,9 @@ class Kind(ABC):
         """Return the values (.., r, j) of the sensed joints at the poses of rows (r,), from those
         of all joints by name (.., n); None where it senses none. DataError if one is missing.
         """
-        for name in self.sensed_joints:
-            if name not in joints:
-                raise DataError(
-                    f"the kind {self.name!r} needs the values of joint {name!r}; pass them as "
-                    "`joints`"
-                )
+        for name in (name for name in self.sensed_joints if name not in joints):
+            sentence = f"the kind {self.name!r} needs the values of joint {name!r}"
+            raise DataError(f"{sentence}; pass them as `joints`")
         columns = [joints[name][..., rows] for name in self.sensed_joints]
         return np.stack(columns, axis=-1) if columns else None
 
@@ -151,14 +154,35 @@ class Kind(ABC):
 
     @cached_property
     def setup_items(self) -> Mapping[str, SetupItem]:
-        """The setup items that are unknown, in order."""
+        """The setup items that are unknown, in order; errors that rows share come last."""
+        possible = {**self.possible_setup, **make_shared_errors(self)}
+        return {**self.own_items, **{name: possible[name] for name in self.shared_errors}}
+
+    @cached_property
+    def own_items(self) -> Mapping[str, SetupItem]:
+        """The frames, targets, surfaces and offsets that are unknown, in order."""
         possible = self.possible_setup
-        return {name: possible[name] for name in self.unknown}
+        return {name: possible[name] for name in self.unknown if name not in SHARED_ERRORS}
+
+    @property
+    def shared_errors(self) -> tuple[str, ...]:
+        """Which of "bias" and "drift" are unknown."""
+        return tuple(name for name in SHARED_ERRORS if name in self.unknown)
+
+    @cached_property
+    def is_drift(self) -> BoolArray:
+        """(u,) nuisance parameters of which a row takes the part of its progress."""
+        items = self.setup_items.items()
+        return np.array([name == DRIFT for name, item in items for _ in item.parameters], bool)
 
     @cached_property
     def nuisance_parameters(self) -> tuple[Parameter, ...]:
         """The u parameters of all unknown items; rows of one scope share a value."""
         return tuple(p for item in self.setup_items.values() for p in item.parameters)
+
+    def without_shared_errors(self) -> Self:
+        """Return the kind without a bias or drift."""
+        return replace(cast(Any, self), unknown=tuple(self.own_items))
 
     @property
     def references(self) -> Mapping[str, FloatArray]:
@@ -257,7 +281,9 @@ class Kind(ABC):
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = self._drop_rounding(self._evaluate(T, filled, values, joints))
+        result = drop_rounding(self._evaluate(T, filled, values, joints))
+        if self.shared_errors:
+            result = add_shared_errors(self, result, filled, values)
         present = self.detect_present(measured)
         if np.all(present):
             return result
@@ -301,6 +327,8 @@ class Kind(ABC):
         """
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         joints = np.zeros_like(noise) if joints is None else joints
+        if self.shared_errors:
+            noise = noise + sum_shared_errors(self, values) @ spread_components(self).T
         return self._measure(T, noise, values, joints)
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
@@ -343,21 +371,6 @@ class Kind(ABC):
         """Which columns are angles."""
         return tuple(column.dimension is Dimension.ANGLE for column in self.columns)
 
-    def _drop_rounding(self, evaluation: Evaluation) -> Evaluation:
-        """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as
-        those by the place of a target do between parallel poses.
-
-        They are compared with derivatives by the platform twist. A meter is compared with a radian
-        there; the tolerance is so small that the size of a machine does not matter.
-        """
-        if evaluation.nuisance is None:
-            return evaluation
-        by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
-        by_twist = by_twist.sum(axis=-2) if self.poses_per_row > 1 else by_twist
-        return evaluation._replace(
-            nuisance=without_rounding(evaluation.nuisance, by_twist[..., None])
-        )
-
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
         """Return derivatives side by side: by the twist, then by each unknown setup item.
 
@@ -372,7 +385,7 @@ class Kind(ABC):
         -------
         rows : (*shape, 6 + u)
         """
-        widths = {"twist": 6} | {k: len(item.parameters) for k, item in self.setup_items.items()}
+        widths = {"twist": 6} | {k: len(item.parameters) for k, item in self.own_items.items()}
         columns = [
             np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
             for name, w in widths.items()
@@ -383,18 +396,4 @@ class Kind(ABC):
         """Return the evaluation of residuals (t, r, m) with derivatives (t, r, m, 6 + u) from
         `join_columns`.
         """
-        return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.setup_items else None)
-
-    def _changed_settings(self) -> Iterator[str]:
-        for setting in fields(cast(Any, self)):
-            value, usual = getattr(self, setting.name), setting.default
-            if setting.default_factory is not MISSING:
-                usual = setting.default_factory()
-            if setting.init and not np.array_equal(value, cast(Any, usual)):
-                text = repr(value)
-                if isinstance(value, np.ndarray):
-                    is_small = value.size <= 16
-                    text = (
-                        f"{np.round(value, 6).tolist() if is_small else f'<array {value.shape}>'}"
-                    )
-                yield f"{setting.name}={text}"
+        return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.own_items else None)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -58,3 +59,17 @@ def is_incomplete(columns: FloatArray) -> BoolArray:
     """Return the rows of columns (.., c) in which some values are missing, but not all."""
     missing = np.isnan(columns)
     return np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
+
+
+def drop_rounding(evaluation: Evaluation) -> Evaluation:
+    """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as those by
+    the place of a target do between parallel poses.
+
+    They are compared with derivatives by the platform twist. A meter is compared with a radian
+    there; the tolerance is so small that the size of a machine does not matter.
+    """
+    if evaluation.nuisance is None:
+        return evaluation
+    by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
+    by_twist = by_twist.sum(axis=-2) if evaluation.jacobian.ndim > 4 else by_twist
+    return evaluation._replace(nuisance=without_rounding(evaluation.nuisance, by_twist[..., None]))

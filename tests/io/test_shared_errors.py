@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bias and a drift of each session, declared in one line of a measurement file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.diagnose import adjust_uncertainty
+from loopcal.errors import FileError
+from loopcal.estimate import identify
+from loopcal.io import load_measurements, save_measurements
+from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure
+
+DELTA = ROBOTS["linear-delta"]
+TRUE_BIAS = np.array([[30.0, -10.0, 5.0], [-20.0, 15.0, -5.0], [-10.0, -5.0, 0.0]]) * LENGTH
+TRUE_DRIFT = np.array([40.0, -30.0, 10.0]) * LENGTH
+PATTERNS = {"residuals.sessions-differ", "residuals.trend", "residuals.drift"}
+
+
+def save_with(path, data, *lines):
+    """Save measurements with further settings, and return the path."""
+    save_measurements(data, path, DELTA)
+    text = path.read_text("utf-8")
+    path.write_text("".join(f"# {line}\n" for line in lines) + text, "utf-8")
+    return path
+
+
+def measure_biased(seed=3):
+    """Measure a delta in three sessions, each with its bias."""
+    group = np.arange(30) % 3
+    errors = draw_errors(30, 3, seed) + TRUE_BIAS[group] / LENGTH
+    return measure(
+        "linear-delta", "component", errors, seed, np.array(["mon", "tue", "wed"])[group]
+    )
+
+
+def measure_drifting(seed=3, order=None):
+    """Measure a delta with a drift in time; rows are in this order of time."""
+    order = np.arange(30) if order is None else order
+    progress = order / 29.0 - 0.5
+    errors = draw_errors(30, 3, seed) + progress[:, None] * TRUE_DRIFT / LENGTH
+    context = {"time": 60.0 * order}
+    return measure("linear-delta", "component", errors, seed, context=context)
+
+
+def list_estimates(fit):
+    """Return value and standard deviation of each setup parameter by name."""
+    triples = zip(fit.nuisance.names, fit.nuisance.estimate, fit.nuisance.sd, strict=True)
+    return {name: (value, sd) for name, value, sd in triples}
+
+
+def test_a_session_bias_is_declared_in_one_line_and_estimated(tmp_path):
+    truth, data = measure_biased()
+    undeclared = load_measurements(save_with(tmp_path / "a.csv", data), DELTA)
+    line = "session_bias: {x: 200 um, y: 200 um, z: 200 um}"
+    declared = load_measurements(save_with(tmp_path / "b.csv", data, line), DELTA)
+    before, fit = identify(DELTA, undeclared), identify(DELTA, declared)
+    estimates = list_estimates(fit)
+    assert len(estimates) == 9
+    for i, session in enumerate(("mon", "tue", "wed")):
+        for j, axis in enumerate("xyz"):
+            value, sd = estimates[f"{session}.component.bias.{axis}"]
+            assert abs(value - TRUE_BIAS[i, j]) < 4.0 * sd
+            assert sd < 200e-6
+    # it is cured: the residuals are those of the noise, and nothing depends on the session
+    assert fit.residual_test.chi_square < 0.1 * before.residual_test.chi_square
+    assert "residuals.sessions-differ" in {
+        f.code for f in adjust_uncertainty(before, undeclared).findings
+    }
+    assert not PATTERNS & {f.code for f in adjust_uncertainty(fit, declared).findings}
+    error, error_before = (np.linalg.norm(f.robot.values - truth) for f in (fit, before))
+    assert error < error_before
+
+
+@pytest.mark.parametrize("is_sorted", [True, False])
+def test_a_drift_is_declared_in_one_line_and_estimated(tmp_path, is_sorted):
+    order = np.arange(30) if is_sorted else np.random.default_rng(1).permutation(30)
+    _, data = measure_drifting(order=order)
+    path = save_with(tmp_path / "a.csv", data, "session_drift: unknown")
+    declared = load_measurements(path, DELTA)
+    fit = identify(DELTA, declared)
+    for axis, true in zip("xyz", TRUE_DRIFT, strict=True):
+        value, sd = list_estimates(fit)[f"component.drift.{axis}"]
+        assert abs(value - true) < 4.0 * sd
+        assert sd < 0.1 * np.abs(TRUE_DRIFT).max()
+    assert "residuals.drift" in {
+        f.code for f in adjust_uncertainty(identify(DELTA, data), data).findings
+    }
+    assert not PATTERNS & {f.code for f in adjust_uncertainty(fit, declared).findings}
+
+
+def test_held_out_rows_have_the_drift_that_they_have_in_the_whole_session(tmp_path):
+    _, data = measure_drifting()
+    path = save_with(tmp_path / "a.csv", data, "session_drift: unknown")
+    declared = load_measurements(path, DELTA)
+    (rows,) = declared.observations
+    half = declared.take(np.arange(5, 20))
+    assert np.allclose(half.observations[0].drift_part, rows.drift_part[5:20])
+    report = lc.calibrate(DELTA, declared, lc.CalibrationOptions(hold_out=0.3))
+    assert report.validation is not None
+    plain = lc.calibrate(DELTA, data, lc.CalibrationOptions(hold_out=0.3))
+    codes = [{f.code for f in r.findings} for r in (report, plain)]
+    assert "residuals.drift" in codes[1] - codes[0]
+    assert report.verdict is not lc.Verdict.NOT_CALIBRATED
+
+
+def test_components_without_a_line_have_no_bias_and_files_are_written_as_read(tmp_path):
+    _, data = measure_biased()
+    path = save_with(tmp_path / "a.csv", data, "session_bias: {x: 0.1 mm, z: unknown}")
+    loaded = load_measurements(path, DELTA)
+    table = loaded.nuisance_parameters.table
+    found = {e.name: (e.free, e.tolerance) for e in table.entries}
+    assert found["mon.component.bias.x"] == (True, pytest.approx(1e-4))
+    assert found["mon.component.bias.y"][0] is False
+    assert found["mon.component.bias.z"][0] is True
+    assert found["mon.component.bias.z"][1] is None
+    save_measurements(loaded, tmp_path / "b.csv", DELTA)
+    again = load_measurements(tmp_path / "b.csv", DELTA).nuisance_parameters.table
+    assert [(e.name, e.free) for e in again.entries] == [(e.name, e.free) for e in table.entries]
+    assert np.array_equal(again.tolerance, table.tolerance, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("session_bias: yes", "write 'session_bias: unknown'"),
+        ("session_bias: {w: 1 um}", "'w'"),
+        ("session_bias: {x: 5}", "unit"),
+        ("session_bias: {x: 5 deg}", "deg"),
+        ("session_drift: {x: 0 um}", "positive number"),
+        ("session_drift: [x]", "write 'session_drift: unknown'"),
+    ],
+)
+def test_wrong_lines_are_refused_at_their_place(tmp_path, line, words):
+    _, data = measure_biased()
+    with pytest.raises(FileError, match=words) as caught:
+        load_measurements(save_with(tmp_path / "a.csv", data, line), DELTA)
+    assert "a.csv:1" in str(caught.value)
+
+
+def test_a_bias_and_an_unknown_frame_together_begin_from_the_frame(tmp_path):
+    errors = draw_errors(20, 9, 2) + (np.arange(20) / 19.0 - 0.5)[:, None] * np.tile(
+        [30.0, 0, 0], 3
+    )
+    robot = ROBOTS["hexapod-42"]
+    _, data = measure("hexapod-42", "tracker", errors, 2)
+    (rows,) = data.observations
+    kind = replace(rows.kind, unknown=("frame", "drift"))
+    declared = replace(data, observations=(replace(rows, kind=kind),))
+    fit = identify(robot, declared)
+    value, sd = list_estimates(fit)["position.drift.x"]
+    assert fit.converged
+    assert abs(value - 30.0 * LENGTH) < 4.0 * sd
+    assert sd < 10.0 * LENGTH

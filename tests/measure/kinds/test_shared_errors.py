@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every kind can have a bias and a drift of each session."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.errors import DataError
+from loopcal.measure import KINDS, Gaussian, Observations, Sensor, collect_nuisance_parameters
+from loopcal.measure.kinds.shared_errors import measure_progress
+from tests.measure.kinds.test_contract import (
+    attach_frame_and_tool,
+    draw_joint_values,
+    platform_poses,
+)
+
+KINDS_WITH_ERRORS = [
+    pytest.param(
+        dataclasses.replace(kind, unknown=(*kind.unknown, "bias", "drift")), id=f"{name}-{i}"
+    )
+    for name, cls in KINDS.items()
+    for i, kind in enumerate(cls.examples()[:2])
+]
+
+
+@pytest.mark.parametrize("kind", KINDS_WITH_ERRORS)
+def test_what_is_measured_with_a_bias_has_no_residual_and_right_derivatives(kind):
+    kind = attach_frame_and_tool(kind)
+    T = platform_poses(kind, 1, 3)
+    joints = draw_joint_values(kind, T)
+    u = len(kind.nuisance_parameters)
+    shared = u - len(kind.without_shared_errors().nuisance_parameters)
+    assert shared > 0
+    assert kind.is_drift[-shared:].sum() * 2 == shared
+    values = np.tile(kind.nominal_values, (1, 3, 1))
+    values[..., -shared:] += 1e-5 * np.random.default_rng(1).standard_normal((1, 3, shared))
+    measured = kind.measure(T, np.zeros((1, 3, len(kind.noise_columns))), values, joints)
+    evaluated = kind.evaluate(T, measured, values, joints)
+    assert_allclose(evaluated.residual, 0.0, atol=1e-8)  # second order where rotations are measured
+    plain = kind.evaluate(T, measured, None, joints)
+    assert np.abs(plain.residual).max() > 1e-6
+    for i in range(u - shared, u):
+        moved = values.copy()
+        moved[..., i] += 1e-3
+        change = kind.evaluate(T, measured, moved, joints).residual - evaluated.residual
+        assert_allclose(evaluated.nuisance[..., i], change / 1e-3, atol=1e-9)
+
+
+def test_only_known_setup_items_are_allowed_and_the_message_names_the_errors():
+    with pytest.raises(DataError, match="bias, drift"):
+        KINDS["pose"](unknown=("offset",))
+
+
+def test_progress_is_that_in_time_within_each_session():
+    session = np.array(["a", "b", "a", "b", "a"])
+    assert_allclose(measure_progress(session, None), [-0.5, -0.5, 0.0, 0.5, 0.5])
+    time = np.array([30.0, 5.0, 0.0, 1.0, 10.0])
+    expected = [0.5, 0.5, -0.5, -0.5, -1.0 / 6.0]
+    assert_allclose(measure_progress(session, time), expected, atol=1e-15)
+    time[2] = np.nan  # not all known: the order counts
+    assert_allclose(measure_progress(session, time), [-0.5, -0.5, 0.0, 0.5, 0.5])
+    assert_allclose(measure_progress(np.array(["one"]), None), [0.0])
+
+
+def test_rows_take_their_part_of_a_drift():
+    kind = KINDS["component"](("x", "z"), unknown=("bias", "drift")).with_tool(np.eye(4))
+    rows = Observations.from_sigma(kind, np.arange(3), np.zeros((3, 2)), 1e-6, session="s")
+    setup = collect_nuisance_parameters([rows], ("1", "2", "3"))
+    assert setup.table.names == tuple(
+        f"s.component.{item}.{axis}" for item in ("bias", "drift") for axis in "xz"
+    )
+    used = setup.select(0, np.array([[1.0, 2.0, 10.0, 20.0]]))
+    assert_allclose(used[0], [[1, 2, -5, -10], [1, 2, 0, 0], [1, 2, 5, 10]])
+    sensor = Sensor(kind, Gaussian(np.full(2, 1e-6)), np.arange(3), session="s").assign_rows(3)
+    assert_allclose(
+        collect_nuisance_parameters([sensor], ("1", "2", "3")).factors[0], used[0] / [1, 2, 10, 20]
+    )
+
+
+def test_two_instruments_have_errors_of_their_own():
+    wires = [
+        KINDS["distance"](anchor=np.ones(3), anchor_name=name, unknown=("bias",))
+        for name in ("wire1", "wire2")
+    ]
+    names = [p.name for kind in wires for p in kind.nuisance_parameters]
+    assert names == ["wire1.bias.distance", "wire2.bias.distance"]
