@@ -303,3 +303,51 @@ def test_held_out_rows_are_predicted_with_the_discrepancy():
     for numbers, H, _, _ in blocks.groups:
         variance = noise**2 * np.einsum("bmk,bmk->b", H, H)
         assert np.allclose(np.sqrt(variance), u.position[numbers], rtol=0.02)
+
+
+def test_a_wrong_proportion_of_the_sigmas_is_no_discrepancy():
+    """Positions 1.6 times as noisy as stated, orientations as stated."""
+    robot, found = lc.load_robot("3-prs"), 0
+    for seed in range(12):
+        data, noisy = (measure(robot, 18, seed, scale) for scale in (1.0, 1.6))
+        (rows,), (other,) = data.observations, noisy.observations
+        measured = np.concatenate([rows.measured[:, :3], other.measured[:, 3:]], axis=1)
+        data = replace(data, observations=(replace(rows, measured=measured),))
+        found += bool(find(add_model_discrepancy(identify(robot, data, MAP()), data)))
+    assert found <= 3  # 5 % each, with a probability of 0.2 % for more
+
+
+def test_errors_that_each_pose_has_of_its_own_show_in_repeats():
+    """Twelve poses, three times each: the errors of 60 um repeat, the noise of 10 um does not."""
+    robot, inside, before, found = delta(), [], [], 0
+    coordinates = np.repeat(sample_workspace(robot, 12, 7).coordinates, 3, axis=0)
+    held_out = sample_workspace(robot, 30, 8).solution.q
+    sensor = Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, SIGMA)))
+    for seed in range(12):
+        machine = robot.with_values(sample_truth(robot, 1, seed)[0])
+        rng = np.random.default_rng(seed)
+        data = simulate(machine, coordinates, Instrument((sensor,)), seed)
+        data = displaced(data, np.repeat(60 * UM * rng.standard_normal((12, 3)), 3, axis=0))
+        fit = identify(robot, data)
+        adjusted = adjust_uncertainty(fit, data)
+        findings = find(adjusted)
+        found += bool(findings)
+        true = places(machine, held_out) + 60 * UM * rng.standard_normal((30, 3))
+        error = np.abs(places(fit.robot, held_out) - true)
+        for each, shares in ((fit, before), (adjusted, inside)):
+            u = pose_uncertainty(each, forward(fit.robot, held_out), frame="base")
+            shares.append((error <= u.expanded[:, 3:]).mean())
+    assert found == 12
+    assert np.mean(before) < 0.8
+    assert np.mean(inside) > 0.93
+
+
+def test_repeats_of_a_model_that_fits_show_nothing():
+    robot, found = delta(), 0
+    coordinates = np.repeat(sample_workspace(robot, 12, 7).coordinates, 3, axis=0)
+    sensor = Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, SIGMA)))
+    for seed in range(16):
+        machine = robot.with_values(sample_truth(robot, 1, seed)[0])
+        data = simulate(machine, coordinates, Instrument((sensor,)), seed)
+        found += bool(find(adjust_uncertainty(identify(robot, data), data)))
+    assert found <= 4  # 6 % each

@@ -42,25 +42,21 @@ class VarianceComponent(NamedTuple):
     ratio: float
 
 
-def compute_component_tail(weights: FloatArray, y: FloatArray, rest: float, degrees: int) -> float:
+def compute_component_tail(weights: FloatArray, y: FloatArray) -> float:
     """Return the probability of a larger Q without the component; 1 where there is no test.
 
     Parameters
     ----------
-    weights, y : (k,) elements. rest : sum of squares of further elements of weight 0.
-    degrees : number of all elements, k at least.
+    weights, y : (k,) elements.
     """
-    total, largest = float((y**2).sum()) + rest, float(weights.max(initial=0.0))
+    total, largest = float((y**2).sum()), float(weights.max(initial=0.0))
     if not (total > 0.0 and largest > 0.0):
         return 1.0
-    quotient = float((weights * y**2).sum()) / (largest * total)
-    values, counts = np.r_[weights / largest, 0.0] - quotient, np.ones(len(y) + 1)
-    counts[-1] = degrees - len(y)
-    return _tail(values[counts > 0.0], counts[counts > 0.0])
+    return _tail(weights / largest - float(weights @ y**2) / (largest * total))
 
 
 def estimate_variance_component(
-    weights: FloatArray, y: FloatArray, rest: float, degrees: int, known: float = 0.0
+    weights: FloatArray, y: FloatArray, known: float = 0.0
 ) -> VarianceComponent:
     """Return the size of a component; arguments as of `compute_component_tail`.
 
@@ -70,8 +66,8 @@ def estimate_variance_component(
     tau = np.geomspace(SMALLEST, LARGEST, STEPS) / np.sqrt(largest)
     ratio = tau**2
     scale = 1.0 + ratio[:, None] * weights
-    square = (y**2 / scale).sum(axis=1) + rest + known
-    count = degrees + known
+    square = (y**2 / scale).sum(axis=1) + known
+    count = len(y) + known
     density = -0.5 * np.log(scale).sum(axis=1) - 0.5 * count * np.log(square)
     share = np.exp(density - density.max()) * np.gradient(tau)
     share /= share.sum()
@@ -83,10 +79,10 @@ def estimate_variance_component(
     return VarianceComponent(mean, 2.0 * mean**2 / spread, float(ratio[np.argmax(density)]))
 
 
-def _tail(values: FloatArray, counts: FloatArray) -> float:
-    """Return P(sum of values_i times chi-square of counts_i degrees > 0), saddlepoint t:
+def _tail(values: FloatArray) -> float:
+    """Return P(sum of values_i times chi-square of one degree > 0), saddlepoint t:
 
-    K(t) = -1/2 sum counts log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
+    K(t) = -1/2 sum log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
     v = t sqrt(K''(t)), tail = 1 - Phi(w + log(v / w) / w).
     """
     from scipy.special import ndtr
@@ -96,16 +92,16 @@ def _tail(values: FloatArray, counts: FloatArray) -> float:
     low, high = 0.5 / values.min(), 0.5 / values.max()
 
     def slope(t: float) -> float:
-        return float((counts * values / (1.0 - 2.0 * t * values)).sum())
+        return float((values / (1.0 - 2.0 * t * values)).sum())
 
     t = 0.0
     for _ in range(NEWTON):  # K' grows: bisection cannot fail
         low, high = (t, high) if slope(t) < 0.0 else (low, t)
         t = 0.5 * (low + high)
-    K = -0.5 * float((counts * np.log1p(-2.0 * t * values)).sum())
-    curvature = 2.0 * float((counts * (values / (1.0 - 2.0 * t * values)) ** 2).sum())
+    K = -0.5 * float(np.log1p(-2.0 * t * values).sum())
+    curvature = 2.0 * float(((values / (1.0 - 2.0 * t * values)) ** 2).sum())
     w, v = np.sign(t) * np.sqrt(max(-2.0 * K, 0.0)), t * np.sqrt(curvature)
     if abs(w) < 1e-4:  # the limit at the mean
-        third = 8.0 * float((counts * (values / (1.0 - 2.0 * t * values)) ** 3).sum())
+        third = 8.0 * float(((values / (1.0 - 2.0 * t * values)) ** 3).sum())
         return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
     return float(ndtr(-(w + np.log(v / w) / w)))

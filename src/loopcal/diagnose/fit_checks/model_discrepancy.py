@@ -5,9 +5,12 @@ uncertainty.
 With the whitened rows A of the parameters, the rows of the prior, and the rows Phi of slow errors
 of the poses (`SmoothErrors`), the elimination of the parameters leaves (y, S) of the residuals and
 Phi. If the model is right, y has the variance sigma^2; with errors of amplitude tau it has
-sigma^2 + tau^2 S S'. The test does not need sigma, and does not depend on the order of the poses.
-Displacements and rotations of the tool are tested one after the other, the more significant first.
-See docs/theory/uncertainty.md.
+sigma^2 + tau^2 S S'. The test looks at the residuals that such errors can change, which differ by
+their weights alone: it needs no sigma, neither of positions nor of orientations, and does not
+depend on the order of the poses. Displacements and rotations of the tool are tested one after the
+other, the more significant first. Where repeats of a pose agree much better with each other than
+with the fit, and no slow errors are found, every pose may have an error of its own. See
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -17,16 +20,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.diagnose.fit_checks.repeated_poses import LEVEL as REPEATS_LEVEL
+from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
 from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, SIGNIFICANCE
-from loopcal.estimate.poses.smooth_errors import SmoothErrors, describe_smooth_errors
+from loopcal.estimate.poses.smooth_errors import CENTERS, SmoothErrors, describe_smooth_errors
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import forward
+from loopcal.numerics.chi_square import compute_f_tail
 from loopcal.numerics.variance_component import (
     VarianceComponent,
     compute_component_tail,
@@ -50,6 +56,9 @@ UNSEEN = 1e-8
 NEGLIGIBLE = 1e-12
 """Share of the largest variance by slow errors below which one is rounding."""
 
+ROUGH, MOST_ROUGH = 1e-3, 150
+"""Length, in radii, over which errors vary that no two poses share, and most poses for these."""
+
 ROTATION, PLACE = 0, 1
 """Number of the errors of rotation and of place."""
 
@@ -61,16 +70,13 @@ class SlowErrorRows:
     Attributes
     ----------
     errors : of unit amplitude. slope : (p, m) change of the estimates [SI] with the coefficients.
-    rows : (m, m) S. residuals : (m,) y. rest : sum of squares that no slow error touches.
-    degrees : number of residuals, those of `rest` included.
+    rows : (m, m) S. residuals : (m,) y.
     """
 
     errors: SmoothErrors
     slope: FloatArray
     rows: FloatArray
     residuals: FloatArray
-    rest: float
-    degrees: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +86,12 @@ class SlowErrors:
     Attributes
     ----------
     rows : that show them. found : number of the errors, of rotation or place -> size, probability.
+    is_slow : whether neighboring poses share them; otherwise each pose has its own.
     """
 
     rows: SlowErrorRows
     found: Mapping[int, tuple[VarianceComponent, float]]
+    is_slow: bool = True
 
 
 def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
@@ -108,7 +116,34 @@ def find_slow_errors(fit: Identification, data: Measurements) -> SlowErrors | No
         return None
     rows = project_slow_errors(fit, data)
     found = {} if rows is None else detect_slow_errors(rows, _known_degrees(fit))
-    return None if rows is None or not found else SlowErrors(rows, found)
+    if rows is not None and found:
+        return SlowErrors(rows, found)
+    return find_rough_errors(fit, data)
+
+
+def find_rough_errors(fit: Identification, data: Measurements) -> SlowErrors | None:
+    """Return errors that every pose has of its own, where repeats of a pose agree much better with
+    each other than with the fit; None elsewhere.
+
+    With the variance sigma^2 of pure error, the residuals that such errors can change have the
+    variance sigma^2 + tau^2 S S'.
+    """
+    lack = check_lack_of_fit(fit, data)
+    if lack.is_explained is not False:
+        return None
+    rows = project_slow_errors(fit, data, ROUGH, MOST_ROUGH)
+    if rows is None:
+        return None
+    found = {}
+    for part in (part for part in (PLACE, ROTATION) if _is_seen(rows, part)):
+        u, w = _find_axes(rows.rows[:, _columns(rows.errors, part)])
+        y = (u.T @ rows.residuals) / lack.sigma_scale
+        p_value = float(compute_f_tail(len(y), lack.pure_degrees, float(y @ y) / len(y)))
+        if p_value < REPEATS_LEVEL:
+            size = estimate_variance_component(w, y, lack.pure_degrees)
+            variance = size.variance * lack.sigma_scale**2
+            found[part] = (size._replace(variance=variance), p_value)
+    return SlowErrors(rows, found, is_slow=False) if found else None
 
 
 def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
@@ -120,10 +155,9 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
         degrees[part] = component.degrees
     errors = rows.errors.scaled(amplitude)
     root = rows.slope * np.repeat(amplitude, rows.errors.count // 6)
-    for part, (component, p_value) in slow.found.items():
+    for part, (component, _) in slow.found.items():
         own = root[:, _columns(rows.errors, part)]
-        finding = _report(fit, part, float(amplitude[3 * part]), component.degrees, p_value)
-        fit = add_covariance(fit, own, component.degrees, finding)
+        fit = add_covariance(fit, own, component.degrees, _report(fit, slow, part))
     discrepancy = ModelDiscrepancy(errors, root, degrees, first.directions, first.variance)
     return replace(fit, posterior=replace(fit.posterior, discrepancy=discrepancy))
 
@@ -144,10 +178,7 @@ def detect_slow_errors(
             part: _find_axes(whitening @ rows.rows[:, _columns(rows.errors, part)])
             for part in parts
         }
-        tests = {
-            part: (w, u.T @ y, rows.rest + _square_outside(u, y), rows.degrees)
-            for part, (u, w) in turned.items()
-        }
+        tests = {part: (w, u.T @ y) for part, (u, w) in turned.items()}
         p_values = {part: compute_component_tail(*test) for part, test in tests.items()}
         part = min(parts, key=lambda each: p_values[each])
         if p_values[part] >= level:
@@ -162,9 +193,11 @@ def detect_slow_errors(
     return found
 
 
-def project_slow_errors(fit: Identification, data: Measurements) -> SlowErrorRows | None:
+def project_slow_errors(
+    fit: Identification, data: Measurements, length: float = 1.0, most: int = CENTERS
+) -> SlowErrorRows | None:
     """Return residuals and slow errors without what the parameters explain; None where there are
-    too few poses or residuals.
+    too few poses or residuals. `length`, `most` : see `describe_smooth_errors`.
     """
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
@@ -173,7 +206,7 @@ def project_slow_errors(fit: Identification, data: Measurements) -> SlowErrorRow
     T = solution.T[solution.converged]
     if len(T) < FEWEST_POSES:
         return None
-    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3])
+    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], length, most)
     if len(errors.centers) < FEWEST_POSES:
         return None
     linear = linearize_fit(fit, data)
@@ -198,11 +231,10 @@ def project_slow_errors(fit: Identification, data: Measurements) -> SlowErrorRow
     left = R[k:, k:]
     turned, triangle = np.linalg.qr(left[:, :m])
     residuals = turned.T @ left[:, m]
-    rest = float(max(left[:, m] @ left[:, m] - residuals @ residuals, 0.0))
     size = np.linalg.norm(factor[:, p : p + m])
     if not np.linalg.norm(triangle) > UNSEEN * size:
         return None
-    return SlowErrorRows(errors, slope, triangle, residuals, rest, degrees)
+    return SlowErrorRows(errors, slope, triangle, residuals)
 
 
 def _columns(errors: SmoothErrors, part: int) -> slice:
@@ -220,30 +252,25 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return axes[:, kept], variances[kept]
 
 
-def _square_outside(u: FloatArray, y: FloatArray) -> float:
-    """Return the squared length of y (k,) outside orthonormal columns u (k, r)."""
-    return float(((y - u @ (u.T @ y)) ** 2).sum())
-
-
 def _known_degrees(fit: Identification) -> float:
     """Return the degrees of freedom with which the stated noise is known."""
     return 0.0 if fit.residual_test.noise == "estimated" else KNOWN
 
 
-def _report(
-    fit: Identification, part: int, amplitude: float, degrees: float, p_value: float
-) -> Finding:
+def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:
     """Return the size of the errors of rotation or of place, and that they are in the uncertainty;
     a warning where they are beyond doubt.
     """
+    component, p_value = slow.found[part]
     dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
     finding = report_finding(
         DISCREPANCY,
         quantity=("orientation", "position")[part],
-        amplitude=fit.robot.to_quantity(amplitude, dimension),
-        degrees=degrees,
+        amplitude=fit.robot.to_quantity(float(np.sqrt(component.variance)), dimension),
+        degrees=component.degrees,
         p_value=p_value,
-        level=LEVEL,
+        is_slow=slow.is_slow,
+        level=LEVEL if slow.is_slow else REPEATS_LEVEL,
     )
     return replace(finding, severity=Severity.WARNING) if p_value < SIGNIFICANCE else finding
 

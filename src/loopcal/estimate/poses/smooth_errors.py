@@ -109,12 +109,16 @@ def correlate(x: FloatArray, centers: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * ((x[..., None, :] - centers) ** 2).sum(axis=-1)))
 
 
-def describe_smooth_errors(T: FloatArray, tool: FloatArray) -> SmoothErrors:
+def describe_smooth_errors(
+    T: FloatArray, tool: FloatArray, length: float = 1.0, most: int = CENTERS
+) -> SmoothErrors:
     """Return errors of unit amplitude (1 rad, 1 m) about reference poses T (n, 4, 4).
 
     Parameters
     ----------
     tool : (3,) [m] tool point in the platform frame.
+    length : over which errors vary, in radii of the reference poses; a small one leaves errors
+        that different poses do not share. most : largest number of centers.
     """
     u, _, vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -125,21 +129,21 @@ def describe_smooth_errors(T: FloatArray, tool: FloatArray) -> SmoothErrors:
     for part, smallest in zip((slice(0, 3), slice(3, 6)), least, strict=True):
         reach = float(np.sqrt(((x[:, part] - origin[part]) ** 2).sum(axis=1).max()))
         if reach > smallest:
-            radius[part] = reach
+            radius[part] = length * reach
     x = (x - origin) / radius
-    centers = x[_spread(x)]
+    centers = x[_spread(x, most)]
     triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
     whitening = np.asarray(np.linalg.inv(triangle).T)
     return SmoothErrors(tool, rotation, origin, radius, centers, whitening, np.ones(6))
 
 
-def _spread(x: FloatArray) -> list[int]:
+def _spread(x: FloatArray, most: int) -> list[int]:
     """Return the outermost of coordinates (n, 6), then always the one farthest from all chosen
-    ones, up to `CENTERS` different ones.
+    ones, up to `most` different ones.
     """
     chosen = [int(np.argmax((x**2).sum(axis=1)))]
     distance = ((x - x[chosen[0]]) ** 2).sum(axis=1)
-    while len(chosen) < CENTERS and distance.max() > STILL**2:
+    while len(chosen) < most and distance.max() > STILL**2:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(axis=1))
     return chosen
