@@ -325,3 +325,22 @@ def test_simulate_adds_the_requested_noise_to_readings_and_states_it(run, tmp_pa
     refused = run("identifiability linear-delta noisy.csv --sigma-reading 5um")
     assert refused[0] == 1
     assert "DATA states the noise of its readings" in refused[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "method"),
+    [
+        ("--inflation none", "MAP(inflation=1.0"),
+        ("--inflation groups", "InflatedTolerances(by='groups')"),
+        ("--inflation heavy-tailed", "InflatedTolerances(by='heavy-tailed')"),
+        ("", "InflatedTolerances(by='auto')"),
+    ],
+)
+def test_what_may_be_inflated_is_an_option(run, words, method) -> None:
+    assert run(f"calibrate hexapod-42 measurements.csv -o run {words}")[0] == 0
+    assert method in load_run("run").result["fit"]["method"]
+
+
+def test_inflation_needs_the_default_method(run) -> None:
+    command = "calibrate hexapod-42 measurements.csv -o run --method ls --inflation groups"
+    assert "--inflation belongs to --method auto" in run(command)[2]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import chi2, multivariate_normal
 
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
@@ -18,11 +18,14 @@ from loopcal.estimate.methods.component_choice import (
     compute_evidence,
     predict,
 )
+from loopcal.estimate.methods.detectable_deviations import find_information
+from loopcal.estimate.methods.prior_conflict import LEVEL, correct_probability
 from loopcal.estimate.methods.tolerance_components import ToleranceComponent, list_components
 from loopcal.io import load_robot
 from loopcal.measure import Component, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
 from loopcal.mechanism import forward_trials, sample_workspace
 from loopcal.numerics.decomposition import decompose
+from loopcal.report.calibration_view import view_fit
 from tests.estimate.problems import fold_rows
 from tests.findings.expectations import get_finding
 
@@ -210,3 +213,38 @@ def test_right_tolerances_rarely_get_a_component():
     fits = [identify(DELTA, trials.trial(i)) for i in range(150)]
     conflicts = [f.prior_conflict for f in fits]
     assert sum(bool(c.components) for c in conflicts if c) <= 12  # 4 % expected
+
+
+def test_undetectable_deviations_are_reported_where_the_prior_hides_them():
+    _, trials = simulate_deltas(1, {})
+    coarse = get_finding(identify(DELTA, trials.trial(0)).findings, "prior.undetectable")
+    assert set(coarse.data["together"]) == set(ARMS)
+    assert "hardly test the stated tolerances" in str(coarse)
+    poses = sample_workspace(DELTA, 20, 9).coordinates
+    sharp = Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 2e-6))),))
+    fine = simulate_trials(DELTA, sample_truth(DELTA, 1, 9), poses, sharp, 9).trial(0)
+    codes = {finding.code for finding in identify(DELTA, fine).findings}
+    assert "prior.undetectable" not in codes
+
+
+def test_deviation_that_counts_as_detectable_is_detected_in_four_of_five_machines():
+    free = select_free_parameters(DELTA)
+    least = find_information(5.0, len(free))
+    rng = np.random.default_rng(2)
+    # t = N(x sqrt(q), 1) for a deviation x with the information q, in one of the 9 statistics
+    statistic = np.abs(5.0 * np.sqrt(least) + rng.standard_normal(20000))
+    p = [correct_probability(correct_probability(float(chi2.sf(t**2, 1)), 9), 3) for t in statistic]
+    assert np.mean(np.array(p) < LEVEL) == pytest.approx(0.8, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("method", "source"),
+    [(None, "the tolerances"), (MAP(), "the tolerances"), (LeastSquares(), "")],
+)
+def test_tables_of_intervals_state_what_they_average_over(method, source):
+    _, trials = simulate_deltas(1, {})
+    fit = identify(DELTA, trials.trial(0), method)
+    note = f"Intervals use {source} as a prior"
+    shown = "\n".join(str(block) for block in view_fit(fit))
+    for text in (str(fit), shown, str(fit.to_dict()["interval_note"])):
+        assert (note in " ".join(text.split())) == bool(source)

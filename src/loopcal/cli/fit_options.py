@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from loopcal.estimate import FitOptions
 
 METHODS = ("auto", "map", "ls", "ridge", "tsvd")
+INFLATIONS = ("auto", "global", "groups", "heavy-tailed", "none")
 LOSSES = ("none", "huber", "tukey")
 
 rank_tolerance_option = click.option(
@@ -32,6 +33,14 @@ fit_options = add_options(
         default=METHODS[0],
         help="map: the tolerances are a prior. auto: map, with tolerances inflated where the "
         "data contradict them. ls: least squares. ridge, tsvd: regularized least squares.",
+    ),
+    click.option(
+        "--inflation",
+        type=click.Choice(INFLATIONS),
+        default=INFLATIONS[0],
+        help="For auto: which tolerances may be inflated. global: all by one factor. groups: also "
+        "limbs and types of parameters, and what these have in common. heavy-tailed: also single "
+        "parameters. auto: all of these. none: as stated.",
     ),
     click.option(
         "--lam",
@@ -69,6 +78,15 @@ fit_options = add_options(
 """Decorator of a command that fits; `make_fit_options` takes their values."""
 
 
+def _make_default(inflation: str) -> Any:
+    """Return the default method, None, or MAP with another choice of what is inflated."""
+    from loopcal.estimate import MAP, InflatedTolerances
+
+    if inflation == "auto":
+        return None
+    return MAP() if inflation == "none" else MAP(InflatedTolerances(inflation))
+
+
 def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     """Return the options of the library from those of `fit_options`.
 
@@ -97,8 +115,14 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
                 f"{option} belongs to --method {needed}, not to {name}; leave it out, or change "
                 "the method"
             )
+    inflation = options["inflation"]
+    if inflation != INFLATIONS[0] and name != "auto":
+        raise DataError(
+            f"--inflation belongs to --method auto, not to {name}; leave it out, or change the "
+            "method"
+        )
     methods: dict[str, Callable[[], Any]] = {
-        "auto": lambda: None,
+        "auto": lambda: _make_default(inflation),
         "map": MAP,
         "ls": LeastSquares,
         "ridge": lambda: Ridge(GCV() if lam is None else lam),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -57,12 +58,12 @@ class FreeParameters:
         total = len(self.robot.parameters)
         return f"<FreeParameters of {self.robot.name}: {len(self)} of {total}>"
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """The free parameters in order."""
         return tuple(self.robot.parameters.entries[i] for i in self.places)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names in order."""
         return tuple(parameter.name for parameter in self.parameters)

@@ -55,7 +55,11 @@ from loopcal.estimate.poses.estimate import (
 )
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.estimate.poses.states import PoseSolution
-from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
+from loopcal.estimate.prior_inflation import (
+    add_factor_uncertainty,
+    report_untested,
+    run_prior_tests,
+)
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
@@ -263,6 +267,7 @@ def _assemble(
         report_noise(data, robot, test),
         *report_divergence(free, fit.deviation[0], method, converged),
         *(conflict.report() if converged and conflict is not None else []),
+        *report_untested(free, fit, method),
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),

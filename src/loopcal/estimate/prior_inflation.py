@@ -22,6 +22,7 @@ from loopcal.estimate.methods.component_choice import (
     predict,
     restate,
 )
+from loopcal.estimate.methods.detectable_deviations import report_undetectable
 from loopcal.estimate.methods.inflated_tolerances import (
     InflatedTolerances,
     are_penalized,
@@ -37,7 +38,7 @@ from loopcal.estimate.methods.tolerance_components import (
 )
 from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.result import Identification
-from loopcal.findings import report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray
@@ -68,7 +69,13 @@ def choose_methods(
         return {}
     chosen: dict[int, MAP] = {}
     rows = _divide(fit.decomposition, method)
-    for i in converged if method.components else _screen(rows, method, candidates, converged):
+    for i in (
+        converged
+        if method.components
+        else _screen(
+            rows, method.read_inflation(fit.decomposition, fit.penalty), candidates, converged
+        )
+    ):
         unpenalized = method.unpenalized(len(free))
         one = rows.take(np.array([i]))
         components = ComponentSearch(one, method.correlation, unpenalized, candidates).choose()
@@ -81,13 +88,25 @@ def run_prior_tests(free: FreeParameters, fit: Descent, method: Method) -> Prior
     """Return the tests of the prior, where the method uses one."""
     if not isinstance(method, MAP):
         return None
-    rows, p = fit.decomposition, len(free)
-    if method.components:
-        stated = compute_prior_covariance(p, method.correlation, ())
-        rows = restate(rows, stated, method.unpenalized(p))
-    inflation = float(method.compute_inflation(fit.decomposition)[0])
+    rows = _restate_as_stated(free, fit, method)
+    inflation = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     sigma = float(method.sigma(fit.decomposition)[0])
     return assess_prior_conflict(free, rows, inflation, sigma, fit.deviation[0], method.components)
+
+
+def report_untested(free: FreeParameters, fit: Descent, method: Method) -> list[Finding]:
+    """Return which deviations from the tolerances the data could not show."""
+    if not isinstance(method, MAP) or fit.status[0] != DescentStatus.CONVERGED:
+        return []
+    return report_undetectable(free, _divide(_restate_as_stated(free, fit, method), method))
+
+
+def _restate_as_stated(free: FreeParameters, fit: Descent, method: MAP) -> Decomposition:
+    """Return the decomposition of the rows for the tolerances as stated."""
+    if not method.components:
+        return fit.decomposition
+    stated = compute_prior_covariance(len(free), method.correlation, ())
+    return restate(fit.decomposition, stated, method.unpenalized(len(free)))
 
 
 def add_factor_uncertainty(result: Identification, fit: Descent) -> Identification:
@@ -99,7 +118,7 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     method = result.method
     if not (isinstance(method, MAP) and callable(method.inflation) and result.converged):
         return result
-    factor = float(method.compute_inflation(fit.decomposition)[0])
+    factor = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     if factor <= 1.0 and not method.components:
         return result
     changes = [_change_by_factor(fit, method)] if factor > 1.0 else []
@@ -117,7 +136,7 @@ def _change_by_factor(fit: Descent, method: MAP) -> FloatArray:
     In the coordinates y of the decomposition it is 2 (1 - f_i) y_i.
     """
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
-    spread = estimate_factor_spread(_divide(d, method), method.compute_inflation(d))
+    spread = estimate_factor_spread(_divide(d, method), method.read_inflation(d, fit.penalty))
     change = 2.0 * (1.0 - d.filter_factors(penalty)) * d.solution(fit.penalty)
     change = np.where(penalty > 0.0, change, 0.0)
     return np.asarray(d.deviation(change * spread[:, None])[0])
@@ -158,16 +177,14 @@ def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:
 
 def _screen(
     rows: Decomposition,
-    method: MAP,
+    factor: FloatArray,
     candidates: tuple[ToleranceComponent, ...],
     converged: np.ndarray,
 ) -> np.ndarray:
     """Return the converged trials in which any component has more evidence than none, besides the
     stated or the inflated tolerances.
     """
-    assert isinstance(method.inflation, InflatedTolerances)
-    rows = rows.take(converged)
-    factor = method.inflation(rows)
+    rows, factor = rows.take(converged), factor[converged]
     evidence = compute_evidence(predict(rows, np.ones(len(factor))), candidates)
     if (factor > 1.0).any():
         evidence = np.maximum(evidence, compute_evidence(predict(rows, factor), candidates))

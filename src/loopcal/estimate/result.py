@@ -15,13 +15,13 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
-from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
 from loopcal.estimate.methods.regularization import Regularization
 from loopcal.estimate.nuisance.estimate import NuisanceEstimate
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
-from loopcal.findings import Finding
+from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray
@@ -207,6 +207,17 @@ class Identification:
         return self.history.status is DescentStatus.CONVERGED
 
     @property
+    def interval_note(self) -> Finding | None:
+        """What the coverage of the intervals is an average over, where they use a prior."""
+        if not self.converged or not self.residual_test.intervals:
+            return None
+        if self.options.prior is not None:
+            return report_finding("prior.intervals", source="the earlier calibration")
+        if isinstance(self.method, MAP) and not self.free_parameters.assumed.all():
+            return report_finding("prior.intervals", source="the tolerances")
+        return None
+
+    @property
     def chi_square(self) -> float:
         """Whitened sum of squares, see `ResidualTest`."""
         return self.residual_test.chi_square
@@ -241,7 +252,8 @@ class Identification:
 
     def __str__(self) -> str:
         """Return the parameters as a table, the status and the findings."""
-        lines = [*self._list_values(), ""]
+        note = [] if self.interval_note is None else [str(self.interval_note)]
+        lines = [*self._list_values(), *note, ""]
         lines.append(f"{self.history.finding} {self.describe_statistics()}".rstrip())
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self._further_findings)])
 
@@ -303,6 +315,7 @@ class Identification:
             "robot": self.robot.name,
             "method": repr(self.method),
             "parameters": self._parameter_rows(),
+            "interval_note": None if self.interval_note is None else str(self.interval_note),
             "local": self._nuisance_rows(),
             "rank": self.rank if self.converged else None,
             "condition": self.spectrum.condition if self.converged else None,

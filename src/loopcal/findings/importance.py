@@ -61,6 +61,8 @@ IMPORTANCE = (
     "residuals.start-within-noise",
     "residuals.start-is-best",
     "residuals.common-errors-small",
+    "prior.undetectable",
+    "prior.inflation",
 )
 """Codes of findings, most important first. Codes that are absent here come after these."""
 

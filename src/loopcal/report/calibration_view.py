@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from loopcal.diagnose import ModelChoice, ReadingError
-from loopcal.estimate import Identification
+from loopcal.estimate import Identification, PriorConflict
 from loopcal.estimate.result import LAST_DIGITS
 from loopcal.findings import Finding
+from loopcal.findings.wording import list_names
 from loopcal.mechanism import Mechanism
 from loopcal.report.budget_view import build_budget_table
 from loopcal.report.numbers import (
@@ -63,6 +64,7 @@ def view_calibration(
         blocks.append(f"Hint: {advice}")
     if fit.converged:
         blocks.append(build_parameter_table("Parameters", rows["parameters"]))
+        blocks += _note_intervals(fit)
     elif verbose:
         blocks.append(build_last_value_table(rows["parameters"]))
     if verbose:
@@ -85,7 +87,10 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
     blocks: list[Block] = []
     if rows["local"] and fit.converged:
         blocks.append(build_parameter_table("Setup parameters", rows["local"]))
+        blocks += _note_intervals(fit)
     blocks += ["", _describe_iteration(fit)]
+    if fit.converged and fit.prior_conflict is not None:
+        blocks.append(build_prior_table(fit.prior_conflict))
     for suggestion in report.suggestions or ():
         blocks.append(f"Suggested measurement: {suggestion}")
     if report.budget is not None:
@@ -115,6 +120,35 @@ def build_parameter_table(caption: str, rows: Iterable[Mapping[str, Any]]) -> Ta
             lambda row: format_uncertainty(row["plus_minus"]) if row.get("free", True) else "fixed",
         ),
         (word_column("unit"), lambda row: row["unit"]),
+    )
+
+
+def _note_intervals(fit: Identification) -> list[Block]:
+    """Return the sentence below a table of intervals that use a prior."""
+    return [] if fit.interval_note is None else [str(fit.interval_note)]
+
+
+def build_prior_table(conflict: PriorConflict) -> Table:
+    """Return the tests of the stated tolerances."""
+    rows = (
+        ("all deviations", conflict.statistic, conflict.degrees, conflict.p_value, ()),
+        *(
+            (title, test.statistic, test.count, test.p_value, test.names)
+            for title, test in (
+                ("worst direction", conflict.direction),
+                ("worst parameter", conflict.parameter),
+            )
+        ),
+    )
+    return build_table(
+        f"Stated tolerances against the data: p = {format_number(conflict.joint_p_value, 2)} "
+        "for the three tests together",
+        rows,
+        (word_column("test"), lambda row: row[0]),
+        (Column("statistic [1]"), lambda row: format_number(row[1], 3)),
+        (Column("degrees or number"), lambda row: format_number(row[2], 3)),
+        (Column("p"), lambda row: format_number(row[3], 2)),
+        (word_column("parameters"), lambda row: list_names(row[4])),
     )
 
 
@@ -169,7 +203,8 @@ def view_fit(fit: Identification) -> list[Block]:
     rows = fit.to_dict()["parameters"]
     caption = f"{fit.robot.name}: {len(fit.names)} parameters"
     table = build_parameter_table(caption, rows)
-    return [table if fit.converged else build_last_value_table(rows), _describe_iteration(fit)]
+    shown = [table, *_note_intervals(fit)] if fit.converged else [build_last_value_table(rows)]
+    return [*shown, _describe_iteration(fit)]
 
 
 def _describe_iteration(fit: Identification) -> str:

@@ -30,7 +30,7 @@ LARGEST_FACTOR = 1e6
 WIDEST = 30.0
 """Factor on an estimated factor up to which its distribution is integrated."""
 
-GRID = np.log(LARGEST_FACTOR) * np.linspace(0.0, 1.0, 30) ** 1.5
+GRID = np.log(LARGEST_FACTOR) * np.linspace(0.0, 1.0, 20) ** 1.5
 """Logarithms of factors among which the minimum is bracketed."""
 
 NEWTON_STEPS = 6

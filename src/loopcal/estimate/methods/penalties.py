@@ -254,6 +254,15 @@ class MAP(Method):
             return np.full(len(decomposition.rows), rule)
         return np.asarray(rule(decomposition.divided(self.sigma(decomposition))))
 
+    def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
+        """Return the factor (t,) on all tolerances that the penalty (t, p) of a fit contains; 1
+        where no direction is penalized.
+        """
+        is_penalized = np.isfinite(penalty) & (penalty > 0.0)
+        largest = np.where(is_penalized, penalty, 0.0).max(axis=1, initial=0.0)
+        root = np.sqrt(np.where(largest > 0.0, largest, 1.0))
+        return np.where(largest > 0.0, self.sigma(decomposition) / root, 1.0)
+
     def sigma(self, decomposition: Decomposition) -> FloatArray:
         """Return the factor (t,) on the stated sigmas.
 
