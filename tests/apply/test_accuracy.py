@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from loopcal import geometry, load_robot
-from loopcal.apply.accuracy import accuracy_map, pose_uncertainty
+from loopcal.apply import accuracy_map, pose_uncertainty
 from loopcal.apply.accuracy_simulation import simulate_accuracy
 from loopcal.diagnose import find_frame_motions
 from loopcal.errors import EstimationError
@@ -103,7 +103,8 @@ def test_size_of_pose_uncertainty_does_not_depend_on_the_axes(fit):
     np.testing.assert_allclose(base.position, platform.position, rtol=1e-9)
     np.testing.assert_allclose(base.orientation, platform.orientation, rtol=1e-9)
     assert "platform axes" in platform.frame
-    assert np.array_equal(base.expanded, 2 * base.sd)
+    assert np.array_equal(base.expanded, base.coverage_factor * base.sd)
+    np.testing.assert_allclose(base.degrees.position, platform.degrees.position, rtol=1e-9)
 
 
 def test_uncertainty_without_torsion_is_infinite_about_the_normal_only(fit_5):

@@ -18,7 +18,7 @@ REAL = (
     "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm "
     "--sigma-position 0.6mm"
 )
-CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls"
+CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls --sigma-uncertainty 0"
 
 
 @pytest.fixture

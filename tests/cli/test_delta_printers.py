@@ -107,16 +107,17 @@ def test_unknown_sigma_gives_no_verdict_on_the_nominal_geometry(calibrate) -> No
     assert result["start"]["verdict"] == "open"
 
 
-def test_one_degree_of_freedom_gives_intervals_only_with_a_stated_sigma(calibrate) -> None:
+def test_one_degree_of_freedom_gives_wide_intervals_without_a_stated_sigma(calibrate) -> None:
     out, result = calibrate(CALIBRATED[2], "--noise estimated")
     assert result["fit"]["dof"] == pytest.approx(1.0)
-    assert "noise.too-few-degrees" in {finding["code"] for finding in result["findings"]}
-    assert out.count("not given") == 6  # intervals
-    assert {row["plus_minus"] for row in result["fit"]["parameters"]} == {None}
-    out, result = calibrate(CALIBRATED[2], "--force", sigma="0.02 mm")
+    assert "noise.few-degrees" in {finding["code"] for finding in result["findings"]}
+    for row in result["fit"]["parameters"]:  # Student's t
+        assert row["plus_minus"] == pytest.approx(12.706 * row["sd"], rel=1e-4)
+    exact = "--force --sigma-uncertainty 0"
+    out, result = calibrate(CALIBRATED[2], exact, sigma="0.02 mm")
     assert "not given" not in out
     assert all(0.01 < row["plus_minus"] < 1.0 for row in result["fit"]["parameters"])  # [mm, deg]
-    wider = calibrate(CALIBRATED[2], "--force", sigma="0.04 mm")[1]["fit"]["parameters"]
+    wider = calibrate(CALIBRATED[2], exact, sigma="0.04 mm")[1]["fit"]["parameters"]
     for narrow, wide in zip(result["fit"]["parameters"], wider, strict=True):
         assert wide["plus_minus"] == pytest.approx(2 * narrow["plus_minus"], rel=1e-6)
 
@@ -180,7 +181,7 @@ def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root)
     numbers = re.findall(r"\d+\.\d{4}", quoted)
     assert len(numbers) == 6
     assert re.findall(r"\d+\.\d{4}", printed) == numbers
-    words = "calibrate printer.yaml probes.csv -o run --method ls --verbose"
+    words = "calibrate printer.yaml probes.csv -o run --method ls --sigma-uncertainty 0 --verbose"
     assert main(words.split()) == 0
     out = capsys.readouterr().out
     # heights and distances mixed in millimeters increase, though chi-square decreases from 18.9

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import identifiability, suggest_measurements
-from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate import FitOptions, LeastSquares, identify
 from loopcal.io.formats import klipper
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
@@ -143,8 +143,9 @@ def test_usual_sigmas_of_probe_and_callipers_explain_the_residuals(printers):
 def test_doubled_sigma_doubles_intervals_and_quarters_chi_square(printers):
     name = next(n for n in printers if n.startswith("fzechert"))
     robot, data = free_only(printers[name][0], *GEOMETRY), printers[name][1]
+    exact = FitOptions(sigma_uncertainty=0.0)
     narrow, wide = (
-        identify(robot, with_sigmas(data, sigma, 1.0), LeastSquares())
+        identify(robot, with_sigmas(data, sigma, 1.0), LeastSquares(), options=exact)
         for sigma in (0.01e-3, 0.02e-3)
     )
     assert not narrow.residual_test.failed

@@ -181,7 +181,8 @@ def test_stated_sigma_that_is_wrong_decides_unless_it_is_estimated() -> None:
 
 def test_joint_test_equals_the_inverse_of_the_covariance(fit) -> None:
     (robot, data, truth), *_ = simulate_printers(count=1)
-    estimated = identify(robot, data, LeastSquares())
+    exact = FitOptions(sigma_uncertainty=0.0)
+    estimated = identify(robot, data, LeastSquares(), options=exact)
     names = ("radius", "tower2.angle", "tower3.stop")
     at = [estimated.names.index(name) for name in names]
     all_values = dict(zip(robot.parameters.names, truth, strict=True))
@@ -193,6 +194,14 @@ def test_joint_test_equals_the_inverse_of_the_covariance(fit) -> None:
     assert result.chi_square == pytest.approx(expected, rel=1e-8)
     assert result.degrees == 3
     assert result.p_value == pytest.approx(scipy.stats.chi2.sf(expected, 3), rel=1e-8)
+    # stated sigmas that are partly known: F of their degrees of freedom and those of the residuals
+    partly = identify(robot, data, LeastSquares())
+    again = compare_with_values(partly, {name: all_values[name] for name in names})
+    test = partly.residual_test
+    square = expected / test.sigma_scale**2
+    assert again.chi_square == pytest.approx(square, rel=1e-8)
+    left = 8 + test.degrees
+    assert again.p_value == pytest.approx(scipy.stats.f.sf(square / 3, 3, left), rel=1e-6)
 
 
 def test_answer_in_another_frame_has_the_same_chi_square_and_names_the_frame(fit) -> None:
@@ -233,7 +242,7 @@ def test_values_that_cannot_be_compared_are_refused_or_undecided(tmp_path) -> No
         compare_with_values(fit, {})
     with pytest.raises(EstimationError, match="does not have the parameters"):
         compare_with_values(fit, load_robot("five-bar"))
-    few = data.take(np.arange(data.n_poses) < 7)
+    few = data.take(np.arange(data.n_poses) < 6)
     estimated = identify(robot, few, options=FitOptions(method=LeastSquares(), noise="estimated"))
     result = compare_with_truth(estimated, truth)
     assert result.agrees is None

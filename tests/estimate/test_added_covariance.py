@@ -7,8 +7,9 @@ import pytest
 from loopcal.apply import pose_uncertainty
 from loopcal.estimate import FitOptions, LeastSquares, TruncatedSVD, identify
 from loopcal.estimate.inference.added_covariance import add_covariance
+from loopcal.estimate.inference.covariance_parts import CovariancePart
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
-from loopcal.estimate.inference.posterior import CovariancePart, posterior_from_arrays
+from loopcal.estimate.inference.posterior import posterior_from_arrays
 from loopcal.estimate.inference.prior import prior_from
 from loopcal.findings import report_finding
 from loopcal.measure import Pose, Sensor, simulate
@@ -146,7 +147,7 @@ def test_effective_degrees_of_freedom_are_those_of_welch_and_satterthwaite():
 def test_the_noise_of_a_prior_is_the_part_that_the_rows_cause():
     fit = make_fit("null direction with tolerances")
     (part,) = fit.posterior.parts
-    assert part.degrees == np.inf
+    assert part.degrees == fit.residual_test.noise_degrees == 8 + fit.residual_test.degrees
     rest = fit.covariance - part.root @ part.root.T
     assert np.linalg.eigvalsh(rest / fit.tolerance / fit.tolerance[:, None]).min() > -1e-12
     # least squares has nothing but noise

@@ -155,7 +155,9 @@ def test_prior_on_a_frame_is_between_a_free_and_a_fixed_frame():
     robot, truth, data = simulate_delta()
     local = collect_nuisance_parameters(data.observations, data.labels)
     free, held, known = (
-        identify(robot, data, LeastSquares(), options=FitOptions(nuisance=one))
+        identify(
+            robot, data, LeastSquares(), options=FitOptions(nuisance=one, sigma_uncertainty=0.0)
+        )
         for one in (
             local,
             local.with_prior("frame.*", 50 * UM),

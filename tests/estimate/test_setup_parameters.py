@@ -112,7 +112,7 @@ def test_solution_after_elimination_equals_the_joint_solution():
 
 def test_standard_deviations_equal_those_of_the_joint_problem():
     data = simulate_mixed_data()
-    fit = identify(hexapod(), data, LeastSquares())
+    fit = identify(hexapod(), data, LeastSquares(), options=FitOptions(sigma_uncertainty=0.0))
     free = select_free_parameters(fit.robot)
     at = observe_poses(free, data.readings)
     rows = observe_rows(

@@ -195,7 +195,7 @@ def test_redundant_readings_equal_the_dense_solution(cable):
         Instrument((Sensor(Position(), noise(*[1e-3] * 3), rows=np.arange(8)),)),
         1,
     )
-    result = identify(robot, data, LeastSquares())
+    result = identify(robot, data, LeastSquares(), options=FitOptions(sigma_uncertainty=0.0))
     sigma = np.array([a.sigma for a in robot.actuators])
     p, unit, names = len(result.names), robot.parameters.tolerance, robot.parameters.names
     lengths = np.array([limb.length for limb in robot.assembly.limbs])

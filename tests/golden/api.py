@@ -327,9 +327,10 @@ def make_loss(name: str, constant: float | None = None) -> Any:
 
 
 def fit(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
-    """Identify the free parameters."""
+    """Identify the free parameters; the stated sigmas are exact, unless the options differ."""
     names = {"drop": "excluded_poses", "local": "nuisance"}
     given = {names.get(name, name): value for name, value in options.items()}
+    given = {"sigma_uncertainty": 0.0, **given}
     return estimate.identify(machine, data, how, options=estimate.FitOptions(**given))
 
 
@@ -485,7 +486,8 @@ def report_recalibration(
     machine: Robot, data: Data, earlier: Fit, limb: str | None = None
 ) -> Report:
     """Calibrate again with an earlier fit as prior, and test for a change."""
-    result, change = estimate.recalibrate(machine, data, earlier.posterior, limb)
+    exact = estimate.FitOptions(sigma_uncertainty=0.0)
+    result, change = estimate.recalibrate(machine, data, earlier.posterior, limb, options=exact)
     tested = {
         "what": change.subject,
         "names": list(change.names),
@@ -962,7 +964,6 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     study = plan_points(load_machine(), groups, points, AXES, 0, 0)
     q = study.layout.solve_readings(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.build_measurements(study.layout, q[0], noise)
-    result = estimate.identify(
-        study.robot, data, estimate.MAP(), options=estimate.FitOptions(rank_tolerance=1e-5)
-    )
+    options = estimate.FitOptions(rank_tolerance=1e-5, sigma_uncertainty=0.0)
+    result = estimate.identify(study.robot, data, estimate.MAP(), options=options)
     return report_fit(result, parts=False)

@@ -117,15 +117,15 @@ def test_errors_of_blocks_are_corrected_by_the_dense_hat_matrix(sessions) -> Non
 
 @pytest.mark.parametrize("case", [*CASES, "earlier calibration", "prior of the frame", "ridge"])
 def test_normal_errors_scatter_as_the_covariance_says(case) -> None:
-    options, method = FitOptions(), lc.MAP()
+    options, method = FitOptions(sigma_uncertainty=0.0), lc.MAP()
     data = CASES[case]() if case in CASES else hexapod_data(15, seed=5)
     if case == "earlier calibration":
         earlier = identify(hexapod(), hexapod_data(20), lc.MAP())
-        options, method = FitOptions(prior=prior_from(earlier.posterior)), lc.LeastSquares()
+        options, method = FitOptions(sigma_uncertainty=0.0, prior=prior_from(earlier.posterior)), lc.LeastSquares()
     if case == "prior of the frame":
         data = CASES["targets"]()
         known = data.nuisance_parameters.with_prior("frame.*", 20 * UM)
-        options, method = FitOptions(nuisance=known), lc.LeastSquares()
+        options, method = FitOptions(sigma_uncertainty=0.0, nuisance=known), lc.LeastSquares()
     if case == "ridge":
         method = lc.Ridge(3.0)
     fit = identify(hexapod(), data, method, options=options)

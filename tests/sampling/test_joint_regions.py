@@ -19,7 +19,9 @@ NAMES = ["leg1.base.x", "leg1.base.y", "leg2.platform.z"]
 
 @pytest.fixture(scope="module")
 def fit() -> lc.Identification:
-    return identify(hexapod(), hexapod_data(20), lc.LeastSquares())
+    return identify(
+        hexapod(), hexapod_data(20), lc.LeastSquares(), options=lc.FitOptions(sigma_uncertainty=0.0)
+    )
 
 
 def with_degrees(fit: lc.Identification, degrees: float):

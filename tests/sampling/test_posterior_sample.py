@@ -24,6 +24,10 @@ from tests.estimate.problems import MM, UM, hexapod, hexapod_data
 from tests.estimate.uncertain_reading_problems import simulate_hexapod
 
 
+EXACT = FitOptions(method=lc.MAP(), sigma_uncertainty=0.0)
+"""Options with tolerances as the prior and sigmas that are exact, as in the reference."""
+
+
 def delta(
     times: float, sigma: float, poses: int = 4, seed: int = 0
 ) -> tuple[Mechanism, lc.Measurements]:
@@ -109,7 +113,7 @@ def sample_by_walkers(
 
 def test_a_curved_posterior_equals_that_of_a_markov_chain_and_is_reported() -> None:
     robot, data = delta(60.0, 20 * MM, poses=3)
-    fit = identify(robot, data, lc.MAP())
+    fit = identify(robot, data, options=EXACT)
     known = find_nozzle(fit.robot.values[None], data.readings)[0]
     assert known == pytest.approx(lc.forward(fit.robot, data.readings).T[:, :3, 3], abs=1e-9)
     sample = lc.sample_posterior(fit, data, 5000)
@@ -141,7 +145,7 @@ def test_a_curved_posterior_equals_that_of_a_markov_chain_and_is_reported() -> N
 def test_linear_intervals_of_linear_problems_are_confirmed_to_a_percent() -> None:
     for seed in range(20):
         robot, data = delta(1.0, 10 * UM, 6, seed)
-        sample = lc.sample_posterior(identify(robot, data, lc.MAP()), data, 1000, seed=seed)
+        sample = lc.sample_posterior(identify(robot, data, options=EXACT), data, 1000, seed=seed)
         assert [finding.code for finding in sample.findings] == ["sampling.posterior-agrees"]
         assert np.abs(sample.intervals().shift).max() < 0.03
 
@@ -150,7 +154,7 @@ def test_linear_intervals_of_linear_problems_are_confirmed_to_a_percent() -> Non
     "case", ["targets", "sessions", "uncertain readings", "earlier", "estimated"]
 )
 def test_exact_and_linear_posterior_agree_where_rows_are_nearly_linear(case) -> None:
-    options, method = FitOptions(), lc.MAP()
+    options, method = FitOptions(sigma_uncertainty=0.0), lc.MAP()
     data = hexapod_data(12, seed=5)
     if case == "targets":
         data = measure(THREE_TARGETS, 20, 3)
@@ -160,7 +164,7 @@ def test_exact_and_linear_posterior_agree_where_rows_are_nearly_linear(case) -> 
         data = simulate_hexapod(12, 2 * UM)
     elif case == "earlier":
         earlier = identify(hexapod(), hexapod_data(20), lc.MAP())
-        options, method = FitOptions(prior=prior_from(earlier.posterior)), lc.LeastSquares()
+        options, method = FitOptions(sigma_uncertainty=0.0, prior=prior_from(earlier.posterior)), lc.LeastSquares()
     else:
         options, method = FitOptions(noise="estimated"), lc.LeastSquares()
     fit = identify(hexapod(), data, method, options=options)

@@ -45,6 +45,7 @@ PUBLISHED = [
     [-1409.88, 742.61, -151.80],
     [21.85, -0.16, 2343.67],
 ]
+EXACT = FitOptions(method=LeastSquares(), sigma_uncertainty=0.0)
 SIGMA = 0.6  # of lines and of known positions [mm]: what makes chi-square its degrees of freedom
 ANCHORS = [i for i, name in enumerate(NAMES) if "anchor" in name]
 BUILDUPS = [i for i, name in enumerate(NAMES) if "buildup" in name]
@@ -89,7 +90,7 @@ def printer(samples, tmp_path_factory) -> tuple[Mechanism, Measurements]:
 def fit(printer) -> Identification:
     """The least-squares fit of the real machine."""
     robot, data = printer
-    return identify(robot, data, LeastSquares())
+    return identify(robot, data, options=EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +281,7 @@ def fits(samples, tmp_path_factory) -> dict[tuple[tuple[str, ...], int], Identif
     """The fit for each model of the spools."""
     folder = tmp_path_factory.mktemp("models")
     return {
-        model: identify(*build_machine_with_spools(samples, folder, *model), LeastSquares())
+        model: identify(*build_machine_with_spools(samples, folder, *model), options=EXACT)
         for model in MODELS
     }
 
@@ -467,7 +468,7 @@ def test_known_positions_at_the_edge_reduce_uncertainty_more_than_high_ones(prin
         cells = np.full((44, 3), np.nan)
         cells[:9], cells[further] = seen.measured, at[further]
         told = Observations.from_sigma(seen.kind, np.arange(44), cells, SIGMA * 1e-3)
-        again = identify(fit.robot, replace(data, observations=(told,)), LeastSquares())
+        again = identify(fit.robot, replace(data, observations=(told,)), options=EXACT)
         return (
             1.96e3
             * again.standard_deviations[
@@ -487,7 +488,7 @@ def test_known_positions_at_the_edge_reduce_uncertainty_more_than_high_ones(prin
 def test_truth_of_the_example_lies_within_its_intervals(tmp_path, root):
     found = json.loads((root / "examples" / "cable-robot" / "samples.json").read_text("utf-8"))
     robot, data = build_machine(tmp_path, found, 0.5)
-    fit = identify(robot, data, LeastSquares())
+    fit = identify(robot, data, options=EXACT)
     assert not fit.residual_test.failed
     off = (fit.estimate * 1e3 - TRUTH) / (fit.standard_deviations * 1e3)
     assert (
@@ -515,7 +516,7 @@ def test_intervals_of_40_machines_contain_the_truth_as_often_as_stated(tmp_path)
     held, total = np.zeros(21, dtype=int), 0.0
     for seed in range(40):
         robot, data = build_machine(tmp_path, simulate_example(seed), 0.5)
-        fit = identify(robot, data, LeastSquares())
+        fit = identify(robot, data, options=EXACT)
         assert fit.converged
         error = fit.estimate - TRUTH * 1e-3
         held += np.abs(error) < 1.96 * fit.standard_deviations

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Use a calibration: validation, accuracy over the workspace, compensation."""
 
-from loopcal.apply.accuracy import AccuracyMap as AccuracyMap
 from loopcal.apply.accuracy import PoseUncertainty as PoseUncertainty
-from loopcal.apply.accuracy import accuracy_map as accuracy_map
 from loopcal.apply.accuracy import pose_uncertainty as pose_uncertainty
 from loopcal.apply.accuracy_simulation import AccuracySimulation as AccuracySimulation
 from loopcal.apply.accuracy_simulation import simulate_accuracy as simulate_accuracy
@@ -15,4 +13,6 @@ from loopcal.apply.error_budget import compute_error_budget as compute_error_bud
 from loopcal.apply.reused_rows import report_reused_rows as report_reused_rows
 from loopcal.apply.validation import Validation as Validation
 from loopcal.apply.validation import validate as validate
+from loopcal.apply.workspace_accuracy import AccuracyMap as AccuracyMap
+from loopcal.apply.workspace_accuracy import accuracy_map as accuracy_map
 from loopcal.diagnose import NoiseFloor as NoiseFloor

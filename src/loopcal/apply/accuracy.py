@@ -1,47 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertainty of the poses of a calibrated machine, anywhere in its workspace.
 
-    covariance = D C D' + J_q S_q J_q'        expanded uncertainty U = k sqrt(diag), k = 2
+    covariance = D C D' + J_q S_q J_q'        expanded uncertainty U = k sqrt(diag)
 
 with the error model D = d twist / d parameter, the covariance C of the parameters, and the
 variances S_q of the readings where the actuators have a sigma. D refers to a frame, see
 `loopcal.diagnose.error_frames`: motions of the base and platform frames that the measurements do
 not determine are no errors, and the result says so. A direction that the data do not determine
-makes those components infinite that it moves in this frame, and no others. JCGM 100; derivation:
-docs/theory/uncertainty.md.
+makes those components infinite that it moves in this frame, and no others. k is 2 where the noise
+is known, and that of Student's t for the effective degrees of freedom where it was estimated. JCGM
+100; derivation: docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.diagnose import NO_MOTION, ErrorFrame, choose_error_frame, twist_weights
-from loopcal.diagnose.error_frames import FITTED, RELATIVE, list_error_twists, solve_home
+from loopcal.diagnose.error_frames import FITTED, RELATIVE, list_error_twists
 from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_argument
+from loopcal.estimate.inference.covariance_parts import NOISE, combine_degrees
 from loopcal.estimate.inference.posterior import Posterior
+from loopcal.estimate.inference.residual_test import coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
-from loopcal.mechanism import (
-    Mechanism,
-    Solution,
-    differentiate_pose,
-    forward,
-    inverse,
-    resolve_poses,
-)
-from loopcal.numerics.chi_square import compute_chi_square_quantile
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
+from loopcal.numerics.chi_square import compute_f_quantile
+from loopcal.typing import FloatArray
 
-COVERAGE = 2.0
-"""Factor k of the expanded uncertainty of a component: about 95 % of normal errors."""
+COMPONENT_LEVEL = 0.954499736103642
+"""Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
+table G.2).
+"""
 
 LEVEL = 0.95
 """Share of the errors below the expanded uncertainty of a length or an angle."""
@@ -52,6 +49,16 @@ BLOCK = 1024
 
 Axes = Literal["base", "platform"]
 Point = Literal["tool", "platform"]
+
+
+class PoseDegrees(NamedTuple):
+    """Effective degrees of freedom (Welch-Satterthwaite) of the components (n, 6), and of the
+    lengths (n,) of the displacement and of the rotation.
+    """
+
+    components: FloatArray
+    position: FloatArray
+    orientation: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +73,14 @@ class PoseUncertainty:
     covariance : (n, 6, 6) [rad, m]; infinite on the diagonal (and NaN beside it) where the data do
         not determine a component.
     reference : point, axes and frame to which the numbers refer, as a finding `accuracy.frame`.
+    degrees : effective degrees of freedom of the size of the uncertainty; infinite where the noise
+        is known.
     """
 
     T: FloatArray
     covariance: FloatArray
     reference: Finding
+    degrees: PoseDegrees
 
     @property
     def frame(self) -> str:
@@ -94,19 +104,26 @@ class PoseUncertainty:
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     @property
+    def coverage_factor(self) -> FloatArray:
+        """(n, 6) factor k of each component: 2 where the noise is known, else that of Student's t
+        for the same coverage of 95.45 %.
+        """
+        return coverage_factor(self.degrees.components, COMPONENT_LEVEL)
+
+    @property
     def expanded(self) -> FloatArray:
-        """(n, 6) expanded uncertainty U = 2 sd of each component, about 95 % [rad, m]."""
-        return COVERAGE * self.sd
+        """(n, 6) expanded uncertainty U = k sd of each component, about 95 % [rad, m]."""
+        return self.coverage_factor * self.sd
 
     @property
     def expanded_position(self) -> FloatArray:
         """(n,) length that 95 % of the displacements of the point do not exceed [m]."""
-        return _expand_length(self.covariance[:, 3:, 3:])
+        return _expand_length(self.covariance[:, 3:, 3:], self.degrees.position)
 
     @property
     def expanded_orientation(self) -> FloatArray:
         """(n,) angle that 95 % of the rotations of the platform do not exceed [rad]."""
-        return _expand_length(self.covariance[:, :3, :3])
+        return _expand_length(self.covariance[:, :3, :3], self.degrees.orientation)
 
     @property
     def position(self) -> FloatArray:
@@ -119,10 +136,11 @@ class PoseUncertainty:
         return np.sqrt((self.sd[:, :3] ** 2).sum(axis=1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return frame, factor and expanded uncertainties for JSON, SI."""
+        """Return frame, factors, degrees and expanded uncertainties for JSON, SI."""
         return {
             "frame": self.frame,
-            "coverage_factor": COVERAGE,
+            "coverage_factor": self.coverage_factor,
+            "degrees": self.degrees,
             "components": list(COMPONENTS),
             "expanded": self.expanded,
             "position_rms": self.position,
@@ -182,13 +200,14 @@ def pose_uncertainty(
         H = transport(robot, solution.T[rows], axes, point)
         blocks.append(_covariance(posterior, solution.take(rows), chosen, H))
     T = np.where(solution.converged[:, None, None], solution.T, np.nan)
-    return PoseUncertainty(T, np.concatenate(blocks), chosen.describe(point, axes))
+    covariance, *degrees = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
+    return PoseUncertainty(T, covariance, chosen.describe(point, axes), PoseDegrees(*degrees))
 
 
 def _covariance(
     posterior: Posterior, solution: Solution, frame: ErrorFrame, H: FloatArray
-) -> FloatArray:
-    """Return the covariance (n, 6, 6) of poses.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the covariance (n, 6, 6) of poses, and its degrees of freedom as `PoseDegrees`.
 
     H (n, 6, 6) takes twists in base axes to the wanted point and axes.
     """
@@ -199,12 +218,14 @@ def _covariance(
     size = np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2))
     D, by_discrepancy = np.split(H @ frame.relate(D, solution.T), [p], axis=2)
     rest = [by_discrepancy]
-    if posterior.discrepancy is not None:
-        rest.append(H @ posterior.discrepancy.errors.rest(solution.T))
+    slow = posterior.discrepancy
+    if slow is not None:
+        rest.append(H @ slow.errors.rest(solution.T))
         posterior = posterior.without_discrepancy
     is_infinite = np.isinf(posterior.variance)
     known = posterior.directions[:, ~is_infinite] * np.sqrt(posterior.variance[~is_infinite])
-    factors = [D @ known, H @ frame.own_errors(solution.T), *rest]
+    of_frame = H @ frame.own_errors(solution.T)
+    factors = [D @ known, of_frame, *rest]
     if robot.stated_sigma.any():
         factors.append(H @ (S.readings[0] * robot.stated_sigma))
     root = np.concatenate(factors, axis=2)
@@ -220,22 +241,59 @@ def _covariance(
         pose, component = np.nonzero(lost)
         covariance[pose, component, component] = np.inf
     covariance[~solution.converged] = np.nan
-    return covariance
+    squares = [] if slow is None else slow.split_squares(by_discrepancy)
+    return covariance, *_count_degrees(posterior, covariance, D, of_frame, squares)
 
 
-def _expand_length(covariance: FloatArray) -> FloatArray:
-    """Return lengths (n,) that a normal vector of covariance (n, 3, 3) exceeds in 5 % of cases.
+def _count_degrees(
+    posterior: Posterior,
+    covariance: FloatArray,
+    D: FloatArray,
+    of_frame: FloatArray,
+    others: list[tuple[FloatArray, float]],
+) -> PoseDegrees:
+    """Return the effective degrees of freedom of poses.
 
-    Its square is a sum of weighted chi-square variables; its distribution is that of `c` times a
-    chi-square variable of h degrees of freedom with the same mean and variance (Satterthwaite,
-    Biometrics Bulletin 2(6) 110, 1946, doi 10.2307/3002019). With one direction it is exact.
+    Parameters
+    ----------
+    covariance : (n, 6, 6). D : (n, 6, p) errors by the parameters in their units.
+    of_frame : (n, 6, k) errors by those of the frame itself, which count as noise.
+    others : variances (n, 6) and degrees of freedom of other parts that were estimated.
+    """
+    squares = list(others)
+    for part in posterior.parts:
+        square = ((D @ (part.root / posterior.unit[:, None])) ** 2).sum(axis=2)
+        if part.source == NOISE:
+            square += (of_frame**2).sum(axis=2)
+        squares.append((square, part.degrees))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return PoseDegrees(
+        combine_degrees(variance, squares),
+        *(
+            combine_degrees(
+                variance[:, chosen].sum(axis=1),
+                [(s[:, chosen].sum(axis=1), nu) for s, nu in squares],
+            )
+            for chosen in (slice(3, 6), slice(0, 3))
+        ),
+    )
+
+
+def _expand_length(covariance: FloatArray, left: FloatArray) -> FloatArray:
+    """Return lengths (n,) that a vector of covariance (n, 3, 3) exceeds in 5 % of cases.
+
+    The square of a normal vector is a sum of weighted chi-square variables; its distribution is
+    that of `c` times a chi-square variable of h degrees of freedom with the same mean and variance
+    (Satterthwaite, Biometrics Bulletin 2(6) 110, 1946, doi 10.2307/3002019). With one direction it
+    is exact. Where the size of the covariance has `left` (n,) degrees of freedom, it is that of
+    c h F(h, left).
     """
     mean = np.trace(covariance, axis1=1, axis2=2)
     square = (covariance * covariance).sum(axis=(1, 2))
     usable = np.isfinite(square) & (square > 0.0)
     degrees = np.where(usable, mean, 1.0) ** 2 / np.where(usable, square, 1.0)
-    quantile = compute_chi_square_quantile(degrees, 1.0 - LEVEL)
-    length = np.sqrt(np.where(usable, mean, 0.0) / degrees * quantile)
+    quantile = compute_f_quantile(degrees, np.where(usable, left, np.inf), 1.0 - LEVEL)
+    length = np.sqrt(np.where(usable, mean, 0.0) * quantile)
     return np.where(usable, length, np.where(mean > 0.0, np.inf, mean))
 
 
@@ -246,114 +304,3 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
     R = T[:, :3, :3]
     arm = R @ robot.tool[:3, 3] if point == "tool" else np.zeros((len(T), 3))
     return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)
-
-
-@dataclass(frozen=True, eq=False)
-class AccuracyMap:
-    """Uncertainty over the workspace, and at the measured poses.
-
-    Attributes
-    ----------
-    coordinates : (n, c) controlled coordinates [m, rad]; `names` names them.
-    uncertainty : of these n poses. measured : of the measured poses.
-    """
-
-    names: tuple[str, ...]
-    coordinates: FloatArray
-    uncertainty: PoseUncertainty
-    measured: PoseUncertainty
-
-    @property
-    def position_ratio(self) -> FloatArray:
-        """(n,) position uncertainty divided by the largest at the measured poses.
-
-        Above 1 the map extrapolates.
-        """
-        return _ratio(self.uncertainty.position, self.measured.position)
-
-    @property
-    def orientation_ratio(self) -> FloatArray:
-        """(n,) orientation uncertainty divided by the largest at the measured poses."""
-        return _ratio(self.uncertainty.orientation, self.measured.orientation)
-
-    @property
-    def extrapolated(self) -> BoolArray:
-        """(n,) poses that are less certain than every measured pose."""
-        return (self.position_ratio > 1.0) | (self.orientation_ratio > 1.0)
-
-    def __str__(self) -> str:
-        """Return medians and maxima, and how many poses are extrapolated."""
-        n = len(self.coordinates)
-        lines = [f"Pose uncertainty (rms) at {n} poses: {self.uncertainty.frame}"]
-        for name, factor, symbol in (("position", 1e3, "mm"), ("orientation", 1e3, "mrad")):
-            values, measured = (
-                factor * getattr(u, name) for u in (self.uncertainty, self.measured)
-            )
-            ratio = getattr(self, f"{name}_ratio")
-            lines.append(
-                f"{name:<12} median {np.nanmedian(values):.3g} {symbol}, largest "
-                f"{np.nanmax(values):.3g} {symbol}; largest at measured poses "
-                f"{np.nanmax(measured):.3g} {symbol} (ratio up to {np.nanmax(ratio):.3g})"
-            )
-        lines.append(
-            f"{int(self.extrapolated.sum())} of {n} poses are less certain than every measured pose"
-        )
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the map by name for JSON, SI."""
-        return {
-            "names": list(self.names),
-            "coordinates": self.coordinates,
-            **self.uncertainty.to_dict(),
-            "position_ratio": self.position_ratio,
-            "orientation_ratio": self.orientation_ratio,
-            "extrapolated": int(self.extrapolated.sum()),
-        }
-
-
-def accuracy_map(
-    fit: Identification | Posterior,
-    measured: ArrayLike,
-    poses: ArrayLike | int = 400,
-    seed: int = 0,
-    axes: Axes = "base",
-    frame: str = FITTED,
-) -> AccuracyMap:
-    """Compute the uncertainty of poses over the workspace, and compare it with the measured poses.
-
-    Parameters
-    ----------
-    fit : the identification, or the posterior of a run folder.
-    measured : (m, a) readings of the measured poses, as in `Measurements.readings` [m, rad].
-    poses : (n, c) controlled coordinates, for instance a grid, or the number of poses to draw from
-        the robot's workspace.
-    seed : of that draw. axes : of the components. frame : see `pose_uncertainty`; "relative" means
-        relative to the home pose.
-
-    Raises
-    ------
-    MechanismError : poses are to be drawn, and the robot states no workspace.
-    """
-    check_argument(fit, "fit", Identification, Posterior)
-    robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
-    coordinates = resolve_poses(robot, poses, seed)
-    home = solve_home(robot)
-    compute = partial(
-        pose_uncertainty, fit, axes=axes, frame=frame, origin=home, origin_name="home"
-    )
-    return AccuracyMap(
-        names=robot.controlled,
-        coordinates=coordinates,
-        uncertainty=compute(poses=coordinates),
-        measured=compute(poses=forward(robot, measured)),
-    )
-
-
-def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return values over the largest reference; 1 where both are infinite or both are zero."""
-    largest = float(np.nanmax(reference))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(values == largest, 1.0, values / largest)

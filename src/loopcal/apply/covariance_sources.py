@@ -158,12 +158,8 @@ def _read_penalty(fit: Identification, linear: FitLinearization) -> _Penalty:
     """Return the assumptions of a fit; a direction that is not estimated has its tolerance."""
     d, used = linear.decomposition, linear.is_estimated
     to_z = d.deviation(np.eye(len(used))).T
-    scaled = linear.scaled
-    # with an estimated noise and a prior, the rows are divided by the noise
-    unit = 1.0 if scaled.decomposition is d else fit.residual_test.sigma_scale
-    penalty = unit**2 * np.where(used, scaled.penalty[0], 1.0 / unit**2)
-    noise = unit * float(np.sqrt(scaled.noise))
-    return _Penalty(to_z, used, penalty, np.where(used, unit, 1.0), noise)
+    penalty, spread = np.where(used, linear.penalty[0], 1.0), np.where(used, linear.spread, 1.0)
+    return _Penalty(to_z, used, penalty, spread, float(np.sqrt(linear.sources.noise)))
 
 
 def _evaluate_noise(fit: Identification) -> tuple[str, float]:

@@ -62,6 +62,13 @@ fit_options = add_options(
         "estimated.",
     ),
     click.option(
+        "--sigma-uncertainty",
+        type=click.FloatRange(0, 1),
+        metavar="SHARE",
+        help="Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
+        "takes them as exact.  [default: 0.25]",
+    ),
+    click.option(
         "--loss",
         type=click.Choice(LOSSES),
         default=LOSSES[0],
@@ -106,8 +113,10 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
         TruncationGCV,
         Tukey,
     )
+    from loopcal.estimate.inference.residual_test import SIGMA_UNCERTAINTY
     from loopcal.numerics.decomposition import RANK_TOLERANCE
 
+    stated = options["sigma_uncertainty"]
     name, lam, keep = options["method"], options["lam"], options["keep"]
     for option, value, needed in (("--lam", lam, "ridge"), ("--keep", keep, "tsvd")):
         if value is not None and name != needed:
@@ -133,6 +142,7 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
         method=methods[name](),
         loss=losses[options["loss"]](),
         noise=options["noise"],
+        sigma_uncertainty=SIGMA_UNCERTAINTY if stated is None else stated,
         excluded_poses=options["drop"],
         rank_tolerance=options["rank_tolerance"] or RANK_TOLERANCE,
     )

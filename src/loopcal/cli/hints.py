@@ -55,7 +55,7 @@ HINTS = {
     "gates.run-without-verdict": "use --force to write its numbers nevertheless",
     "noise.residuals-too-large": "exclude a pose with --drop POSE, or use --loss huber",
     "noise.residuals-too-small": "use --noise estimated",
-    "noise.too-few-degrees": "use --noise given",
+    "noise.few-degrees": "use --noise given",
     "prior.machine-changed": "use --free-limb LIMB",
     "prior.rows-reused": "exclude poses with --drop POSE",
     "prior.tolerances-too-narrow": "use --method auto",

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from loopcal.diagnose.second_order import draw_readings, measure_second_order
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.inference.null_space import Combination
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE, ResidualTest
+from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.geometry import log_so3
@@ -282,6 +282,7 @@ def _compare(fit: Identification, at: IntArray, given: FloatArray) -> ValueCompa
     y = tested.T @ (raw / tolerance)
     known = np.where(is_open, 0.0, posterior.variance)
     whitened, u, second_order = np.full(len(y), np.nan), np.eye(len(y)), np.nan
+    left = np.inf
     if np.isfinite(known).all() and len(y):
         scaled = parts * np.sqrt(known)
         u, s, wt = np.linalg.svd(tested.T @ scaled, full_matrices=False)
@@ -289,12 +290,15 @@ def _compare(fit: Identification, at: IntArray, given: FloatArray) -> ValueCompa
         # the most probable change of all parameters with this difference of the compared ones
         change = posterior.directions @ (np.sqrt(known) * (wt.T @ whitened))
         second_order = measure_second_order(posterior, posterior.unit * change)
+        whitening = np.zeros((len(y), len(posterior.unit)))
+        whitening[:, at] = ((u / s).T @ tested.T) / tolerance
+        left = float(posterior.count_degrees(whitening))
     chi_square = float(np.sum(whitened**2))
     names = tuple(fit.names[i] for i in at)
     sigma, direction = _name_largest(names, tested @ u, whitened)
     is_cut = comparable.shape[1] < len(names)
     p_value, *bounds = (
-        _compute_p_value(fit.residual_test, len(y), max(root, 0.0) ** 2)
+        _compute_p_value(left, len(y), max(root, 0.0) ** 2)
         for root in np.sqrt(chi_square) + np.array([0.0, -1.0, 1.0]) * np.sqrt(second_order)
     )
     return ValueComparison(
@@ -321,14 +325,15 @@ def _find_complement(columns: FloatArray) -> FloatArray:
     return u[:, int((s > NULL_COMPONENT).sum()) :]
 
 
-def _compute_p_value(test: ResidualTest, degrees: int, chi_square: float) -> float:
-    """Return the probability of a larger chi-square; with a noise from the residuals, of F."""
+def _compute_p_value(left: float, degrees: int, chi_square: float) -> float:
+    """Return the probability of a larger chi-square; of F, where the size of the posterior has
+    `left` effective degrees of freedom.
+    """
     if degrees == 0 or not np.isfinite(chi_square):
         return float("nan")
-    if test.noise == "estimated" or test.failed:
-        left = test.dof if test.noise == "estimated" else test.degrees
-        return float(compute_f_tail(degrees, left, chi_square / degrees))
-    return float(compute_chi_square_tail(degrees, chi_square))
+    if np.isinf(left):
+        return float(compute_chi_square_tail(degrees, chi_square))
+    return float(compute_f_tail(degrees, left, chi_square / degrees))
 
 
 def _name_largest(

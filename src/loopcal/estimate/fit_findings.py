@@ -7,7 +7,7 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.losses import Loss
-from loopcal.estimate.methods.penalties import MAP, Method
+from loopcal.estimate.methods.penalties import MAP, Method, Ridge
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.numerics.gauss_newton import DescentStatus
@@ -95,5 +95,26 @@ def report_equations(equations: int, parameters: int, method: Method) -> list[Fi
             equations=equations,
             parameters=parameters,
             directions=parameters - equations,
+        )
+    ]
+
+
+def report_unknown_bias(
+    free: FreeParameters, method: Method, prior: FloatArray | None
+) -> list[Finding]:
+    """Return why a ridge has no intervals, where its bias is not known.
+
+    Parameters
+    ----------
+    prior : (1, p) variance of the true coordinates, see `Method.prior_variance`.
+    """
+    if not isinstance(method, Ridge) or prior is None or not np.isnan(prior).any():
+        return []
+    lacking = method.lacks_tolerances(free)
+    return [
+        report_finding(
+            "fit.ridge-without-intervals",
+            names=tuple(n for n, lacks in zip(free.names, lacking, strict=True) if lacks),
+            is_correlated=free.correlation is not None,
         )
     ]

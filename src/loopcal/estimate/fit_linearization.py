@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.estimate.inference.posterior import ScaledNoise, scale_variances
+from loopcal.estimate.inference.posterior import VarianceSources, find_variance_sources
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.poses.smooth_errors import SmoothErrors
@@ -26,19 +26,39 @@ class FitLinearization:
     Attributes
     ----------
     problem : without the rows of an earlier calibration. linearization : with them.
-    decomposition, penalty : of the fit. scaled : from which variances are read.
+    decomposition, penalty : of the fit. sources : of its variances.
     """
 
     problem: Problem
     linearization: Linearization
     decomposition: Decomposition
     penalty: FloatArray
-    scaled: ScaledNoise
+    sources: VarianceSources
 
     @property
     def variance(self) -> FloatArray:
         """(p,) variance of each direction; infinite where it is not estimated."""
-        return self.scaled.decomposition.variances(self.scaled.penalty, self.scaled.noise)[0]
+        return self.decomposition.variances(self.penalty, *self.sources)[0]
+
+    @property
+    def spread(self) -> FloatArray:
+        """(p,) standard deviation of the true coordinates times the root of the penalty: 1 where
+        the penalty is a prior of the rows' unit noise.
+        """
+        penalty, prior = self.penalty[0], self.sources.prior
+        if prior is None:
+            return np.ones(len(penalty))
+        finite = np.where(np.isfinite(penalty), penalty, 0.0)
+        return np.asarray(np.sqrt(finite * prior[0]))
+
+    @property
+    def prior_weight(self) -> FloatArray:
+        """(p,) 1 / variance of the true coordinates about nominal: the penalty, but where it
+        contains an estimated noise; 0 without a prior, infinite where a direction is not used.
+        """
+        penalty = self.penalty[0]
+        spread = np.where(np.isfinite(penalty) & (penalty > 0.0), self.spread, 1.0)
+        return np.asarray(penalty / spread**2)
 
     @property
     def is_estimated(self) -> BoolArray:
@@ -64,8 +84,8 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
         fit.spectrum.tolerance,
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
-    scaled = scale_variances(d, penalty, fit.residual_test, method)
-    return FitLinearization(problem, linearization, d, penalty, scaled)
+    sources = find_variance_sources(d, penalty, fit.residual_test, method, fit.free_parameters)
+    return FitLinearization(problem, linearization, d, penalty, sources)
 
 
 def linearize_rows_of(fit: Identification, data: Measurements) -> tuple[Problem, Linearization]:

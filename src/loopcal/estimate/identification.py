@@ -11,7 +11,12 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_descent import descend_once, descend_to_prior, get_method, repeat_trials
-from loopcal.estimate.fit_findings import report_divergence, report_equations, report_weights
+from loopcal.estimate.fit_findings import (
+    report_divergence,
+    report_equations,
+    report_unknown_bias,
+    report_weights,
+)
 from loopcal.estimate.fit_input import (
     check_count,
     check_rows,
@@ -24,7 +29,7 @@ from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
-from loopcal.estimate.inference.posterior import compute_posterior, scale_variances
+from loopcal.estimate.inference.posterior import compute_posterior, find_variance_sources
 from loopcal.estimate.inference.prior import (
     collect_used_rows,
     refuse_reused_rows,
@@ -34,7 +39,7 @@ from loopcal.estimate.inference.residual_test import run_residual_test
 from loopcal.estimate.inference.shown_noise import find_shown_noise
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.losses import Loss
-from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
+from loopcal.estimate.methods.penalties import LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.regularization import describe_regularization
 from loopcal.estimate.minimization.closure_start import report_unused_closure
 from loopcal.estimate.minimization.descent import Descent
@@ -141,6 +146,7 @@ class IdentifiedTrials:
     values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
     cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
     decomposition, penalty : variances and leverages are read from them.
+    prior_variance : (t, p) see `Method.prior_variance`.
     """
 
     values: FloatArray
@@ -150,6 +156,7 @@ class IdentifiedTrials:
     free_parameters: FreeParameters
     decomposition: Decomposition
     penalty: FloatArray
+    prior_variance: FloatArray | None = None
 
     def __repr__(self) -> str:
         """Return the number of trials and how many converged."""
@@ -167,7 +174,9 @@ class IdentifiedTrials:
         """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
         parameter.
         """
-        scaled = self.decomposition.standard_deviations(self.penalty, noise_variance)
+        scaled = self.decomposition.standard_deviations(
+            self.penalty, noise_variance, self.prior_variance
+        )
         return scaled * self.free_parameters.tolerance
 
 
@@ -218,6 +227,7 @@ def identify_trials(
         free,
         fit.decomposition,
         fit.penalty,
+        method.prior_variance(fit.decomposition, fit.penalty, free),
     )
 
 
@@ -242,26 +252,30 @@ def _assemble(
     """
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
     noise, weighs = name_noise(options, data), options.loss is not None
-    is_prior, method = isinstance(get_method(options), MAP), get_method(options)
-    test = run_residual_test(fit.decomposition, fit.penalty, noise, weighs, converged, is_prior)
+    d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
+    test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, weighs, converged)
+    sources = find_variance_sources(d, penalty, test, method, free)
+    test = replace(test, intervals=bool(np.isfinite(sources.noise)))
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = run_prior_tests(free, fit, method)
-    d, penalty, variance = scale_variances(fit.decomposition, fit.penalty, test, method)
-    plain, values = fit.decomposition.plain(), free.values(fit.deviation)[0]
+    plain, values = d.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
     has_nuisance = weighted.nuisance is not None
     linearization = weighted.linearize(fit.deviation, fit.start) if has_nuisance else None
     baseline = fit_setup_before(problem, robot, options, data.with_weights(weights), fit)
-    nuisance = _estimate_nuisance(weighted, linearization, robot, d, penalty, variance, baseline)
+    variance = d.variances(penalty, *sources)[0]
+    nuisance = _estimate_nuisance(
+        weighted, linearization, robot, d, variance, sources.noise, baseline
+    )
     frames = find_measured_frames(
-        weighted, data, fit.deviation, fit.start, options.prior, linearization, variance
+        weighted, data, fit.deviation, fit.start, options.prior, linearization, sources.noise
     )
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
     excluded, estimates = tuple(options.excluded_poses), solution.estimates
     poses = None if estimates is None else estimate_poses(estimates, data, excluded)
     history = _record_history(free, fit)
-    regularization = describe_regularization(method, fit.decomposition, fit.penalty)
+    regularization = describe_regularization(method, d, penalty)
     findings = [
         *([] if converged else [history.finding]),
         report_noise(data, robot, test),
@@ -273,6 +287,7 @@ def _assemble(
         *free.findings(),
         *_report_closure(problem, options),
         *([] if regularization is None else [regularization.finding]),
+        *report_unknown_bias(free, method, sources.prior),
         *report_equations(int(problem.equations[0]), problem.parameters, method),
         *report_weights(data, weights, options.loss),
         *_report_excluded(excluded),
@@ -283,9 +298,9 @@ def _assemble(
         initial=robot,
         options=options,
         free_parameters=free,
-        covariance=d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance,
+        covariance=d.covariance(penalty, *sources)[0] * free.tolerance[:, None] * free.tolerance,
         posterior=compute_posterior(
-            corrected, free.places, free.tolerance, d, penalty, variance, frames, test.noise_degrees
+            corrected, free.places, free.tolerance, d, penalty, sources, frames, test.noise_degrees
         ),
         spectrum=Spectrum(
             int(plain.rank[0]), float(plain.condition[0]), plain.singular_values[0], d.tolerance
@@ -315,15 +330,15 @@ def _estimate_nuisance(
     linearization: Linearization | None,
     robot: Mechanism,
     d: Decomposition,
-    penalty: FloatArray,
-    variance: float,
+    variance: FloatArray,
+    noise: float,
     baseline: FloatArray | None,
 ) -> NuisanceEstimate:
     """Return the nuisance parameters at the estimate, where the rows are linearized."""
     if problem.nuisance is None or linearization is None:
         return empty_nuisance_estimate(problem.parameters)
     nuisance = problem.nuisance
-    return estimate_nuisance(nuisance, linearization, robot, d, penalty, variance, baseline)
+    return estimate_nuisance(nuisance, linearization, robot, d, variance, noise, baseline)
 
 
 def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:

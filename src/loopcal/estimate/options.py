@@ -12,6 +12,7 @@ import numpy as np
 
 from loopcal.errors import ArgumentTypeError, EstimationError
 from loopcal.estimate.inference.prior import Prior
+from loopcal.estimate.inference.residual_test import SIGMA_UNCERTAINTY
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.descent import StepControl
@@ -41,6 +42,8 @@ class FitOptions:
     loss : `Huber()` or `Tukey()` reduce the weight of observation blocks far from the fit; None
         gives all rows their full weight.
     noise : "given" takes the sigmas of the data as true, "estimated" up to one common factor.
+    sigma_uncertainty : relative standard uncertainty of given sigmas. The residuals correct them
+        within it, and intervals account for it; 0 takes them as exact.
     prior : an earlier calibration, see `loopcal.estimate.prior_from`.
     start : (p of the robot,) or (t, p of the robot) [SI] values to begin with; None begins with the
         values of the robot.
@@ -67,6 +70,7 @@ class FitOptions:
     method: Method | None = None
     loss: Loss | None = None
     noise: Noise = "given"
+    sigma_uncertainty: float = SIGMA_UNCERTAINTY
     prior: Prior | None = None
     start: Sequence[float] | FloatArray | None = None
     begin: Begin = "kinematics"
@@ -79,6 +83,12 @@ class FitOptions:
     def __post_init__(self) -> None:
         _check_choice("noise", self.noise, get_args(Noise))
         _check_choice("begin", self.begin, get_args(Begin))
+        check_number(self.sigma_uncertainty, "sigma_uncertainty", "a number from 0 to 1")
+        if not 0.0 <= self.sigma_uncertainty <= 1.0:
+            raise EstimationError(
+                f"sigma_uncertainty is {self.sigma_uncertainty}; it must be from 0 (the stated "
+                "sigmas are exact) to 1"
+            )
         if self.method is not None and not _is_instance_with(self.method, METHOD_PARTS):
             raise EstimationError(
                 f"method is {self.method!r}; it must be an instance such as MAP(), "

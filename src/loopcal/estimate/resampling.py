@@ -183,7 +183,7 @@ def _descend(
 
 def draw_centers(linear: FitLinearization, count: int, rng: np.random.Generator) -> FloatArray:
     """Draw centers (count, p) of the prior of a fit by MAP, in tolerances from nominal."""
-    d, penalty = linear.scaled.decomposition, linear.scaled.penalty[0]
+    d, penalty = linear.decomposition, linear.prior_weight
     is_penalized = np.isfinite(penalty) & (penalty > 0.0)
     sd = np.where(is_penalized, 1.0 / np.sqrt(np.where(is_penalized, penalty, 1.0)), 0.0)
     return d.deviation(rng.standard_normal((count, len(penalty))) * sd)

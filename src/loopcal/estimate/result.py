@@ -167,9 +167,16 @@ class Identification:
         """
         return np.sqrt(np.diag(self.covariance))
 
+    @cached_property
+    def degrees(self) -> FloatArray:
+        """(p,) effective degrees of freedom of the standard deviations (Welch-Satterthwaite):
+        infinite where nothing in them was estimated.
+        """
+        return self.posterior.count_degrees(np.eye(len(self.names))[:, None])
+
     def interval(self, level: float = LEVEL) -> FloatArray:
-        """Return half-widths (p,) of intervals of this coverage."""
-        return coverage_factor(self.residual_test, level) * self.standard_deviations
+        """Return half-widths (p,) of intervals of this coverage, by Student's t."""
+        return coverage_factor(self.degrees, level) * self.standard_deviations
 
     @property
     def plus_minus(self) -> FloatArray:
@@ -228,10 +235,10 @@ class Identification:
         """
         test, cost = self.residual_test, self.history.cost
         if self.converged:
-            rank, (square, degrees, _) = f"Rank {self.rank} of {len(self.names)}.", test.decisive
+            rank, square = f"Rank {self.rank} of {len(self.names)}.", test.chi_square
             if test.weighted:
                 return f"{rank} The squares of the weighted residuals add up to {square:.5g}."
-            return f"{rank} Chi-square {square:.5g} with {degrees:.4g} degrees of freedom."
+            return f"{rank} Chi-square {square:.5g} with {test.degrees:.4g} degrees of freedom."
         if not cost[-1] < cost[0]:
             return ""
         fell = f"The sum of squared residuals, each divided by its sigma, fell from {cost[0]:.3g}"
@@ -284,7 +291,8 @@ class Identification:
 
     def _nuisance_rows(self) -> list[dict[str, Any]]:
         """Return one row for each nuisance parameter, with 95 % intervals."""
-        return self.nuisance.rows(coverage_factor(self.residual_test))
+        degrees = self.nuisance.count_degrees(self.posterior.parts, self.tolerance)
+        return self.nuisance.rows(coverage_factor(degrees), degrees)
 
     def _parameter_rows(self) -> list[dict[str, Any]]:
         """Return one row for each parameter, in the units of the robot's file."""
@@ -298,6 +306,7 @@ class Identification:
                 "estimate": self.estimate[i] / factor[i],
                 "sd": self.standard_deviations[i] / factor[i],
                 "plus_minus": half[i] / factor[i],
+                "degrees": self.degrees[i],
                 "tolerance": self.tolerance[i] / factor[i],
                 "tolerance_assumed": bool(self.free_parameters.assumed[i]),
             }
@@ -327,9 +336,10 @@ class Identification:
             "chi_square": test.chi_square,
             "degrees": test.degrees,
             "p_value": test.p_value,
-            "residuals_alone": None if test.residuals is None else test.residuals._asdict(),
             "noise": test.noise,
+            "sigma_uncertainty": self.options.sigma_uncertainty,
             "sigma_scale": test.sigma_scale if self.converged else None,
+            "noise_degrees": test.noise_degrees if self.converged else None,
             "prior_conflict": self.prior_conflict,
             "dropped": self.excluded_poses,
             "readings": self.poses,

@@ -7,7 +7,7 @@ import numpy as np
 
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.identification import IdentifiedTrials
-from loopcal.estimate.inference.posterior import Posterior, compute_posterior
+from loopcal.estimate.inference.posterior import Posterior, VarianceSources, compute_posterior
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Trials
 
@@ -28,11 +28,13 @@ def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) 
     frames = find_measured_frames(
         problem, data, z, linearization.next_start, linearization=linearization
     )
+    prior = fits.prior_variance
     return compute_posterior(
         free.robot.with_values(fits.values[trial]),
         free.places,
         free.tolerance,
         fits.decomposition.take(chosen),
         fits.penalty[chosen],
-        frames=frames,
+        VarianceSources(1.0, None if prior is None else prior[chosen]),
+        frames,
     )

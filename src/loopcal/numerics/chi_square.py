@@ -57,3 +57,21 @@ def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> F
     from scipy.special import chdtri
 
     return np.asarray(chdtri(degrees, probability), dtype=float)
+
+
+def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLike) -> FloatArray:
+    """Return the statistic that F exceeds with a probability.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom of the statistic, above 0.
+    left : of the estimated noise, above 0; infinite for a known one: chi-square over `degrees`.
+    probability : of a larger value [1]. All broadcast.
+    """
+    from scipy.special import fdtri
+
+    left = np.asarray(left, dtype=float)
+    is_known = np.isinf(left)
+    known = compute_chi_square_quantile(degrees, probability) / np.asarray(degrees)
+    estimated = fdtri(degrees, np.where(is_known, 1.0, left), 1.0 - np.asarray(probability))
+    return np.where(is_known, known, estimated)

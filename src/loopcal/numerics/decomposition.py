@@ -173,19 +173,28 @@ class Decomposition(TrialBatch):
         left = (1.0 - self.filter_factors(penalty)) * self.projections
         return (left**2).sum(axis=1) + self.outside
 
-    def variances(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
+    def variances(
+        self, penalty: FloatArray, noise: FloatArray | float = 1.0, prior: FloatArray | None = None
+    ) -> FloatArray:
         """Return the variance (t, p) of each coordinate: infinite where the direction is not used.
 
-        For noise variance sigma^2 of the rows and a prior of variance 1 / penalty_i it is noise
-        plus the bias of the penalty: f_i^2 sigma^2 / s_i^2 + (1 - f_i)^2 / penalty_i, with
-        sigma = 1 equal to 1 / (s_i^2 + penalty_i), and with no penalty equal to sigma^2 / s_i^2.
+        For noise variance sigma^2 of the rows and true coordinates of variance tau_i^2 it is noise
+        plus the expected square of the bias: f_i^2 sigma^2 / s_i^2 + (1 - f_i)^2 tau_i^2. With
+        tau_i^2 = 1 / penalty_i and sigma = 1 that is 1 / (s_i^2 + penalty_i), and with no penalty
+        it is sigma^2 / s_i^2.
+
+        Parameters
+        ----------
+        penalty : (t, p). noise : sigma^2, (t,) or one number.
+        prior : (t, p) tau_i^2, of no effect where the penalty is zero; default: 1 / penalty.
         """
         square = self.singular_values**2
         sigma2 = np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(square),))[:, None]
         cut = np.isinf(penalty) | (square + penalty <= 0.0)
         finite = np.where(cut, 1.0, penalty)
         total = np.where(cut, 1.0, square + finite)
-        return np.where(cut, np.inf, (sigma2 * square + finite) / total**2)
+        bias = finite if prior is None else finite**2 * np.where(finite > 0.0, prior, 0.0)
+        return np.where(cut, np.inf, (sigma2 * square + bias) / total**2)
 
     def noise_roots(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
         """Return a square root (t, p, p) of the part of the covariance that the noise of the rows
@@ -198,14 +207,16 @@ class Decomposition(TrialBatch):
         sigma = np.sqrt(np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(s),)))
         return self.directions * (sigma[:, None] * gain)[:, None, :]
 
-    def covariance(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
+    def covariance(
+        self, penalty: FloatArray, noise: FloatArray | float = 1.0, prior: FloatArray | None = None
+    ) -> FloatArray:
         """Return the covariance (t, p, p) of the deviation, in the units of the columns.
 
         A parameter that has a part in a direction that is not used has infinite variance, and its
         covariances with all others are not defined (nan): the one rule of the project for
         directions that the data do not determine.
         """
-        variances = self.variances(penalty, noise)
+        variances = self.variances(penalty, noise, prior)
         infinite = np.isinf(variances)
         spread = self.directions * np.sqrt(np.where(infinite, 0.0, variances))[:, None, :]
         covariance = np.matmul(spread, spread.swapaxes(-1, -2)) * self.scale[:, None] * self.scale
@@ -217,12 +228,12 @@ class Decomposition(TrialBatch):
         return covariance
 
     def standard_deviations(
-        self, penalty: FloatArray, noise: FloatArray | float = 1.0
+        self, penalty: FloatArray, noise: FloatArray | float = 1.0, prior: FloatArray | None = None
     ) -> FloatArray:
         """Return the standard deviation (t, p) of each parameter by the rule of `covariance`,
         without the matrix.
         """
-        variances = self.variances(penalty, noise)
+        variances = self.variances(penalty, noise, prior)
         infinite = np.isinf(variances)
         finite = np.where(infinite, 0.0, variances)
         result = np.sqrt(np.matmul(self.directions**2, finite[:, :, None])[:, :, 0]) * self.scale
@@ -254,14 +265,18 @@ class Decomposition(TrialBatch):
         )
 
     def knowledge(
-        self, penalty: FloatArray, noise: float = 1.0, trial: int = 0
+        self,
+        penalty: FloatArray,
+        noise: float = 1.0,
+        prior: FloatArray | None = None,
+        trial: int = 0,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return orthonormal directions (p, p) of z / scale, the variance (p,) of each, and which
         the rows see, of one trial.
 
         Where V is oblique these come from the singular values of diag(var)^(-1/2) V^-1.
         """
-        variances = self.variances(penalty, noise)[trial]
+        variances = self.variances(penalty, noise, prior)[trial]
         if self.dual is None or np.isnan(variances).any():
             return self.plain().directions[trial], variances, self.plain().used[trial]
         dual = self.dual[trial]

@@ -125,7 +125,7 @@ def describe_density(fit: Identification, linear: FitLinearization) -> Posterior
     `linear` are its rows, see `linearize_fit`.
     """
     scale, degrees = fit.residual_test.sigma_scale, fit.residual_test.noise_degrees
-    stated, penalty = linear.decomposition, linear.scaled.penalty[0]
+    stated, penalty = linear.decomposition, linear.prior_weight
     d = stated.divided(np.array([scale]))
     finite = np.where(np.isfinite(penalty), penalty, 0.0)
     # without a prior a direction is used within the rank; with one, also beyond it

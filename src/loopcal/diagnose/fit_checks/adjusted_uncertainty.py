@@ -27,7 +27,7 @@ from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_resi
 from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.inference.added_covariance import add_covariance
-from loopcal.estimate.inference.posterior import NOISE
+from loopcal.estimate.inference.covariance_parts import NOISE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma

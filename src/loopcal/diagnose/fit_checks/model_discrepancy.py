@@ -211,16 +211,14 @@ def project_slow_errors(
         return None
     linear = linearize_fit(fit, data)
     extended = linearize_smooth_errors(fit, data, errors)
-    d, scaled, m = linear.decomposition, linear.scaled, errors.count
-    unit = 1.0 if scaled.decomposition is d else fit.residual_test.sigma_scale
-    used = d.used[0]
+    d, m, used = linear.decomposition, errors.count, linear.decomposition.used[0]
     k = int(used.sum())
     to_z = d.deviation(np.eye(len(used)))[used].T
-    penalty = np.where(np.isfinite(scaled.penalty[0]), scaled.penalty[0], 0.0)[used]
+    penalty = np.where(np.isfinite(linear.penalty[0]), linear.penalty[0], 0.0)[used]
     prior = np.zeros((k, k + m + 1))
     prior[:, :k] = np.diag(np.sqrt(penalty))
     prior[:, -1] = np.sqrt(penalty) * d.coordinates(linear.linearization.deviation)[0][used]
-    factor = extended.factor[0] / unit
+    factor = extended.factor[0]
     p = len(used)
     columns = np.concatenate([factor[:, :p] @ to_z, factor[:, p:]], axis=1)
     R = np.linalg.qr(np.concatenate([columns, prior[penalty > 0.0]]), mode="r")

@@ -19,7 +19,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.estimate.inference.posterior import CovariancePart, Posterior
+from loopcal.estimate.inference.covariance_parts import CovariancePart
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.nuisance.estimate import NuisanceEstimate
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding

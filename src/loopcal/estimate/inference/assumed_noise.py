@@ -52,7 +52,7 @@ def report_noise(data: Measurements, robot: Mechanism, test: ResidualTest) -> Fi
             return test.finding
         sigmas = _list_sigmas(data, robot, test.sigma_scale)
         return report_finding("noise.assumed-replaced", sigmas=sigmas, dof=test.dof)
-    if test.degrees < 0.5:
+    if test.degrees < 0.5 or np.isnan(test.p_value):
         return report_finding("noise.assumed-untested", sigmas=_list_sigmas(data, robot, 1.0))
     ratio = float(np.sqrt(test.chi_square / test.degrees))
     return report_finding(

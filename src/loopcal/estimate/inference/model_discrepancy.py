@@ -55,6 +55,16 @@ class ModelDiscrepancy:
         """
         return by_parameters @ self.root - self.errors.twists(T)
 
+    def split_squares(self, twists: FloatArray) -> list[tuple[FloatArray, float]]:
+        """Return the variances (n, 6) that the errors of rotation and those of place cause, from
+        columns (n, 6, m) such as `twists`, and the degrees of freedom of each.
+        """
+        halves = np.split(twists, 2, axis=2)
+        return [
+            ((half**2).sum(axis=2), float(degrees))
+            for half, degrees in zip(halves, self.degrees, strict=True)
+        ]
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `discrepancy_from_arrays` reads."""
         own = {PREFIX + name: np.asarray(getattr(self, name)) for name in STORED}

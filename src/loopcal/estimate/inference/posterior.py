@@ -15,6 +15,15 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.covariance_parts import (
+    NOISE,
+    PREFIX,
+    CovariancePart,
+    combine_degrees,
+    parts_from_arrays,
+    store_parts,
+)
 from loopcal.estimate.inference.measured_frames import MeasuredFrames, frames_from_arrays
 from loopcal.estimate.inference.model_discrepancy import (
     DISCREPANCY,
@@ -23,40 +32,15 @@ from loopcal.estimate.inference.model_discrepancy import (
 )
 from loopcal.estimate.inference.residual_test import ResidualTest
 from loopcal.estimate.inference.shown_noise import ShownNoise, shown_noise_from_arrays
-from loopcal.estimate.methods.penalties import MAP, Method
+from loopcal.estimate.methods.penalties import Method
 from loopcal.findings import report_finding
 from loopcal.measure import FittedRows, fitted_rows_from_arrays
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-PREFIX = "posterior_"
 STORED = {"unit": "unit", "directions": "directions", "variance": "variance", "seen": "determined"}
 """Arrays of a run folder (after `PREFIX`), and the attributes that they hold."""
-
-
-NOISE = "noise"
-"""Source of the part of the covariance that the noise of the rows causes."""
-
-PARTS = ("source", "degrees", "root", "part")
-"""Arrays of a run folder (after `PREFIX`) with the parts of the covariance: the source and the
-degrees of freedom of each, the roots beside each other, and the number of the part of each column.
-"""
-
-
-class CovariancePart(NamedTuple):
-    """A part of the covariance of the parameters whose size was estimated from data.
-
-    Attributes
-    ----------
-    source : what causes it: "noise", or the code of the finding with which it was added.
-    root : (p, k) [SI], the part is root root'.
-    degrees : degrees of freedom of its estimated size; infinite where it is known.
-    """
-
-    source: str
-    root: FloatArray
-    degrees: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,27 +116,15 @@ class Posterior:
         )
 
     def count_degrees(self, effect: FloatArray) -> FloatArray:
-        """Return the effective degrees of freedom (..,) of the size of errors.
-
-        The square of the size of an error `effect` times the deviation of the parameters is the sum
-        of the squares of its c components. Its parts u_i^2 have nu_i degrees of freedom, each with
-        one common factor, so that (Welch-Satterthwaite, JCGM 100 G.4)
-
-            degrees = u^4 / sum(u_i^4 / nu_i)
+        """Return the effective degrees of freedom (..,) of the size of errors, whose square is the
+        sum of the squares of c components; see `combine_degrees`.
 
         Parameters
         ----------
-        effect : (.., c, p) [per SI].
-
-        Returns
-        -------
-        At least the smallest nu_i; infinite where no part has an effect.
+        effect : (.., c, p) [per SI] of the components.
         """
-        total = _sum_squares(effect @ self.root)
-        spread = np.zeros_like(total)
-        for part in self.parts:
-            spread += _sum_squares(effect @ part.root) ** 2 / part.degrees
-        return np.divide(total**2, spread, out=np.full_like(total, np.inf), where=spread > 0.0)
+        squares = ((_sum_squares(effect @ part.root), part.degrees) for part in self.parts)
+        return combine_degrees(_sum_squares(effect @ self.root), squares)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the run folder, which `posterior_from_arrays` reads."""
@@ -160,17 +132,24 @@ class Posterior:
             PREFIX + name: np.asarray(getattr(self, attribute))
             for name, attribute in STORED.items()
         }
-        parts = self.parts
-        content = (
-            np.array([part.source for part in parts], dtype=np.str_),
-            np.array([part.degrees for part in parts]),
-            np.concatenate([np.zeros((len(self.unit), 0)), *(part.root for part in parts)], axis=1),
-            np.repeat(np.arange(len(parts)), [part.root.shape[1] for part in parts]),
-        )
-        own |= {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
+        own |= store_parts(self.parts, len(self.unit))
         for value in (self.frames, self.fitted_rows, self.discrepancy, self.shown_noise):
             own |= {} if value is None else value.arrays()
         return own
+
+
+class VarianceSources(NamedTuple):
+    """What the variances of a fit are made of, beside its decomposition and penalty.
+
+    Attributes
+    ----------
+    noise : variance of the whitened rows; NaN without intervals.
+    prior : (1, p) variance of the true coordinates about nominal, from which the bias of the
+        penalty is expected; None for 1 / penalty.
+    """
+
+    noise: float
+    prior: FloatArray | None = None
 
 
 def compute_posterior(
@@ -179,7 +158,7 @@ def compute_posterior(
     tolerance: FloatArray,
     decomposition: Decomposition,
     penalty: FloatArray,
-    noise: float = 1.0,
+    sources: VarianceSources = VarianceSources(1.0),  # noqa: B008
     frames: MeasuredFrames | None = None,
     degrees: float = np.inf,
 ) -> Posterior:
@@ -189,13 +168,13 @@ def compute_posterior(
     ----------
     robot : at the estimate. places, tolerance : (p,) of the free parameters.
     decomposition, penalty : of the fit; columns scaled by tolerance.
-    noise : variance of the whitened rows; NaN without intervals.
+    sources : of the variances; default: stated noise, and a prior that is the penalty.
     frames : which frames the measurements determine.
     degrees : degrees of freedom of the noise variance; infinite where it is known.
     """
-    directions, variance, determined = decomposition.knowledge(penalty, noise)
+    directions, variance, determined = decomposition.knowledge(penalty, *sources)
     unit = tolerance * decomposition.scale
-    by_noise = unit[:, None] * decomposition.noise_roots(penalty, noise)[0]
+    by_noise = unit[:, None] * decomposition.noise_roots(penalty, sources.noise)[0]
     return Posterior(
         robot=robot,
         places=places,
@@ -208,27 +187,19 @@ def compute_posterior(
     )
 
 
-class ScaledNoise(NamedTuple):
-    """Decomposition, penalty and noise variance from which the variances of a fit are read."""
-
-    decomposition: Decomposition
-    penalty: FloatArray
-    noise: float
-
-
-def scale_variances(
-    decomposition: Decomposition, penalty: FloatArray, test: ResidualTest, method: Method
-) -> ScaledNoise:
-    """Return what the variances of a fit are read from, the noise scaled as the test says.
-
-    With an estimated noise the penalty of MAP contains its variance. Decomposition and penalty are
-    divided by it, so that the variance of the rows is 1 again. The noise is NaN without intervals.
+def find_variance_sources(
+    decomposition: Decomposition,
+    penalty: FloatArray,
+    test: ResidualTest,
+    method: Method,
+    free: FreeParameters,
+) -> VarianceSources:
+    """Return what the variances of a fit are made of: noise as the test scales it, and the bias of
+    the penalty as the stated tolerances let it expect.
     """
-    noise = test.sigma_scale**2 if test.intervals else np.nan
-    if isinstance(method, MAP) and test.intervals and test.noise == "estimated":
-        divided = decomposition.divided(np.full(len(penalty), test.sigma_scale))
-        return ScaledNoise(divided, penalty / noise, 1.0)
-    return ScaledNoise(decomposition, penalty, noise)
+    prior = method.prior_variance(decomposition, penalty, free)
+    is_known = test.intervals and (prior is None or not np.isnan(prior).any())
+    return VarianceSources(test.sigma_scale**2 if is_known else np.nan, prior)
 
 
 def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:
@@ -259,21 +230,10 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         variance,
         determined.astype(bool),
         frames_from_arrays(arrays),
-        _parts_from_arrays(arrays),
+        parts_from_arrays(arrays),
         fitted_rows_from_arrays(arrays),
         discrepancy_from_arrays(arrays),
         shown_noise_from_arrays(arrays),
-    )
-
-
-def _parts_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[CovariancePart, ...]:
-    """Return the parts of the covariance; none for run folders of earlier versions."""
-    if any(PREFIX + name not in arrays for name in PARTS):
-        return ()
-    sources, degrees, roots, number = (arrays[PREFIX + name] for name in PARTS)
-    return tuple(
-        CovariancePart(str(source), roots[:, number == i], float(degrees[i]))
-        for i, source in enumerate(sources.tolist())
     )
 
 

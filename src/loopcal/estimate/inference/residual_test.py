@@ -1,14 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test the residuals of a fit against the noise (chi-square), and scale its intervals.
+"""Test the residuals of a fit against the noise (chi-square), and estimate the noise.
 
-Intervals use the normal distribution where the noise is given, and Student's t where it is
-estimated.
+The test takes what no parameter can explain: the part of the rows outside the range of the
+parameters. No penalty and no prior enters it, so that wrong tolerances are not reported as noise.
+
+A stated sigma is taken as known to within a relative standard uncertainty u. That is knowledge of
+nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals add their own:
+
+    s^2 = (nu0 + unexplained) / (nu0 + degrees)        with nu0 + degrees degrees of freedom
+
+u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that exceed the stated
+noise beyond doubt contradict the stated sigma: then s is that of the residuals alone. Residuals
+that are far too small may be copies of each other, or averages: then s stays 1. See
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +27,8 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
 
 FEWEST_DEGREES = 5
-"""Degrees of freedom below which an estimated noise is too uncertain for intervals: with 4 its own
-standard deviation is 35 %.
+"""Degrees of freedom below which an estimated noise is too uncertain to weigh data against
+tolerances: with 4 its own standard deviation is 35 %. Intervals account for it by Student's t.
 """
 
 LEVEL = 0.95
@@ -33,13 +42,13 @@ that do not agree with the data.
 DOUBT = 1e-2
 """Probability below which a test does not accept either."""
 
+SIGMA_UNCERTAINTY = 0.25
+"""Relative standard uncertainty of the stated sigmas, where nothing else is said: the reliability
+that JCGM 100, G.4.2, gives as its example.
+"""
 
-class SquareTest(NamedTuple):
-    """A sum of squares, its degrees of freedom, and the probability of a larger one."""
-
-    square: float
-    degrees: float
-    p_value: float
+ASSUMED_UNCERTAINTY = 0.5
+"""The same for sigmas that nobody stated, and that a program assumed."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +57,17 @@ class ResidualTest:
 
     Attributes
     ----------
-    chi_square : whitened sum of squares, with the penalty of a prior; like the other numbers NaN
-        where the iteration did not converge, because it then belongs to no fit.
-    degrees : degrees of freedom of chi_square if model, noise and prior are right.
+    chi_square : whitened sum of squares of the rows outside the range of the parameters; like the
+        other numbers NaN where the iteration did not converge, because it then belongs to no fit.
+        Where a loss chose the weights: of all weighted residuals.
+    degrees : its degrees of freedom, equations minus rank.
     p_value : probability of a larger chi_square; NaN where nothing can be tested.
     dof : equations minus the number of parameters that the method effectively uses.
     noise : "given", "estimated", or "assumed" where nobody stated it.
-    sigma_scale : factor on the stated sigmas. With given noise it is 1, unless the test rejects the
-        residuals: then the intervals are wider by this factor.
+    sigma_scale : factor s on the stated sigmas; 1 where they are exact and not contradicted.
+    noise_degrees : degrees of freedom of s; infinite where the stated sigmas are exact.
     intervals : whether intervals are given at all.
     converged, weighted : whether the iteration converged, and whether a loss chose the weights.
-    residuals : the test of the residuals alone, where the penalty is no prior but a ridge: with it,
-        `chi_square` has no chi-square distribution. None elsewhere.
     """
 
     chi_square: float
@@ -68,25 +76,15 @@ class ResidualTest:
     dof: float
     noise: str
     sigma_scale: float
+    noise_degrees: float
     intervals: bool
     converged: bool = True
     weighted: bool = False
-    residuals: SquareTest | None = None
-
-    @property
-    def decisive(self) -> SquareTest:
-        """The test that decides: that of the residuals alone, or with the prior."""
-        return self.residuals or SquareTest(self.chi_square, self.degrees, self.p_value)
 
     @property
     def failed(self) -> bool:
         """Whether the residuals exceed the stated noise beyond doubt."""
-        return self.noise == "given" and self.decisive.p_value < SIGNIFICANCE
-
-    @property
-    def noise_degrees(self) -> float:
-        """Degrees of freedom of the noise variance in the intervals; infinite where it is known."""
-        return self.dof if self.noise == "estimated" and self.intervals else np.inf
+        return self.noise == "given" and self.p_value < SIGNIFICANCE
 
     @property
     def finding(self) -> Finding:
@@ -97,82 +95,94 @@ class ResidualTest:
             return self._estimated
         if self.weighted:
             return report_finding("noise.weighted")
-        square, degrees, p_value = self.decisive
-        if degrees < 0.5:
+        if self.degrees < 0.5:
             return report_finding("noise.no-degrees-of-freedom")
         code = "noise.consistent"
-        if p_value < SIGNIFICANCE:
+        if self.p_value < SIGNIFICANCE:
             code = "noise.residuals-too-large"
-        elif p_value < DOUBT:
+        elif self.p_value < DOUBT:
             code = "noise.doubtful"
-        elif p_value > 1.0 - SIGNIFICANCE:
+        elif self.p_value > 1.0 - SIGNIFICANCE:
             code = "noise.residuals-too-small"
-        ratio = float(np.sqrt(square / degrees))
-        return report_finding(code, ratio=ratio, degrees=degrees, p_value=p_value)
+        ratio = float(np.sqrt(self.chi_square / self.degrees))
+        return report_finding(
+            code,
+            ratio=ratio,
+            degrees=self.degrees,
+            p_value=self.p_value,
+            scale=self.sigma_scale,
+            noise_degrees=self.noise_degrees,
+        )
 
     @property
     def _estimated(self) -> Finding:
         """The result where the noise is estimated."""
-        if self.dof < 0.5:
-            return report_finding("noise.not-estimated")
         if not self.intervals:
-            return report_finding("noise.too-few-degrees", dof=self.dof, fewest=FEWEST_DEGREES)
-        return report_finding("noise.estimated", scale=self.sigma_scale, dof=self.dof)
+            return report_finding("noise.not-estimated")
+        data = {"scale": self.sigma_scale, "dof": self.noise_degrees}
+        if self.noise_degrees < FEWEST_DEGREES:
+            factor = coverage_factor(self.noise_degrees)
+            return report_finding("noise.few-degrees", factor=float(factor), **data)
+        return report_finding("noise.estimated", **data)
 
 
 def run_residual_test(
     decomposition: Decomposition,
     penalty: FloatArray,
     noise: str,
+    sigma_uncertainty: float = SIGMA_UNCERTAINTY,
     weighted: bool = False,
     converged: bool = True,
-    is_prior: bool = True,
 ) -> ResidualTest:
     """Test the residuals of a fit (t = 1).
-
-    chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used. Each equation is a degree
-    of freedom, less one for each direction used without penalty: m - rank for least squares, m for
-    MAP. The penalty of a ridge is no prior. Then the residuals alone are tested: with filter
-    factors f_i their expected sum of squares is m - sum f_i (2 - f_i), but for the bias.
 
     Parameters
     ----------
     decomposition, penalty : of the fit. noise : "given", "estimated" or "assumed"; with assumed
         noise the test is a note.
-    weighted : whether a loss chose the weights by the residuals, so that chi_square has no known
-        distribution.
+    sigma_uncertainty : relative standard uncertainty of the stated sigmas.
+    weighted : whether a loss chose the weights by the residuals, so that the sum of squares has no
+        known distribution.
     converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor
         intervals.
-    is_prior : whether the penalty is knowledge of the parameters, as with MAP.
     """
     if not converged:
         nan = np.nan
-        return ResidualTest(nan, nan, nan, nan, noise, 1.0, False, False, weighted)
-    finite = np.where(np.isfinite(penalty), penalty, 0.0)
-    left = float(decomposition.remaining(penalty)[0])
-    y = decomposition.solution(penalty)
-    chi_square = left + float((finite * y**2).sum())
-    used = np.isfinite(penalty)
-    m = float(decomposition.rows[0])
-    degrees = m - float((used & (penalty == 0.0)).sum())
-    f = decomposition.filter_factors(penalty)
-    dof = m - float(f.sum())
-    p_value, scale, intervals, alone = np.nan, 1.0, True, None
-    p_own = _compute_tail(degrees, chi_square)
-    tested = SquareTest(chi_square, degrees, p_own)
-    if not is_prior and (finite > 0.0).any() and not weighted:
-        spare = m - float((f * (2.0 - f)).sum())
-        tested = alone = SquareTest(left, spare, _compute_tail(spare, left))
-    if noise == "estimated":
-        intervals = dof >= FEWEST_DEGREES
-        scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
-    elif not weighted:
-        p_value = p_own
-        if tested.p_value < SIGNIFICANCE:
-            scale = max(1.0, float(np.sqrt(tested.square / tested.degrees)))
-    return ResidualTest(
-        chi_square, degrees, p_value, dof, noise, scale, intervals, True, weighted, alone
+        return ResidualTest(nan, nan, nan, nan, noise, 1.0, nan, False, False, weighted)
+    left = float(decomposition.unexplained[0])
+    m, degrees = float(decomposition.rows[0]), float((decomposition.rows - decomposition.rank)[0])
+    dof = m - float(decomposition.filter_factors(penalty).sum())
+    square, p_value = left, np.nan
+    if weighted:
+        square = float(decomposition.remaining(penalty)[0])
+    elif noise != "estimated":
+        p_value = _compute_tail(degrees, left)
+    scale, nu = _estimate_scale(left, degrees, p_value, noise, sigma_uncertainty, weighted)
+    return ResidualTest(square, degrees, p_value, dof, noise, scale, nu, nu > 0.0, True, weighted)
+
+
+def _estimate_scale(
+    unexplained: float,
+    degrees: float,
+    p_value: float,
+    noise: str,
+    uncertainty: float,
+    weighted: bool,
+) -> tuple[float, float]:
+    """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
+    if noise == "estimated" or p_value < SIGNIFICANCE:
+        return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
+    if uncertainty == 0.0:
+        return 1.0, np.inf
+    stated = (
+        0.5 / (max(uncertainty, ASSUMED_UNCERTAINTY) if noise == "assumed" else uncertainty) ** 2
     )
+    if weighted or degrees <= 0:
+        return 1.0, stated
+    total = stated + degrees
+    if p_value > 1.0 - SIGNIFICANCE:
+        return 1.0, total
+    return float(np.sqrt((stated + unexplained) / total)), total
 
 
 def _compute_tail(degrees: float, square: float) -> float:
@@ -180,11 +190,15 @@ def _compute_tail(degrees: float, square: float) -> float:
     return float(compute_chi_square_tail(degrees, square)) if degrees > 0 else np.nan
 
 
-def coverage_factor(test: ResidualTest, level: float = LEVEL) -> float:
-    """Return the half-width of an interval of this coverage, in standard deviations."""
+def coverage_factor(degrees: FloatArray | float, level: float = LEVEL) -> FloatArray:
+    """Return half-widths (..,) of intervals of this coverage, in standard deviations.
+
+    They are those of Student's t, and of the normal distribution for infinite degrees of freedom.
+    """
     from scipy.special import ndtri, stdtrit
 
     quantile = 0.5 + 0.5 * level
-    if test.noise == "estimated":
-        return float(stdtrit(test.dof, quantile)) if test.intervals else np.nan
-    return float(ndtri(quantile))
+    degrees = np.asarray(degrees, dtype=np.float64)
+    is_known = np.isinf(degrees)
+    student = stdtrit(np.where(is_known, 1.0, degrees), quantile)
+    return np.asarray(np.where(is_known, ndtri(quantile), student))

@@ -26,6 +26,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
 from loopcal.estimate.methods.inflated_tolerances import InflatedTolerances
 from loopcal.estimate.methods.tolerance_components import (
@@ -66,6 +67,14 @@ class Method(Protocol):
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return the penalty (t, p) of each direction; infinite where it is not used."""
         ...
+
+    def prior_variance(
+        self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
+    ) -> FloatArray | None:
+        """Return the variance (t, p) of the true coordinates about nominal, from which the bias of
+        the penalty is expected; NaN where it is not known. None stands for 1 / penalty.
+        """
+        return None
 
 
 @dataclass(frozen=True)
@@ -188,6 +197,30 @@ class Ridge(Method):
         )
         return _penalize(decomposition, lam)
 
+    def prior_variance(
+        self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
+    ) -> FloatArray | None:
+        """Return the variance of the true coordinates if the stated tolerances are right: 1 in
+        tolerances, whatever lam is.
+
+        It is NaN where a penalized parameter has no stated tolerance, where the tolerances are
+        correlated, or where different parameters have different lam: then the coordinates are
+        correlated.
+        """
+        lam = np.array(self.lam if isinstance(self.lam, tuple) else [1.0])
+        penalized = lam[lam > 0.0]
+        is_known = (
+            free.correlation is None
+            and not self.lacks_tolerances(free).any()
+            and (penalized == penalized[:1]).all()
+        )
+        return np.full(penalty.shape, penalized.max(initial=0.0) if is_known else np.nan)
+
+    def lacks_tolerances(self, free: FreeParameters) -> BoolArray:
+        """Return which parameters (p,) are penalized without a stated tolerance."""
+        lam = 1.0 if callable(self.lam) else np.asarray(self.lam)
+        return np.asarray(free.assumed & np.broadcast_to(lam > 0.0, free.assumed.shape))
+
 
 @dataclass(frozen=True)
 class MAP(Method):
@@ -262,6 +295,15 @@ class MAP(Method):
         largest = np.where(is_penalized, penalty, 0.0).max(axis=1, initial=0.0)
         root = np.sqrt(np.where(largest > 0.0, largest, 1.0))
         return np.where(largest > 0.0, self.sigma(decomposition) / root, 1.0)
+
+    def prior_variance(
+        self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
+    ) -> FloatArray | None:
+        """Return inflation^2, which an estimated noise does not change."""
+        if self.noise == "given":
+            return None
+        square = self.sigma(decomposition)[:, None] ** 2
+        return np.divide(square, penalty, out=np.zeros_like(penalty), where=penalty > 0.0)
 
     def sigma(self, decomposition: Decomposition) -> FloatArray:
         """Return the factor (t,) on the stated sigmas.

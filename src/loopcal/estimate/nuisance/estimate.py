@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.estimate.inference.covariance_parts import NOISE, CovariancePart, combine_degrees
 from loopcal.estimate.inference.null_space import Combination, sparsify_basis
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance.elimination import NuisanceElimination
@@ -80,10 +81,29 @@ class NuisanceEstimate:
         """Values by name [SI] that fit best at the geometry from which the fit starts."""
         return dict(zip(self.names, self.start.tolist(), strict=True))
 
-    def rows(self, coverage: float) -> list[dict[str, Any]]:
+    def count_degrees(self, parts: Iterable[CovariancePart], tolerance: FloatArray) -> FloatArray:
+        """Return the effective degrees of freedom (U,) of the standard deviations; infinite where
+        nothing in them was estimated.
+
+        Parameters
+        ----------
+        parts : of the posterior of the machine; the noise is also that of the setup parameters at a
+            known machine. tolerance : (p,) of the parameters [SI].
+        """
+        own = np.nan_to_num((self.root**2).sum(axis=1))
+        squares = []
+        for part in parts:
+            by_machine = ((self.slope @ (part.root / tolerance[:, None])) ** 2).sum(axis=1)
+            squares.append((by_machine + own * (part.source == NOISE), part.degrees))
+        return combine_degrees(self.sd**2, squares)
+
+    def rows(self, coverage: FloatArray, degrees: FloatArray) -> list[dict[str, Any]]:
         """Return one entry for each, in its unit, ready for JSON.
 
-        `coverage` is the number of standard deviations in `plus_minus`.
+        Parameters
+        ----------
+        coverage : (U,) number of standard deviations in `plus_minus`.
+        degrees : (U,) of the standard deviations.
         """
         shown = []
         for i, entry in enumerate(self.table.entries):
@@ -92,7 +112,7 @@ class NuisanceEstimate:
                 "nominal": entry.nominal,
                 "estimate": self.estimate[i],
                 "sd": self.sd[i],
-                "plus_minus": coverage * self.sd[i],
+                "plus_minus": coverage[i] * self.sd[i],
             }
             tolerance = None if entry.tolerance is None else entry.tolerance / factor
             scaled = {name: float(value) / factor for name, value in numbers.items()}
@@ -101,6 +121,7 @@ class NuisanceEstimate:
                     "name": entry.name,
                     "unit": symbol,
                     **scaled,
+                    "degrees": float(degrees[i]),
                     "tolerance": tolerance,
                     "free": entry.free,
                 }
@@ -130,7 +151,7 @@ def estimate_nuisance(
     linearization: Linearization,
     robot: Mechanism,
     decomposition: Decomposition,
-    penalty: FloatArray,
+    variance: FloatArray,
     noise: float,
     start: FloatArray | None = None,
 ) -> NuisanceEstimate:
@@ -139,7 +160,8 @@ def estimate_nuisance(
     Parameters
     ----------
     nuisance : of the problem. linearization : at the estimate (t = 1).
-    robot : for its units. decomposition, penalty : of the fit (t = 1).
+    robot : for its units. decomposition : of the fit (t = 1).
+    variance : (p,) of each of its directions.
     noise : variance of the whitened rows; NaN where no interval is given.
     start : (U,) values that fit the initial geometry; default: those with which the fit began.
     """
@@ -153,16 +175,15 @@ def estimate_nuisance(
         slope, root = np.zeros((U, p)), np.full((U, U), np.nan)
         return NuisanceEstimate(table, begin, estimate, nothing, slope, root, unobservable, shown)
     done, is_free = linearization.nuisance.elimination, nuisance.is_free
-    known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
     slope, is_unobservable = done.slope[0], done.is_unobservable[0]
     moved = slope[is_free] @ V
-    unknown = np.isinf(known)
+    unknown = np.isinf(variance)
     moved_by_unknown = np.linalg.norm(moved[:, unknown], axis=1)
     is_infinite = moved_by_unknown > SMALLEST_EFFECT * np.linalg.norm(moved, axis=1)
-    by_machine = (moved**2) @ np.where(unknown, 0.0, known)
-    variance = np.zeros(U)
-    variance[is_free] = np.where(
+    by_machine = (moved**2) @ np.where(unknown, 0.0, variance)
+    square = np.zeros(U)
+    square[is_free] = np.where(
         is_infinite | is_unobservable[is_free],
         np.inf,
         done.variances()[0, is_free] * noise + by_machine,
@@ -171,7 +192,7 @@ def estimate_nuisance(
         table,
         begin,
         linearization.nuisance.best[0],
-        np.sqrt(variance),
+        np.sqrt(square),
         slope,
         done.joint_root()[0] * np.sqrt(noise),
         is_unobservable,
