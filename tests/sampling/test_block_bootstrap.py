@@ -121,7 +121,8 @@ def test_normal_errors_scatter_as_the_covariance_says(case) -> None:
     data = CASES[case]() if case in CASES else hexapod_data(15, seed=5)
     if case == "earlier calibration":
         earlier = identify(hexapod(), hexapod_data(20), lc.MAP())
-        options, method = FitOptions(sigma_uncertainty=0.0, prior=prior_from(earlier.posterior)), lc.LeastSquares()
+        options = FitOptions(sigma_uncertainty=0.0, prior=prior_from(earlier.posterior))
+        method = lc.LeastSquares()
     if case == "prior of the frame":
         data = CASES["targets"]()
         known = data.nuisance_parameters.with_prior("frame.*", 20 * UM)

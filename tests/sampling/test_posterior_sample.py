@@ -23,7 +23,6 @@ from tests.diagnose.test_cluster_covariance import THREE_TARGETS, measure
 from tests.estimate.problems import MM, UM, hexapod, hexapod_data
 from tests.estimate.uncertain_reading_problems import simulate_hexapod
 
-
 EXACT = FitOptions(method=lc.MAP(), sigma_uncertainty=0.0)
 """Options with tolerances as the prior and sigmas that are exact, as in the reference."""
 
@@ -164,7 +163,8 @@ def test_exact_and_linear_posterior_agree_where_rows_are_nearly_linear(case) -> 
         data = simulate_hexapod(12, 2 * UM)
     elif case == "earlier":
         earlier = identify(hexapod(), hexapod_data(20), lc.MAP())
-        options, method = FitOptions(sigma_uncertainty=0.0, prior=prior_from(earlier.posterior)), lc.LeastSquares()
+        options = FitOptions(sigma_uncertainty=0.0, prior=prior_from(earlier.posterior))
+        method = lc.LeastSquares()
     else:
         options, method = FitOptions(noise="estimated"), lc.LeastSquares()
     fit = identify(hexapod(), data, method, options=options)
