@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import identifiability
-from loopcal.diagnose.identifiable_parameters import compute_observability
+from loopcal.diagnose.observability import compute_observability
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.inference.null_space import Combination, describe_null_space

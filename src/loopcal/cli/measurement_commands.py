@@ -23,6 +23,8 @@ from loopcal.cli.instrument_options import (
     unknown_options,
 )
 from loopcal.cli.options import (
+    POSITIVE_ANGLE,
+    POSITIVE_LENGTH,
     data_argument,
     data_options,
     file_option,
@@ -69,6 +71,18 @@ DETAILS = "every combination, the singular values and a table of all parameters"
 @instrument_options
 @sigma_reading_option
 @rank_tolerance_option
+@click.option(
+    "--useful",
+    type=POSITIVE_LENGTH,
+    metavar="QUANTITY",
+    help="Also show what the data determine to this standard deviation of lengths, such as 1um.",
+)
+@click.option(
+    "--useful-angle",
+    type=POSITIVE_ANGLE,
+    metavar="QUANTITY",
+    help="The same for angles. Default: the length over the size of ROBOT.",
+)
 @data_options
 @verbose_option
 @json_option
@@ -83,6 +97,8 @@ def identifiability(
     force: bool,
     sigma_reading: str | None,
     rank_tolerance: float | None,
+    useful: float | None,
+    useful_angle: float | None,
     verbose: bool,
     as_json: bool,
     **options: Any,
@@ -101,6 +117,7 @@ def identifiability(
       loopcal identifiability 3-prs --measure x,y,z,phi,theta
       loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
       loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
+      loopcal identifiability hexapod-42 measurements.csv --useful 1um
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
@@ -115,6 +132,7 @@ def identifiability(
         _refuse_beside_data(poses)
     if output is not None and not reduced:
         raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
+    _check_useful(useful, useful_angle)
     refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
     machine, drawn = load_robot(robot), []
     if data:
@@ -130,7 +148,8 @@ def identifiability(
             machine, make_instrument(options), targets, reading_sigma=sigma, seed=seed
         )
     tolerance = rank_tolerance or RANK_TOLERANCE
-    report = analyze_identifiability(machine, measurements, reduced, tolerance)
+    accuracy = None if useful is None else (useful, useful_angle)
+    report = analyze_identifiability(machine, measurements, reduced, tolerance, accuracy)
     if report.subset is not None and output is not None:
         _write_subset(output, report.subset)
     if as_json:
@@ -142,6 +161,12 @@ def identifiability(
     if output is not None:
         page += ["", f"Written to {output}: the robot with the other parameters fixed"]
     terminal.print_page(page)
+
+
+def _check_useful(length: float | None, angle: float | None) -> None:
+    """Refuse an accuracy of angles without one of lengths."""
+    if length is None and angle is not None:
+        raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
 
 
 def _refuse_beside_data(poses: Path | None) -> None:

@@ -71,6 +71,8 @@ from loopcal.diagnose.row_errors import compute_row_errors as compute_row_errors
 from loopcal.diagnose.suggestions import MeasurementSuggestion as MeasurementSuggestion
 from loopcal.diagnose.suggestions import describe_missing_equations as describe_missing_equations
 from loopcal.diagnose.suggestions import suggest_measurements as suggest_measurements
+from loopcal.diagnose.useful_accuracy import UsefulAccuracy as UsefulAccuracy
+from loopcal.diagnose.useful_accuracy import judge_useful_accuracy as judge_useful_accuracy
 from loopcal.diagnose.value_comparison import ValueComparison as ValueComparison
 from loopcal.diagnose.value_comparison import compare_with_truth as compare_with_truth
 from loopcal.diagnose.value_comparison import compare_with_values as compare_with_values

@@ -127,7 +127,12 @@ def interpret_combinations(
     poses = probe_workspace(free)
     if not len(poses.readings):
         return combinations
-    motions, base, platform = _weigh_motions(free.robot, poses.T[0], poses.twists[0])
+    usable = poses.is_reached & np.isfinite(poses.twists[0]).all(axis=(1, 2))
+    if not usable.any():
+        return combinations
+    motions, base, platform = _weigh_motions(
+        free.robot, poses.T[0, usable], poses.twists[0, usable]
+    )
     frames = {"platform": platform, "base": base}
     limit = NO_MOTION * float(np.linalg.norm(motions))
     interpreted = []

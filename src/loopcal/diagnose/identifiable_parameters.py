@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Determine what measurements identify, before or without a fit: rank, condition, null space.
 
-Singular values are those of whitened rows in units of tolerance. Formulas and sources of the
-observability indices O1 to O5: docs/theory/observability.md.
+Singular values are those of whitened rows in units of tolerance.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopcal.diagnose.frame_motions import interpret_combinations
+from loopcal.diagnose.observability import SCALING, Observability, compute_observability
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
@@ -27,7 +27,13 @@ from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism, sample_workspace
-from loopcal.numerics.decomposition import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, decompose
+from loopcal.numerics.decomposition import (
+    NULL_COMPONENT,
+    RANK_TOLERANCE,
+    Decomposition,
+    are_nonzero,
+    decompose,
+)
 from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
 
@@ -40,48 +46,11 @@ AROUND = 3
 MOST_ROWS = 12
 """Number of parameters in the printed table; the others are counted."""
 
-SCALING = "rows divided by sigma, columns multiplied by tolerance"
-"""Units of the singular values; every index depends on them."""
+CLEAR_GAP = 1e3
+"""Ratio of the singular values at the cut that makes the rank clear."""
 
-MEANING = {
-    "o1": "(product of s)^(1/L) / sqrt(m): a small uncertainty ellipsoid",
-    "o2": "smallest / largest: 1 / condition",
-    "o3": "smallest: the worst direction",
-    "o4": "smallest^2 / largest: noise amplification",
-    "o5": "1 / sum(1/s): a small sum of semi-axes",
-}
-
-
-@dataclass(frozen=True)
-class Observability:
-    """The five indices over the L observable directions.
-
-    Attributes
-    ----------
-    o1, o2, o3, o4, o5 : the larger the better. directions : L. left_out : number of null
-        directions, which would make all five zero.
-    equations : m. scaling : of rows and columns.
-    """
-
-    o1: float
-    o2: float
-    o3: float
-    o4: float
-    o5: float
-    directions: int
-    left_out: int
-    equations: int
-    scaling: str = SCALING
-
-    def rows(self) -> list[tuple[str, float, str]]:
-        """Return index, value and meaning, for a table."""
-        return [(name.upper(), getattr(self, name), meaning) for name, meaning in MEANING.items()]
-
-    def __str__(self) -> str:
-        values = ", ".join(f"{name} {value:.3g}" for name, value, _ in self.rows())
-        without = f", without {self.left_out} null directions" if self.left_out else ""
-        counts = f"m = {self.equations}, L = {self.directions}{without}"
-        return f"Observability: {values} ({self.scaling}; {counts})"
+NEARBY_TOLERANCES = (1e-2, 1e2)
+"""Multiples of the rank tolerance between which a clear rank does not change."""
 
 
 @dataclass(frozen=True)
@@ -230,10 +199,26 @@ class Identifiability:
             findings.append(
                 report_finding("identifiability.gap", counted=counted, cut=cut, gap=self.gap)
             )
+        findings += self._report_arbitrary_cut()
         findings += [combination.finding for combination in (*self.unidentifiable, *self.weak)]
         if (more := rank - self.improved - len(self.weak)) > 0:
             findings.append(report_finding("identifiability.more-weak-directions", count=more))
         return (*findings, *self.free_parameters.findings())
+
+    def _report_arbitrary_cut(self) -> list[Finding]:
+        """Return that the rank depends on the rank tolerance, where singular values continue
+        through the cut.
+        """
+        s = self.singular_values
+        tolerances = tuple(self.tolerance * factor for factor in NEARBY_TOLERANCES)
+        ranks = tuple(int(are_nonzero(s, tolerance).sum()) for tolerance in tolerances)
+        if ranks[0] == ranks[1] or self.gap >= CLEAR_GAP:
+            return []
+        return [
+            report_finding(
+                "identifiability.arbitrary-cut", gap=self.gap, ranks=ranks, tolerances=tolerances
+            )
+        ]
 
     @property
     def posterior(self) -> Posterior:
@@ -316,34 +301,6 @@ def compute_remaining_sd(rows: FloatArray) -> FloatArray:
     """
     _, s, vt = np.linalg.svd(rows, full_matrices=False)
     return np.sqrt((vt**2 / (1.0 + s[:, None] ** 2)).sum(axis=0))
-
-
-def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
-    """Return the indices of the singular values of whitened rows in units of tolerance.
-
-    Parameters
-    ----------
-    singular_values : (p,), descending. rank : how many of them count. equations : m, number of
-        rows.
-
-    Returns
-    -------
-    Observability; all indices are zero where the rank is zero.
-    """
-    s = singular_values[:rank]
-    left_out = len(singular_values) - rank
-    if rank == 0 or equations == 0:
-        return Observability(0.0, 0.0, 0.0, 0.0, 0.0, 0, left_out, equations)
-    return Observability(
-        o1=float(np.exp(np.log(s).mean()) / np.sqrt(equations)),
-        o2=float(s[-1] / s[0]),
-        o3=float(s[-1]),
-        o4=float(s[-1] ** 2 / s[0]),
-        o5=float(1.0 / (1.0 / s).sum()),
-        directions=rank,
-        left_out=left_out,
-        equations=equations,
-    )
 
 
 def _summarize(

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from loopcal.diagnose import UsefulAccuracy
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names
 from loopcal.report.numbers import format_number
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block
+from loopcal.typing import FloatArray
 from loopcal.workflow.identifiability_report import IdentifiabilityReport
 
 SD_MEANING = (
@@ -15,6 +19,14 @@ SD_MEANING = (
     "nothing."
 )
 
+
+MOST_COMBINATIONS = 8
+"""Combinations and suggestions that a page lists; the rest is counted."""
+
+FEW_PARTNERS = 4
+"""Partners of a parameter that a table lists."""
+
+COMBINATIONS = ("fit.unidentifiable", "fit.hardly-observable")
 
 FEW_PARAMETERS = 12
 """Parameters that a summary lists one by one."""
@@ -32,6 +44,8 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
         blocks.append(str(report_finding("identifiability.known-frames-assumed")))
     if verbose:
         blocks += ["", *_view_findings(report)]
+    if report.useful is not None and verbose:
+        blocks += _view_useful(report.useful)
     if verbose or report.analysis.n_parameters <= FEW_PARAMETERS:
         blocks += _view_parameters(report)
     if verbose:
@@ -44,8 +58,42 @@ def view_identifiability(report: IdentifiabilityReport, verbose: bool = False) -
 def _view_findings(report: IdentifiabilityReport) -> list[Block]:
     """Return the findings that the summary leaves out, and the measurement for each combination."""
     said = {finding.code for finding in report.summary}
-    findings = [str(f) for f in report.analysis.findings if f.code not in said]
-    return [*findings, *(str(suggestion) for suggestion in report.suggestions)]
+    findings = [f for f in report.analysis.findings if f.code not in said]
+    combinations = [f for f in findings if f.code in COMBINATIONS]
+    others = [str(f) for f in findings if f.code not in COMBINATIONS]
+    return [
+        *others,
+        *_shorten([str(f) for f in combinations], "combinations"),
+        *_shorten([str(suggestion) for suggestion in report.suggestions], "suggestions"),
+    ]
+
+
+def _shorten(lines: list[str], what: str) -> list[Block]:
+    """Return the first lines and the number of the others."""
+    left = len(lines) - MOST_COMBINATIONS
+    more = [f"and {left} more {what}; --json shows all"] if left > 0 else []
+    return [*lines[:MOST_COMBINATIONS], *more]
+
+
+def _view_useful(useful: UsefulAccuracy) -> list[Block]:
+    """Return the best and the worst known combinations about the useful accuracy."""
+    rows = [*useful.determined[-MOST_COMBINATIONS:], *useful.undetermined[:MOST_COMBINATIONS]]
+    table = build_table(
+        "Combinations next to the useful accuracy",
+        rows,
+        (
+            word_column("combination of length one", wraps=True),
+            lambda row: _name_terms(row.names, row.coefficients),
+        ),
+        (Column("sd / useful accuracy"), lambda row: format_number(row.sd, 3)),
+    )
+    return [table]
+
+
+def _name_terms(names: Sequence[str], coefficients: FloatArray) -> str:
+    """Return the strongest terms of a combination."""
+    terms = [f"{c:+.2f} {name}" for name, c in zip(names, coefficients, strict=True)]
+    return list_names(terms, 4).replace(" and ", ", ")
 
 
 def _view_parameters(report: IdentifiabilityReport) -> list[Block]:
@@ -57,7 +105,10 @@ def _view_parameters(report: IdentifiabilityReport) -> list[Block]:
         (word_column("name"), lambda row: row.name),
         (
             word_column("determined", wraps=True),
-            lambda row: states.get(row.state) or f"only with {list_names(row.others)}",
+            lambda row: (
+                states.get(row.state)
+                or f"only with {list_names(row.others, MOST_COMBINATIONS // 2)}"
+            ),
         ),
         (Column("sd / tolerance"), lambda row: f"{row.left:.2f}"),
     )

@@ -12,9 +12,11 @@ from loopcal.diagnose import (
     Identifiability,
     IdentifiableSubset,
     MeasurementSuggestion,
+    UsefulAccuracy,
     choose_identifiable_subset,
     find_frame_motions,
     identifiability,
+    judge_useful_accuracy,
     suggest_measurements,
 )
 from loopcal.findings import Finding, report_finding
@@ -36,11 +38,13 @@ class IdentifiabilityReport:
     analysis : rank, singular values and a statement on each parameter.
     suggestions : further measurements for open combinations.
     subset : a smallest set of parameters; None where it was not asked for.
+    useful : what is determined to a useful accuracy; None where none was stated.
     """
 
     analysis: Identifiability
     suggestions: tuple[MeasurementSuggestion, ...]
     subset: IdentifiableSubset | None
+    useful: UsefulAccuracy | None = None
 
     @cached_property
     def summary(self) -> tuple[Finding, ...]:
@@ -48,6 +52,8 @@ class IdentifiabilityReport:
         by_code = {finding.code: finding for finding in self.analysis.findings}
         return (
             by_code["identifiability.rank"],
+            *(f for code, f in by_code.items() if code == "identifiability.arbitrary-cut"),
+            *(() if self.useful is None else self.useful.findings),
             *self._report_undetermined(),
             by_code["identifiability.improved"],
             *self._report_measurement(),
@@ -101,6 +107,8 @@ class IdentifiabilityReport:
             "summary": self.summary,
             "remedies": self.suggestions,
         }
+        if self.useful is not None:
+            document["useful"] = self.useful
         return document if self.subset is None else {**document, "reduction": self.subset}
 
 
@@ -109,6 +117,7 @@ def analyze_identifiability(
     data: Measurements,
     choose_subset: bool = False,
     rank_tolerance: float = RANK_TOLERANCE,
+    useful: tuple[float, float | None] | None = None,
 ) -> IdentifiabilityReport:
     """Return what measurements determine of a robot's free parameters.
 
@@ -117,7 +126,10 @@ def analyze_identifiability(
     data : measurements, or simulated ones without noise for an instrument that is considered.
     choose_subset : also choose a smallest set of parameters that says the same.
     rank_tolerance : share of the largest singular value below which one counts as zero.
+    useful : accuracy of lengths [m] and angles [rad] to which combinations are to be determined;
+        see `loopcal.diagnose.judge_useful_accuracy`.
     """
     analysis = identifiability(robot, data, rank_tolerance)
     subset = choose_identifiable_subset(analysis) if choose_subset else None
-    return IdentifiabilityReport(analysis, suggest_measurements(analysis), subset)
+    accuracy = None if useful is None else judge_useful_accuracy(analysis, *useful)
+    return IdentifiabilityReport(analysis, suggest_measurements(analysis), subset, accuracy)
