@@ -180,6 +180,18 @@ def test_command_states_what_is_useful(capsys, complete):
     assert {row["useful"] for row in useful["parameters"]} <= {True, False}
 
 
+def test_command_names_the_option_where_the_rank_is_arbitrary(capsys, complete, tmp_path):
+    robot = lc.load_robot(complete)
+    changed = robot.with_values(sample_truth(robot, 1, 1)[0])
+    lc.save_robot(changed, tmp_path / "changed.yaml")
+    assert main(["identifiability", str(tmp_path / "changed.yaml")]) == 0
+    text = capsys.readouterr().out
+    assert "The rank is arbitrary" in text
+    assert "use --useful" in text
+    assert main(["identifiability", str(tmp_path / "changed.yaml"), "--useful", "1um"]) == 0
+    assert "use --useful" not in capsys.readouterr().out
+
+
 def test_angle_without_a_length_and_wrong_quantities_are_refused(capsys):
     for more in (["--useful-angle", "1urad"], ["--useful", "0um"], ["--useful", "1"]):
         assert main(["identifiability", "3-prs", *more]) != 0

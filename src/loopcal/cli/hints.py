@@ -47,6 +47,7 @@ HINTS = {
     "fit.beyond-tolerance": "use --method map",
     "fit.low-weights": "exclude a pose with --drop POSE",
     "fit.no-prior": "use --method map",
+    "identifiability.arbitrary-cut": "use --useful, such as --useful 1um",
     "fit.too-few-equations": "use --method map",
     "noise.assumed": "use --sigma-height or another --sigma option of loopcal import, or write the "
     "noise in the file",

@@ -12,6 +12,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.fit_options import rank_tolerance_option
+from loopcal.cli.hints import hint_for
 from loopcal.cli.instrument_options import (
     DESCRIPTION,
     distribution_option,
@@ -45,10 +46,11 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.diagnose import IdentifiableSubset
     from loopcal.mechanism import Mechanism
+    from loopcal.workflow.identifiability_report import IdentifiabilityReport
     from loopcal.workflow.simulated_measurements import SimulatedMeasurements
 
 
-DETAILS = "every combination, the singular values and a table of all parameters"
+DETAILS = "the first combinations, the singular values and a table of all parameters"
 """What the summary of identifiability leaves out."""
 
 
@@ -155,12 +157,18 @@ def identifiability(
     if as_json:
         terminal.print_json(report.to_dict())
         return
-    page = [*drawn, *view_identifiability(report, verbose)]
-    if not verbose:
-        page.append(f"Hint: use --verbose for {DETAILS}")
+    page = [*drawn, *view_identifiability(report, verbose), *_list_hints(report, verbose)]
     if output is not None:
         page += ["", f"Written to {output}: the robot with the other parameters fixed"]
     terminal.print_page(page)
+
+
+def _list_hints(report: IdentifiabilityReport, verbose: bool) -> list[str]:
+    """Return hints on options that show more."""
+    asked = report.useful is not None
+    hints = [hint for finding in report.summary if not asked and (hint := hint_for(finding))]
+    hints.append("use --json for all combinations" if verbose else f"use --verbose for {DETAILS}")
+    return [f"Hint: {hint}" for hint in hints]
 
 
 def _check_useful(length: float | None, angle: float | None) -> None:

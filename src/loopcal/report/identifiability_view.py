@@ -71,7 +71,7 @@ def _view_findings(report: IdentifiabilityReport) -> list[Block]:
 def _shorten(lines: list[str], what: str) -> list[Block]:
     """Return the first lines and the number of the others."""
     left = len(lines) - MOST_COMBINATIONS
-    more = [f"and {left} more {what}; --json shows all"] if left > 0 else []
+    more = [f"and {left} more {what}"] if left > 0 else []
     return [*lines[:MOST_COMBINATIONS], *more]
 
 
