@@ -38,6 +38,11 @@ SECTIONS = {
         "budget": "Show the uncertainty of a calibration by source.",
         "compensate": "Compute readings or commands that reach targets.",
     },
+    "Examine the uncertainty": {
+        "bootstrap": "Resample a calibration and compare the scatter with its intervals.",
+        "sample": "Draw from the exact posterior of a calibration.",
+        "region": "Show intervals that hold for several parameters at once.",
+    },
     "Published studies": {
         "reproduce": "Repeat a published study and compare its numbers.",
         "per-leg": "Identify a hexapod leg by leg, to compare with calibrate.",
@@ -51,6 +56,7 @@ MODULES = {
     "measurement_commands": ("identifiability", "simulate"),
     "plan_command": ("plan",),
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
+    "sampling_commands": ("bootstrap", "sample", "region"),
     "study_commands": ("reproduce", "per-leg"),
 }
 """Modules of this package, and the commands in each; they are imported when they run."""

@@ -16,7 +16,7 @@ See docs/theory/resampling.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -153,6 +153,20 @@ class Bootstrap:
         stated = np.where(self.is_known, self.fit.standard_deviations, np.nan)
         ratio = self.standard_deviations / stated
         return (*found, self.scatter.report(self.fit.names, ratio, self.blocks))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was drawn and what was found, for JSON."""
+        return {
+            "robot": self.fit.robot.name,
+            "scheme": self.scheme,
+            "seed": self.seed,
+            "unit": self.blocks.unit,
+            "blocks": self.blocks.count,
+            "resamples": len(self.draws),
+            "failed": self.failed,
+            "degrees": self.scatter.degrees,
+            "findings": self.findings,
+        }
 
     def _ends(
         self, kind: IntervalKind, level: float, quantile: FloatArray

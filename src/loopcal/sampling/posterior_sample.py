@@ -11,6 +11,7 @@ See docs/theory/resampling.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -115,6 +116,18 @@ class PosteriorSample:
             return (report_finding("sampling.few-effective-draws", **size_or_tail),)
         codes = ("sampling.posterior-agrees", "sampling.posterior-differs")
         return (*report_intervals(intervals, *codes),)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was drawn and what was found, for JSON."""
+        return {
+            "robot": self.fit.robot.name,
+            "seed": self.seed,
+            "draws": len(self.draws),
+            "effective_size": self.effective_size,
+            "tail_shape": self.tail_shape,
+            "rounds": self.rounds,
+            "findings": self.findings,
+        }
 
     def _standard_deviations(self) -> FloatArray:
         """Return standard deviations (p,) of the weighted draws."""

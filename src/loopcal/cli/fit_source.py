@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fit that a command examines further: that of a run folder, repeated, or a new one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from loopcal.cli.fit_options import make_fit_options
+from loopcal.cli.options import (
+    DATA_FLAGS,
+    leave_out_held_out,
+    read_checked_measurements,
+    refuse_given,
+    take_flags,
+)
+from loopcal.errors import EstimationError
+from loopcal.findings import report_finding
+
+if TYPE_CHECKING:
+    from loopcal.estimate import Identification
+    from loopcal.io import Run
+    from loopcal.measure import Measurements
+
+FIT_OPTIONS = ("method", "lam", "keep", "noise", "loss", "rank_tolerance", "drop", *DATA_FLAGS)
+"""Options of a new fit; a run folder states its own."""
+
+EQUAL = 1e-2
+"""Largest difference of a repeated estimate from that of the run, in standard deviations."""
+
+
+def load_fit(
+    source: str, data: Sequence[Path], options: Mapping[str, Any]
+) -> tuple[Identification, Measurements]:
+    """Return a fit with its measurements, and with the uncertainty that `calibrate` states.
+
+    Parameters
+    ----------
+    source : a run folder, or with `data` a robot file. options : of the command, those of
+        `fit_options` and `data_options` among them.
+
+    Raises
+    ------
+    LoopcalError : see `loopcal.identify` and `Run.load_measurements`; or the run cannot be
+        repeated.
+    """
+    from loopcal.diagnose import adjust_uncertainty
+    from loopcal.estimate import identify
+    from loopcal.io import load_robot, load_run
+
+    if data:
+        robot = load_robot(source)
+        known = {name: options[name] for name in options if name in FIT_OPTIONS}
+        measurements = leave_out_held_out(
+            read_checked_measurements(data, robot, **take_flags(known))
+        )
+        fit = identify(robot, measurements, options=make_fit_options(known))
+    else:
+        refuse_given([n for n in FIT_OPTIONS if n in options], "with a run folder")
+        fit, measurements = _repeat_run(load_run(source))
+    return adjust_uncertainty(fit, measurements), measurements
+
+
+def _repeat_run(run: Run) -> tuple[Identification, Measurements]:
+    """Return the fit of a run, made again from its files and the options of its command line."""
+    from dataclasses import replace
+
+    from loopcal.estimate import FitOptions, identify, recalibrate
+    from loopcal.io import load_run
+
+    stated = _read_options(run)
+    accepted = ("allow_outside_stroke", "allow_duplicates")
+    data, _ = run.load_measurements(**{name: bool(stated.get(name)) for name in accepted})
+    options = make_fit_options(stated) if stated else FitOptions()
+    options = replace(options, excluded_poses=())  # they are no longer among the measurements
+    if stated.get("prior") is not None:
+        earlier = load_run(stated["prior"]).load_posterior()
+        limb = stated.get("free_limb")
+        fit = recalibrate(run.initial_robot, data, earlier, limb, options=options)[0]
+    else:
+        fit = identify(run.initial_robot, data, options=options)
+    estimate, sd = run.arrays["estimate"], fit.standard_deviations
+    if len(estimate) != len(sd):
+        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
+    off = np.abs(fit.estimate - estimate) > EQUAL * np.where(np.isfinite(sd), sd, np.inf)
+    if off.any():
+        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
+    return fit, data
+
+
+def _read_options(run: Run) -> dict[str, Any]:
+    """Return the options of the command `calibrate` that made a run; none for a run of Python."""
+    from loopcal.cli.calibration_commands import calibrate
+
+    words = list((run.result.get("made_by") or {}).get("command") or ())
+    if "calibrate" not in words:
+        return {}
+    given = words[words.index("calibrate") + 1 :]
+    context: click.Context = calibrate.make_context("calibrate", given, resilient_parsing=True)
+    return context.params

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal bootstrap`, `loopcal sample` and `loopcal region` from a run folder and from files."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder with measurements and a run that fits 30 of their 40 poses."""
+    folder = tmp_path_factory.mktemp("sampling")
+    data = folder / "measurements.csv"
+    shutil.copy(EXAMPLE, data)
+    words = ["calibrate", "hexapod-42", str(data), "-o", str(folder / "run")]
+    words += ["--hold-out", "0.25", "--drop", "1", "--method", "map"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["loopcal", *words])  # what the run states as its command
+        assert main(words) == 0
+    return folder
+
+
+def run_json(capsys, *words: str) -> dict:
+    """Run a command with --json, and return its document."""
+    assert main([*words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def read_draws(path: Path) -> tuple[list[str], np.ndarray]:
+    """Return the header and the numbers of a file of draws."""
+    with path.open(newline="") as stream:
+        rows = list(csv.reader(stream))
+    return rows[0], np.array(rows[1:], dtype=float)
+
+
+def test_bootstrap_repeats_the_fit_of_a_run_and_writes_its_draws(folder, capsys) -> None:
+    run, draws = str(folder / "run"), folder / "bootstrap.csv"
+    document = run_json(capsys, "bootstrap", run, "--count", "60", "--seed", "3", "-o", str(draws))
+    assert (document["scheme"], document["seed"], document["resamples"]) == ("wild", 3, 60)
+    poses = 40 - 10 - 1
+    assert document["blocks"] in (poses, poses + 1)  # the excluded pose may be held out
+    parameters = document["intervals"]["parameters"]
+    arrays = lc.load_run(run).arrays
+    sd = np.array([entry["sd"] for entry in parameters])
+    assert np.median(sd / arrays["sd"]) == pytest.approx(1.0, abs=0.3)
+    header, numbers = read_draws(draws)
+    assert header[0] == "leg1.base.x [mm]"
+    assert numbers.shape == (60, 42)
+    assert 1e-3 * numbers.std(axis=0, ddof=1) == pytest.approx(sd)
+    assert main(["bootstrap", run, "--count", "10", "-o", str(draws)]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert main(["bootstrap", run, "--count", "10", "-o", str(draws), "--force"]) == 0
+    text = capsys.readouterr().out
+    assert "10 resamples of" in text
+    assert f"Written to {draws}" in text
+
+
+def test_sample_prints_the_size_of_the_sample_and_weights_its_draws(folder, capsys) -> None:
+    run, draws = str(folder / "run"), folder / "posterior.csv"
+    assert main(["sample", run, "--count", "600", "-o", str(draws)]) == 0
+    text = capsys.readouterr().out
+    assert "600 weighted draws worth 5" in text
+    assert "No linear interval differs by more than 10 %" in text
+    header, numbers = read_draws(draws)
+    assert header[0] == "weight"
+    assert numbers[:, 0].sum() == pytest.approx(1.0)
+    arrays = lc.load_run(run).arrays
+    mean = 1e-3 * (numbers[:, 0] @ numbers[:, 1:])
+    assert (np.abs(mean - arrays["estimate"]) < 0.25 * arrays["sd"]).all()
+
+
+def test_files_give_the_same_fit_as_a_run(folder, capsys) -> None:
+    data = str(folder / "measurements.csv")
+    options = ["--method", "ls", "--noise", "estimated", "--count", "100"]
+    document = run_json(capsys, "sample", "hexapod-42", data, *options)
+    robot = lc.load_robot("hexapod-42")
+    options = lc.FitOptions(method=lc.LeastSquares(), noise="estimated")
+    fit = lc.identify(robot, lc.load_measurements(data, robot), options=options)
+    half = fit.interval()
+    for i, entry in enumerate(document["intervals"]["parameters"]):
+        assert entry["linear_upper"] - entry["linear_lower"] == pytest.approx(2 * half[i], rel=0.01)
+
+
+def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, capsys) -> None:
+    run = str(folder / "run")
+    words = ["region", run, "-p", "leg1.base.x", "-p", "leg1.base.y", "--level", "0.9"]
+    document = run_json(capsys, *words)
+    run_arrays = lc.load_run(run).arrays
+    region = document["region"]
+    assert region["names"] == ["leg1.base.x", "leg1.base.y"]
+    assert np.array(region["covariance"]) == pytest.approx(run_arrays["covariance"][:2, :2])
+    assert np.array(document["intervals"]["factor"]).min() > 1.645
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "+/- all at once" in text
+    assert "Joint 90 % region" in text
+    assert main(["region", run, "--rule", "scheffe"]) == 0
+    assert "all 42 parameters at once" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["bootstrap", "RUN", "--method", "ls"], "has no effect with a run folder"),
+        (["bootstrap", "RUN", "--unit", "day"], "too few units 'day'"),
+        (["sample", "RUN", "--count", "5"], "100"),
+        (["sample", "hexapod-42", "DATA", "--method", "ridge"], "penalty without a probability"),
+        (["region", "RUN", "-p", "leg9.base.x"], "no free parameter is called 'leg9.base.x'"),
+        (["region", "RUN", "--level", "1.5"], "1.5"),
+        (["bootstrap", "hexapod-42"], "run folder"),
+    ],
+)
+def test_wrong_use_is_refused_in_one_sentence(folder, capsys, words, text) -> None:
+    names = {"RUN": str(folder / "run"), "DATA": str(folder / "measurements.csv")}
+    assert main([names.get(word, word) for word in words]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert text in err
+    assert "Traceback" not in err
+
+
+def test_a_run_whose_robot_was_changed_is_not_examined(folder, capsys, tmp_path) -> None:
+    shutil.copytree(folder / "run", tmp_path / "run")
+    with np.load(tmp_path / "run" / "arrays.npz") as archive:
+        arrays = dict(archive)
+    arrays["estimate"] = arrays["estimate"] + arrays["sd"]
+    np.savez(tmp_path / "run" / "arrays.npz", **arrays)
+    assert main(["bootstrap", str(tmp_path / "run"), "--count", "10"]) == 1
+    assert "cannot be repeated" in capsys.readouterr().err
