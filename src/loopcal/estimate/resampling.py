@@ -85,6 +85,10 @@ class CenteredProblem:
     It is a problem of the descent. `equations` (t,) replace those that the rows count.
     """
 
+    problem: LeastSquaresProblem
+    center: FloatArray
+    equations: IntArray
+
     def __init__(
         self, problem: LeastSquaresProblem, center: FloatArray, equations: IntArray
     ) -> None:
