@@ -12,7 +12,6 @@ import numpy as np
 
 from loopcal.cli.fit_options import make_fit_options
 from loopcal.cli.options import (
-    DATA_FLAGS,
     leave_out_held_out,
     read_checked_measurements,
     refuse_given,
@@ -26,9 +25,6 @@ if TYPE_CHECKING:
     from loopcal.io import Run
     from loopcal.measure import Measurements
 
-FIT_OPTIONS = ("method", "lam", "keep", "noise", "loss", "rank_tolerance", "drop", *DATA_FLAGS)
-"""Options of a new fit; a run folder states its own."""
-
 EQUAL = 1e-2
 """Largest difference of a repeated estimate from that of the run, in standard deviations."""
 
@@ -40,8 +36,8 @@ def load_fit(
 
     Parameters
     ----------
-    source : a run folder, or with `data` a robot file. options : of the command, those of
-        `fit_options` and `data_options` among them.
+    source : a run folder, or with `data` a robot file. options : those of `fit_options` and
+        `data_options`.
 
     Raises
     ------
@@ -54,13 +50,11 @@ def load_fit(
 
     if data:
         robot = load_robot(source)
-        known = {name: options[name] for name in options if name in FIT_OPTIONS}
-        measurements = leave_out_held_out(
-            read_checked_measurements(data, robot, **take_flags(known))
-        )
-        fit = identify(robot, measurements, options=make_fit_options(known))
+        flags = take_flags(options)
+        measurements = leave_out_held_out(read_checked_measurements(data, robot, **flags))
+        fit = identify(robot, measurements, options=make_fit_options(options))
     else:
-        refuse_given([n for n in FIT_OPTIONS if n in options], "with a run folder")
+        refuse_given(options, "with a run folder")
         fit, measurements = _repeat_run(load_run(source))
     return adjust_uncertainty(fit, measurements), measurements
 

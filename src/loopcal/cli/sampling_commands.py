@@ -206,7 +206,6 @@ def region(
       loopcal region run -p radius -p 'tower*.angle'
       loopcal region run -p 'leg1.*' --rule scheffe --json
     """  # noqa: D301
-    from loopcal.cli.fit_source import FIT_OPTIONS
     from loopcal.cli.options import refuse_given
     from loopcal.io.runs.run_folder import load_posterior
     from loopcal.report.sampling_view import view_region
@@ -215,7 +214,7 @@ def region(
     if data:
         posterior = load_fit(source, data, options)[0].posterior
     else:
-        refuse_given(FIT_OPTIONS, "with a run folder")
+        refuse_given(options, "with a run folder")
         posterior = load_posterior(source)
     chosen = names or None
     intervals = compute_simultaneous_intervals(posterior, chosen, level, rule)
