@@ -244,6 +244,17 @@ class Identification:
         fell = f"The sum of squared residuals, each divided by its sigma, fell from {cost[0]:.3g}"
         return f"{fell} to {cost[-1]:.3g}."
 
+    def describe_intervals(self) -> str:
+        """Return coverage factor and degrees of freedom of the 95 % intervals; "" without any."""
+        known = np.isfinite(self.standard_deviations)
+        if not known.any():
+            return ""
+        nu, k = self.degrees[known], coverage_factor(self.degrees[known])
+        least, most = (format(k.min(), ".3g"), format(k.max(), ".3g"))
+        factor = least if least == most else f"{least} to {most}"
+        law = "normal" if np.isinf(nu).all() else f"Student's t, at least {nu.min():.3g} degrees"
+        return f"95 % intervals: {factor} standard uncertainties ({law})."
+
     def __repr__(self) -> str:
         """Return a summary on one screen; `print` shows the parameters."""
         codes = ", ".join(dict.fromkeys(finding.code for finding in self.findings))

@@ -211,4 +211,4 @@ def _describe_iteration(fit: Identification) -> str:
     """Return how a fit ended, and its residuals in one number."""
     status = fit.status.name.lower().replace("_", " ")
     ending = f"Iteration: {status} after {fit.history.iterations} steps."
-    return f"{ending}\n{fit.describe_statistics()}".rstrip()
+    return f"{ending}\n{fit.describe_statistics()}\n{fit.describe_intervals()}".rstrip()
