@@ -56,8 +56,15 @@ UNSEEN = 1e-8
 NEGLIGIBLE = 1e-12
 """Share of the largest variance by slow errors below which one is rounding."""
 
+KERNELS = ((0.6, False), (1.7, True))
+"""Lengths over which slow errors vary, in halves of the range of a coordinate, and whether they
+vary with the rotation of the platform: a wave over the workspace, and slower ones.
+"""
+
 ROUGH, MOST_ROUGH = 1e-3, 150
-"""Length, in radii, over which errors vary that no two poses share, and most poses for these."""
+"""Length, in halves of the range, over which errors vary that no two poses share, and most poses
+for these.
+"""
 
 ROTATION, PLACE = 0, 1
 """Number of the errors of rotation and of place."""
@@ -114,10 +121,14 @@ def find_slow_errors(fit: Identification, data: Measurements) -> SlowErrors | No
     """
     if not (fit.converged and fit.residual_test.intervals):
         return None
-    rows = project_slow_errors(fit, data)
-    found = {} if rows is None else detect_slow_errors(rows, _known_degrees(fit))
-    if rows is not None and found:
-        return SlowErrors(rows, found)
+    every = (project_slow_errors(fit, data, *kernel) for kernel in KERNELS)
+    tested = [rows for rows in every if rows is not None]
+    level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(len(tested), 1))
+    known = _known_degrees(fit)
+    slow = [SlowErrors(rows, detect_slow_errors(rows, known, level)) for rows in tested]
+    slow = [each for each in slow if each.found]
+    if slow:
+        return min(slow, key=lambda each: min(p for _, p in each.found.values()))
     return find_rough_errors(fit, data)
 
 
@@ -131,7 +142,7 @@ def find_rough_errors(fit: Identification, data: Measurements) -> SlowErrors | N
     lack = check_lack_of_fit(fit, data)
     if lack.is_explained is not False:
         return None
-    rows = project_slow_errors(fit, data, ROUGH, MOST_ROUGH)
+    rows = project_slow_errors(fit, data, ROUGH, True, MOST_ROUGH)
     if rows is None:
         return None
     found = {}
@@ -163,14 +174,15 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
 
 
 def detect_slow_errors(
-    rows: SlowErrorRows, known: float
+    rows: SlowErrorRows, known: float, level: float = LEVEL
 ) -> dict[int, tuple[VarianceComponent, float]]:
     """Return the significant errors, the number of each -> its size and probability.
 
-    `known` degrees of freedom say that the residuals have unit variance.
+    `known` degrees of freedom say that the residuals have unit variance. `level` : probability of
+    finding any without such errors.
     """
     parts = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
-    level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(len(parts), 1))
+    level = 1.0 - (1.0 - level) ** (1.0 / max(len(parts), 1))
     whitening, found = np.eye(len(rows.residuals)), {}
     while parts:
         y = whitening @ rows.residuals
@@ -194,10 +206,10 @@ def detect_slow_errors(
 
 
 def project_slow_errors(
-    fit: Identification, data: Measurements, length: float = 1.0, most: int = CENTERS
+    fit: Identification, data: Measurements, length: float, by_rotation: bool, most: int = CENTERS
 ) -> SlowErrorRows | None:
     """Return residuals and slow errors without what the parameters explain; None where there are
-    too few poses or residuals. `length`, `most` : see `describe_smooth_errors`.
+    too few poses or residuals. `length`, `by_rotation`, `most` : see `describe_smooth_errors`.
     """
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
@@ -206,7 +218,7 @@ def project_slow_errors(
     T = solution.T[solution.converged]
     if len(T) < FEWEST_POSES:
         return None
-    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], length, most)
+    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], length, most, by_rotation=by_rotation)
     if len(errors.centers) < FEWEST_POSES:
         return None
     linear = linearize_fit(fit, data)

@@ -6,8 +6,9 @@ component a Gaussian process of the pose with the covariance
 
     amplitude^2 exp(-|x - x'|^2 / 2)
 
-x are the place of the tool and the rotation of the platform, relative to the center of some
-reference poses and in units of their radius. With k of these poses as centers and the triangle L of
+x are the place of the tool and the rotation of the platform, or the place alone, relative to the
+center of the range of some reference poses, each coordinate in units of a length that is a multiple
+of half its range. With k of these poses as centers and the triangle L of
 their correlations, L L' = K(centers, centers), the error is phi(T) c with phi = K(T, centers) L^-T,
 independent c of variance 1, plus an independent rest that matters only far from all centers
 (Nystroem approximation; exact for up to `CENTERS` reference poses). Source: Rasmussen and Williams,
@@ -31,8 +32,8 @@ CENTERS = 40
 """Largest number of centers: more of them are closer to each other than the error varies."""
 
 STILL = 1e-6
-"""Radius of rotations [rad], and of places as a share of the largest coordinate, below which poses
-do not differ."""
+"""Half the range of rotations [rad], and of places as a share of the largest coordinate, below
+which poses do not differ."""
 
 JITTER = 1e-9
 """Added to the correlation of a center with itself, so that its triangle exists."""
@@ -45,7 +46,7 @@ class SmoothErrors:
     Attributes
     ----------
     tool : (3,) [m] tool point in the platform frame. rotation : (3, 3) to which rotations refer.
-    origin, radius : (6,) of rotation vectors [rad] and places [m]; an infinite radius leaves a
+    origin, length : (6,) of rotation vectors [rad] and places [m]; an infinite length leaves a
         coordinate out.
     centers : (k, 6) normalized coordinates. whitening : (k, k) L^-T.
     amplitude : (6,) standard deviations of the rotation [rad] and of the tool's place [m].
@@ -54,7 +55,7 @@ class SmoothErrors:
     tool: FloatArray
     rotation: FloatArray
     origin: FloatArray
-    radius: FloatArray
+    length: FloatArray
     centers: FloatArray
     whitening: FloatArray
     amplitude: FloatArray
@@ -95,7 +96,7 @@ class SmoothErrors:
 
     def _correlate(self, T: FloatArray) -> FloatArray:
         """Return the correlations (.., k) of errors at poses with those at the centers."""
-        x = (_coordinates(T, self.tool, self.rotation) - self.origin) / self.radius
+        x = (_coordinates(T, self.tool, self.rotation) - self.origin) / self.length
         return correlate(x, self.centers)
 
     def _at_origin(self, T: FloatArray) -> FloatArray:
@@ -110,31 +111,35 @@ def correlate(x: FloatArray, centers: FloatArray) -> FloatArray:
 
 
 def describe_smooth_errors(
-    T: FloatArray, tool: FloatArray, length: float = 1.0, most: int = CENTERS
+    T: FloatArray,
+    tool: FloatArray,
+    length: float = 1.0,
+    most: int = CENTERS,
+    *,
+    by_rotation: bool = True,
 ) -> SmoothErrors:
     """Return errors of unit amplitude (1 rad, 1 m) about reference poses T (n, 4, 4).
 
     Parameters
     ----------
     tool : (3,) [m] tool point in the platform frame.
-    length : over which errors vary, in radii of the reference poses; a small one leaves errors
-        that different poses do not share. most : largest number of centers.
+    length : over which errors vary, in halves of the range of each coordinate; a small one leaves
+        errors that different poses do not share. most : largest number of centers.
+    by_rotation : whether errors vary with the rotation of the platform, too.
     """
     u, _, vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     x = _coordinates(T, tool, rotation)
-    origin = x.mean(axis=0)
-    least = (STILL, STILL * float(np.abs(x[:, 3:]).max()))
-    radius = np.full(6, np.inf)
-    for part, smallest in zip((slice(0, 3), slice(3, 6)), least, strict=True):
-        reach = float(np.sqrt(((x[:, part] - origin[part]) ** 2).sum(axis=1).max()))
-        if reach > smallest:
-            radius[part] = length * reach
-    x = (x - origin) / radius
+    low, high = x.min(axis=0), x.max(axis=0)
+    origin, half = 0.5 * (low + high), 0.5 * (high - low)
+    least = np.r_[[STILL] * 3, [STILL * float(np.abs(x[:, 3:]).max())] * 3]
+    used = (half > least) & (by_rotation | (np.arange(6) >= 3))
+    scale = np.where(used, length * np.where(used, half, 1.0), np.inf)
+    x = (x - origin) / scale
     centers = x[_spread(x, most)]
     triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
     whitening = np.asarray(np.linalg.inv(triangle).T)
-    return SmoothErrors(tool, rotation, origin, radius, centers, whitening, np.ones(6))
+    return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.ones(6))
 
 
 def _spread(x: FloatArray, most: int) -> list[int]:
