@@ -44,8 +44,8 @@ from loopcal.units import Dimension
 LEVEL = 0.05
 """Probability of adding a discrepancy at all where there is none."""
 
-KNOWN = 8.0
-"""Degrees of freedom with which a stated sigma is known: to a quarter of its value."""
+EXACT = 1e6
+"""Degrees of freedom that stand for a sigma that is known exactly."""
 
 FEWEST_POSES = 5
 """Different poses below which nothing can be said of how errors vary with the pose."""
@@ -263,8 +263,11 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _known_degrees(fit: Identification) -> float:
-    """Return the degrees of freedom with which the stated noise is known."""
-    return 0.0 if fit.residual_test.noise == "estimated" else KNOWN
+    """Return the degrees of freedom with which the stated noise is known (JCGM 100, G.4.2)."""
+    u = fit.options.sigma_uncertainty
+    if fit.residual_test.noise == "estimated":
+        return 0.0
+    return 0.5 / u**2 if u > 0.0 else EXACT
 
 
 def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:
