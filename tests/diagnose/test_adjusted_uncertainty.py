@@ -26,6 +26,7 @@ PATTERNS = {
     "residuals.sessions-differ",
     "residuals.depend-on-reading",
     "residuals.depend-on-temperature",
+    "residuals.perhaps-correlated",
 }
 
 
@@ -100,13 +101,28 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
     assert np.allclose(result.covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
 
 
+def test_slow_errors_that_no_test_shows_are_allowed_for_where_residuals_are_small():
+    codes, inside, adjusted = [], [], []
+    for seed in range(30):
+        errors = draw_errors(10, 3, seed, 0.95)
+        truth, fit, result = fit_and_adjust("linear-delta", "component", errors, seed)
+        codes += [f.code for f in result.findings]
+        if "residuals.perhaps-correlated" in codes[-len(result.findings) :]:
+            assert (result.standard_deviations > fit.standard_deviations).any()
+            inside.append(cover_positions(ROBOTS["linear-delta"], fit, truth))
+            adjusted.append(cover_positions(ROBOTS["linear-delta"], result, truth))
+    assert codes.count("residuals.perhaps-correlated") >= 3
+    assert np.mean(adjusted) > np.mean(inside)
+
+
 def test_clean_data_change_nothing():
     changed = 0
     for seed in range(40):
-        _, fit, result = fit_and_adjust("linear-delta", "component", draw_errors(12, 3, seed), seed)
+        errors = draw_errors(12, 3, seed)
+        _, fit, result = fit_and_adjust("linear-delta", "component", errors, seed)
         added = {f.code for f in result.findings} - {f.code for f in fit.findings}
         changed += bool(added - {DISCREPANCY})  # which has a level of its own
-    assert changed <= 3
+    assert changed <= 7  # 5 % of 40: more than 7 has a probability of 1e-3
 
 
 def test_correlated_residuals_do_not_mean_that_sigma_is_too_large():
@@ -116,8 +132,11 @@ def test_correlated_residuals_do_not_mean_that_sigma_is_too_large():
         _, fit, result = fit_and_adjust("linear-delta", "component", errors, seed, LeastSquares())
         before = {f.code for f in fit.findings}
         after = {f.code for f in result.findings}
-        assert "noise.residuals-too-small" not in after
-        assert ("noise.not-independent" in after) == ("noise.residuals-too-small" in before)
+        if after & (PATTERNS - {"residuals.perhaps-correlated"}):
+            assert "noise.residuals-too-small" not in after
+        if "noise.residuals-too-small" in before:
+            shown = after & (PATTERNS - {"residuals.perhaps-correlated"})
+            assert ("noise.not-independent" in after) == bool(shown)
         codes.append("noise.not-independent" in after)
     assert any(codes)
 

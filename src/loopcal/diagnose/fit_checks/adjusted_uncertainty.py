@@ -28,15 +28,19 @@ from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.covariance_parts import NOISE
+from loopcal.estimate.options import FitOptions
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS
 
-SIGMA_DEGREES = 8.0
-"""Degrees of freedom that stated sigmas count for where errors are correlated: a relative standard
-uncertainty of 25 % (JCGM 100 G.4.2).
+EXACT = 1e6
+"""Degrees of freedom that sigmas count for where they are stated to be exact."""
+
+NOTICEABLE = 1.05
+"""Factor of the uncertainty of the measured poses from which a correlation that no test shows is
+allowed for.
 """
 
 TOO_SMALL = "noise.residuals-too-small"
@@ -76,36 +80,43 @@ def _add_patterns(
     """
     patterns = find_patterns(rows, data, fit.robot)
     effects = [e for e in patterns.effects if not (is_slow and e.effect.source == READING)]
-    if not (effects or patterns.is_correlated):
+    is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
+    if not (effects or patterns.is_correlated or is_small):
         return fit
     tool = state_tool_uncertainty(fit, data)
     for effect in effects:
         root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
         finding = _report_effect(effect, tool.measure_growth(root))
         fit = add_covariance(fit, root, np.inf, finding)
-    if patterns.is_correlated:
+    if patterns.is_correlated or is_small:
         fit = _add_correlation(fit, patterns, tool)
-    return _without_doubt_of_sigma(fit)
+    return _without_doubt_of_sigma(fit) if effects or patterns.is_correlated else fit
 
 
 def _add_correlation(
     fit: Identification, patterns: ResidualPatterns, tool: ToolUncertainty
 ) -> Identification:
-    """Return a fit with what correlated errors add to the covariance by independent ones."""
+    """Return a fit with what correlated errors add to the covariance by independent ones.
+
+    Where residuals are too small and no test shows a correlation, it is added if it matters: the
+    parameters may have taken up errors that are too slow for the tests.
+    """
     rows = patterns.rows
-    stated = fit.options.noise == "given"
-    errors = estimate_correlated_errors(rows, SIGMA_DEGREES if stated else 0.0)
+    errors = estimate_correlated_errors(rows, count_sigma_degrees(fit.options))
     independent = np.zeros_like(errors.covariance)
     for part in (part for part in fit.posterior.parts if part.source == NOISE):
         scaled = part.root / fit.tolerance[:, None]
         by_noise = np.linalg.lstsq(rows.root / fit.tolerance[:, None], scaled, rcond=None)[0]
         independent += by_noise @ by_noise.T
     root = rows.root @ take_larger(errors.covariance, independent)
+    ratio = tool.measure_growth(root)
+    if not patterns.is_correlated and ratio < NOTICEABLE:
+        return fit
     finding = report_finding(
-        "residuals.correlated",
+        "residuals.correlated" if patterns.is_correlated else "residuals.perhaps-correlated",
         correlation=errors.correlation,
         order=patterns.order,
-        ratio=tool.measure_growth(root),
+        ratio=ratio,
     )
     return add_covariance(fit, root, errors.degrees, finding)
 
@@ -140,6 +151,16 @@ def state_tool_uncertainty(fit: Identification, data: Measurements) -> ToolUncer
     angle, position = D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
     stated = (_sum_squares(angle @ posterior.root), _sum_squares(position @ posterior.root))
     return ToolUncertainty((angle, position), stated)
+
+
+def count_sigma_degrees(options: FitOptions) -> float:
+    """Return the degrees of freedom that the stated sigmas count for: 1 / (2 u^2) with their
+    relative standard uncertainty u (JCGM 100 G.4.2), none where the noise is estimated.
+    """
+    if options.noise == "estimated":
+        return 0.0
+    u = options.sigma_uncertainty
+    return min(0.5 / u**2, EXACT) if u > 0.0 else EXACT
 
 
 def take_root(moments: FloatArray) -> FloatArray:

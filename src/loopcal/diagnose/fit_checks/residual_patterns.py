@@ -27,7 +27,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_f_tail
 from loopcal.typing import FloatArray
 
-LEVEL = 0.01
+LEVEL = 0.05
 """Probability that independent errors show any pattern, over all tests of a fit (Sidak)."""
 
 FEWEST_LEFT = 3.0
