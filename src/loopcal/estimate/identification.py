@@ -38,6 +38,7 @@ from loopcal.estimate.inference.prior import (
 from loopcal.estimate.inference.residual_test import run_residual_test
 from loopcal.estimate.inference.shown_noise import find_shown_noise
 from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.loss_uncertainty import add_loss_uncertainty
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.regularization import describe_regularization
@@ -50,7 +51,7 @@ from loopcal.estimate.nuisance.estimate import (
     empty_nuisance_estimate,
     estimate_nuisance,
 )
-from loopcal.estimate.observation_rows import Residuals
+from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.poses.estimate import (
     EstimatedPoses,
@@ -128,6 +129,7 @@ def identify(
         raise EstimationError(open_poses.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
     result = add_factor_uncertainty(result, fit)
+    result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
     findings = [*result.findings, *report_unknown_rows(options.prior)]
     if open_poses.poses:
         findings.append(open_poses.report("fit.poses-open-at-start"))
