@@ -11,7 +11,7 @@ SMOOTH_ERROR = 15e-6
 """Root mean square [m] of each coordinate of the smooth model error."""
 
 NOISE = ("noise.residuals-too-large", "noise.doubtful")
-PRIOR = ("prior.tolerances",)
+PRIOR = ("prior.tolerances", "prior.components")
 OUTLIERS = ("outliers.some", "outliers.pose", "outliers.conflict", "outliers.ambiguous")
 TIME = ("residuals.drift", "residuals.trend", "residuals.sessions", "residuals.correlated")
 POSE = ("residuals.model-discrepancy", "residuals.depend-on-reading")

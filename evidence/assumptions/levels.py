@@ -7,6 +7,7 @@ STATED_LEVELS = {
     "noise.doubtful": 0.01,
     "noise.residuals-too-large": 0.001,
     "outliers": 0.05,
+    "prior.components-inflated": 0.03,
     "prior.tolerances": 0.01,
     "residuals.common-errors": 0.01,
     "residuals.model-discrepancy": 0.05,

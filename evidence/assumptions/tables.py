@@ -15,6 +15,9 @@ from evidence.assumptions.simulation import HELD_OUT, SEED
 BEFORE = Path(__file__).with_name("before.json")
 """Statistics of the same cases by the code of the commit that the file names."""
 
+KEPT = ("fits", "parameters", "moved", "position", "orientation", "median", "rms", "explained")
+"""What the tables show of the statistics before."""
+
 SHOWN = 0.1
 """Share of fits from which an alarm is listed."""
 

@@ -12,6 +12,7 @@ from loopcal import load_robot
 from loopcal.apply import pose_uncertainty
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify, recalibrate
 from loopcal.mechanism import forward
+from loopcal.sampling import bootstrap
 from tests.estimate.dense_delta import TOLERANCE, differentiate, fit_delta, locate_nozzle
 
 SETUP, ROBOT = SETUPS["linear-delta"], load_robot("linear-delta")
@@ -133,3 +134,22 @@ def test_change_of_a_machine_is_tested_with_the_noise_of_both_calibrations():
         tail = float(((moved * solved).sum(axis=1) >= statistic).mean())
         assert change.p_value == pytest.approx(tail, abs=0.03)
         assert change.moved == (change.p_value < 0.05)
+
+
+def test_bootstrap_of_poses_agrees_with_dense_resamples():
+    data = measure(Case("", degrees=3.0)).measurements[0]
+    fit = identify(ROBOT, data, LeastSquares())
+    count = 600
+    drawn = bootstrap(fit, data, count, scheme="pairs", unit="pose", seed=3)
+    dense, n = fit_densely(data, FINE), len(data.readings)
+    A, b = dense.A.reshape(n, 3, 9), dense.data.reshape(n, 3)
+    rng = np.random.default_rng(4)
+    resamples = []
+    for _ in range(count):
+        kept = rng.integers(n, size=n)
+        rows = A[kept].reshape(-1, 9)
+        resamples.append(np.linalg.lstsq(rows, b[kept].ravel(), rcond=None)[0])
+    ratio = drawn.standard_deviations / (np.std(resamples, axis=0, ddof=1) * TOLERANCE)
+    # each of the two standard deviations is known to 1 / sqrt(2 count)
+    np.testing.assert_allclose(ratio, 1.0, atol=5.0 / np.sqrt(count))
+    assert ratio.mean() == pytest.approx(1.0, abs=2.5 / np.sqrt(count))
