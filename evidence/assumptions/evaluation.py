@@ -25,7 +25,7 @@ from loopcal.findings import Severity
 from loopcal.io import load_robot
 from loopcal.mechanism import Mechanism, forward, forward_trials
 
-FITS, EXAMINED = 400, 50
+FITS, EXAMINED = 400, 25
 """Fits of a case; those of them that are searched for outliers and common errors, where these
 neither explain the case nor would be false alarms.
 """
