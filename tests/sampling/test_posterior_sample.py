@@ -185,6 +185,18 @@ def test_few_effective_draws_are_reported_before_any_interval() -> None:
     assert [finding.code for finding in sample.findings] == ["sampling.few-effective-draws"]
 
 
+def test_wider_stated_intervals_are_reported() -> None:
+    robot, data = delta(1.0, 60 * UM, 8)
+    (rows,) = data.observations
+    understated = replace(rows, covariance=rows.covariance / 9.0)
+    contradicted = replace(data, observations=(understated,))
+    fit = identify(robot, contradicted, lc.MAP())
+    assert fit.residual_test.sigma_scale > 2.0
+    sample = lc.sample_posterior(fit, contradicted, 1000)
+    codes = [finding.code for finding in sample.findings]
+    assert codes == ["sampling.posterior-agrees", "sampling.stated-wider"]
+
+
 def test_a_parameter_that_the_data_do_not_determine_has_no_interval() -> None:
     data = measure(THREE_TARGETS, 20, 3)  # an unknown frame and least squares
     fit = identify(hexapod(), data, lc.LeastSquares())

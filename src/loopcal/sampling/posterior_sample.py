@@ -23,7 +23,7 @@ from loopcal.estimate.methods.penalties import MAP, LeastSquares
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.sampling.intervals import Intervals, compare_ends, half_widths, report_intervals
+from loopcal.sampling.intervals import OFF, Intervals, compare_ends, half_widths, report_intervals
 from loopcal.sampling.posterior_density import PosteriorDensity, describe_density
 from loopcal.sampling.weighted_sample import effective_size, fit_tail_shape, normalize_weights
 from loopcal.typing import FloatArray, Progress, report_no_progress
@@ -109,13 +109,23 @@ class PosteriorSample:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Whether the draws represent the posterior, and whether linear intervals hold."""
+        """Whether the draws represent the posterior, whether linear intervals hold, and whether the
+        fit states wider ones.
+        """
         size, intervals = self.effective_size, self.intervals()
         if size < FEWEST_DRAWS or self.tail_shape > LARGEST_SHAPE:
             size_or_tail = {"size": size, "count": len(self.draws), "shape": self.tail_shape}
             return (report_finding("sampling.few-effective-draws", **size_or_tail),)
         codes = ("sampling.posterior-agrees", "sampling.posterior-differs")
-        return (*report_intervals(intervals, *codes),)
+        return (*report_intervals(intervals, *codes), *self._report_wider())
+
+    def _report_wider(self) -> list[Finding]:
+        """Return whether stated intervals allow for more than the posterior contains."""
+        known = np.isfinite(self.linear_sd)
+        ratio = (self.fit.standard_deviations[known] / self.linear_sd[known]).max(initial=1.0)
+        if ratio <= 1.0 + OFF:
+            return []
+        return [report_finding("sampling.stated-wider", ratio=float(ratio))]
 
     def to_dict(self) -> dict[str, Any]:
         """Return what was drawn and what was found, for JSON."""
