@@ -73,9 +73,11 @@ class FullSteps:
 
     def start_due(self, point: Any, active: IntArray, damping: FloatArray) -> None:
         """Begin chains at the points of trials (a,) that took enough damped steps."""
+        if not self.is_enabled or not damping.any():
+            return
         due = (damping > 0.0) & (self._taken[active] >= self._wait[active])
         due &= ~self.is_ahead[active]
-        if self.is_enabled and due.any():
+        if due.any():
             trials = active[due]
             self._begin(trials, point, point.take(trials), 0)
 
@@ -111,7 +113,8 @@ class FullSteps:
         Chains begin where a full step was refused; `is_full` (a,) are the undamped steps, `ratio`
         (a,) the decrease over the predicted one.
         """
-        if not self.is_enabled:
+        if accepted.all() and not self.is_ahead.any():
+            self._taken[active] += 1
             return
         ahead, finite = self.is_ahead[active], np.isfinite(candidate.cost)
         self._taken[active[accepted & ~ahead]] += 1

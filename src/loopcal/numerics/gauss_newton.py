@@ -145,12 +145,15 @@ class _Run:
 
     def propose(self, active: IntArray) -> tuple[IntArray, Any, Any]:
         """Return the trials (a,) that go on, their points and steps; end those that converged."""
-        damping = self.damping.value[active]
+        damping, current = self.damping.value[active], self.point.take(active)
         self.chains.start_due(self.point, active, damping)
-        current = self.chains.replace_points(self.point.take(active), active)
-        damping = np.where(self.chains.is_ahead[active], 0.0, damping)
+        if self.chains.is_ahead.any():
+            current = self.chains.replace_points(current, active)
+            damping = np.where(self.chains.is_ahead[active], 0.0, damping)
         step = self.model.propose(current, damping)
-        is_last = ~self.chains.is_away(active) & self.model.is_negligible(current, step)
+        is_last = self.model.is_negligible(current, step)
+        if self.chains.is_ahead.any():
+            is_last &= ~self.chains.is_away(active)
         if is_last.any():
             last, going = np.flatnonzero(is_last), np.flatnonzero(~is_last)
             self.chains.is_ahead[active[last]] = False
@@ -166,14 +169,18 @@ class _Run:
         model, chains, reference = self.model, self.chains, current
         candidate = model.evaluate(current, step, active)
         ahead = chains.is_ahead[active]
-        if ahead.any():
+        if has_chains := ahead.any():
             reference, step = self.point.take(active), chains.expect(step, active)
         accepted, ratio = model.judge(reference, step, candidate)
         status = model.ending(reference, step, candidate, accepted)
-        was_full = self.damping.value[active] == 0.0
         single = np.flatnonzero(~ahead)
-        self.damping.adapt(active[single], accepted[single], ratio[single])
-        self.status[active] = np.where(ahead, DescentStatus.RUNNING, status)
+        was_full = self.damping.value[active] == 0.0
+        if has_chains:
+            self.damping.adapt(active[single], accepted[single], ratio[single])
+            status = np.where(ahead, DescentStatus.RUNNING, status)
+        else:
+            self.damping.adapt(active, accepted, ratio)
+        self.status[active] = status
         if chains.is_enabled:
             chains.record(self.point, step, candidate, active, accepted, ratio, was_full)
             if round_number >= PATIENCE:
