@@ -29,13 +29,17 @@ from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
-from loopcal.estimate.inference.posterior import compute_posterior, find_variance_sources
+from loopcal.estimate.inference.posterior import (
+    VarianceSources,
+    compute_posterior,
+    find_variance_sources,
+)
 from loopcal.estimate.inference.prior import (
     collect_used_rows,
     refuse_reused_rows,
     report_unknown_rows,
 )
-from loopcal.estimate.inference.residual_test import run_residual_test
+from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
 from loopcal.estimate.inference.shown_noise import find_shown_noise
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.loss_uncertainty import add_loss_uncertainty
@@ -253,11 +257,8 @@ def _assemble(
     parameters.
     """
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
-    noise, weighs = name_noise(options, data), options.loss is not None
     d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
-    test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, weighs, converged)
-    sources = find_variance_sources(d, penalty, test, method, free)
-    test = replace(test, intervals=bool(np.isfinite(sources.noise)))
+    test, sources = _test_noise(free, fit, options, data)
     solution = _solve_unweighted(problem, weighted, fit)
     conflict = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
@@ -265,10 +266,7 @@ def _assemble(
     has_nuisance = weighted.nuisance is not None
     linearization = weighted.linearize(fit.deviation, fit.start) if has_nuisance else None
     baseline = fit_setup_before(problem, robot, options, data.with_weights(weights), fit)
-    variance = d.variances(penalty, *sources)[0]
-    nuisance = _estimate_nuisance(
-        weighted, linearization, robot, d, variance, sources.noise, baseline
-    )
+    nuisance = _estimate_nuisance(weighted, linearization, robot, fit, sources, baseline)
     frames = find_measured_frames(
         weighted, data, fit.deviation, fit.start, options.prior, linearization, sources.noise
     )
@@ -320,6 +318,18 @@ def _assemble(
     )
 
 
+def _test_noise(
+    free: FreeParameters, fit: Descent, options: FitOptions, data: Measurements
+) -> tuple[ResidualTest, VarianceSources]:
+    """Return the test of the residuals, and what the variances of the fit are made of."""
+    d, penalty, noise = fit.decomposition, fit.penalty, name_noise(options, data)
+    converged = bool(fit.status[0] == DescentStatus.CONVERGED)
+    is_weighted = options.loss is not None
+    test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, is_weighted, converged)
+    sources = find_variance_sources(d, penalty, test, get_method(options), free)
+    return replace(test, intervals=bool(np.isfinite(sources.noise))), sources
+
+
 def _record_history(free: FreeParameters, fit: Descent) -> History:
     """Return the iteration of the first trial."""
     status, steps = DescentStatus(int(fit.status[0])), int(fit.iterations[0])
@@ -331,16 +341,17 @@ def _estimate_nuisance(
     problem: Problem,
     linearization: Linearization | None,
     robot: Mechanism,
-    d: Decomposition,
-    variance: FloatArray,
-    noise: float,
+    fit: Descent,
+    sources: VarianceSources,
     baseline: FloatArray | None,
 ) -> NuisanceEstimate:
     """Return the nuisance parameters at the estimate, where the rows are linearized."""
     if problem.nuisance is None or linearization is None:
         return empty_nuisance_estimate(problem.parameters)
-    nuisance = problem.nuisance
-    return estimate_nuisance(nuisance, linearization, robot, d, variance, noise, baseline)
+    variance = fit.decomposition.variances(fit.penalty, *sources)[0]
+    return estimate_nuisance(
+        problem.nuisance, linearization, robot, fit.decomposition, variance, sources.noise, baseline
+    )
 
 
 def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:

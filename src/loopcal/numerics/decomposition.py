@@ -64,8 +64,7 @@ class Decomposition(TrialBatch):
     parameters alone, and those of the others, each with the best change of the unpenalized ones.
     U stays orthonormal, and V'z of the second group depends on the penalized parameters alone, so
     that all formulas hold; V itself is oblique, and its inverse is kept as `dual`. V is oblique as
-    well where unknowns are correlated: with z / scale = L u its
-    columns are L times those of the decomposition for u.
+    well where unknowns are correlated: with z / scale = L u its columns are L times those for u.
 
     Attributes
     ----------
@@ -178,15 +177,10 @@ class Decomposition(TrialBatch):
     ) -> FloatArray:
         """Return the variance (t, p) of each coordinate: infinite where the direction is not used.
 
-        For noise variance sigma^2 of the rows and true coordinates of variance tau_i^2 it is noise
-        plus the expected square of the bias: f_i^2 sigma^2 / s_i^2 + (1 - f_i)^2 tau_i^2. With
-        tau_i^2 = 1 / penalty_i and sigma = 1 that is 1 / (s_i^2 + penalty_i), and with no penalty
-        it is sigma^2 / s_i^2.
-
-        Parameters
-        ----------
-        penalty : (t, p). noise : sigma^2, (t,) or one number.
-        prior : (t, p) tau_i^2, of no effect where the penalty is zero; default: 1 / penalty.
+        For the variance `noise` sigma^2 of the rows and tau_i^2 of the true coordinates (`prior`,
+        1 / penalty by default) it is noise plus the expected square of the bias: f_i^2 sigma^2 /
+        s_i^2 + (1 - f_i)^2 tau_i^2. By default and with sigma = 1 that is 1 / (s_i^2 + penalty_i),
+        and with no penalty sigma^2 / s_i^2.
         """
         square = self.singular_values**2
         sigma2 = np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(square),))[:, None]
@@ -197,15 +191,13 @@ class Decomposition(TrialBatch):
         return np.where(cut, np.inf, (sigma2 * square + bias) / total**2)
 
     def noise_roots(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
-        """Return a square root (t, p, p) of the part of the covariance that the noise of the rows
-        causes, in z / scale: V diag(sigma s_i / (s_i^2 + penalty_i)), zero in directions that are
-        not used.
+        """Return a square root (t, p, p) of the covariance of z / scale by the noise of the rows:
+        V diag(sigma s_i / (s_i^2 + penalty_i)), zero in directions that are not used.
         """
         s = self.singular_values
         total = s**2 + penalty
         gain = np.divide(s, total, out=np.zeros_like(s), where=np.isfinite(total) & (total > 0.0))
-        sigma = np.sqrt(np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(s),)))
-        return self.directions * (sigma[:, None] * gain)[:, None, :]
+        return self.directions * (np.sqrt(np.reshape(noise, (-1, 1))) * gain)[:, None, :]
 
     def covariance(
         self, penalty: FloatArray, noise: FloatArray | float = 1.0, prior: FloatArray | None = None
