@@ -10,7 +10,15 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
+from loopcal.estimate import (
+    MAP,
+    FitOptions,
+    Huber,
+    InflatedTolerances,
+    LeastSquares,
+    identify,
+    identify_trials,
+)
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.component_choice import (
     VARIANCES,
@@ -248,3 +256,27 @@ def test_tables_of_intervals_state_what_they_average_over(method, source):
     shown = "\n".join(str(block) for block in view_fit(fit))
     for text in (str(fit), shown, str(fit.to_dict()["interval_note"])):
         assert (note in " ".join(text.split())) == bool(source)
+
+
+@pytest.mark.parametrize("case", ["as stated", "huber", "noise", "some assumed", "four poses"])
+def test_covariance_and_posterior_agree_where_a_component_was_chosen(case):
+    truth, trials = simulate_deltas(1, {"arm2.length": 25.0})
+    data, robot = trials.trial(0), DELTA
+    if case == "some assumed":
+        entries = [
+            replace(p, tolerance=None if p.name == "radius" else p.tolerance)
+            for p in DELTA.parameters.entries
+        ]
+        robot = replace(DELTA, parameters=replace(DELTA.parameters, entries=tuple(entries)))
+    if case == "four poses":
+        data = data.take(np.arange(4))
+    options = FitOptions(
+        loss=Huber() if case == "huber" else None, noise="estimated" if case == "noise" else "given"
+    )
+    fit = identify(robot, data, options=options)
+    assert fit.converged
+    assert fit.method.components
+    root = fit.posterior.root
+    np.testing.assert_allclose(root @ root.T, fit.covariance, rtol=1e-9, atol=1e-16)
+    error = np.abs(fit.estimate - truth[0, fit.free_parameters.places])
+    assert (error < 4.0 * fit.standard_deviations).all()

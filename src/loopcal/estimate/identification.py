@@ -178,7 +178,7 @@ class IdentifiedTrials:
 
     def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
         """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
-        parameter.
+        parameter. They do not contain the uncertainty of factors on the tolerances.
         """
         scaled = self.decomposition.standard_deviations(
             self.penalty, noise_variance, self.prior_variance
