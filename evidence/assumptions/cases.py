@@ -13,7 +13,13 @@ SMOOTH_ERROR = 15e-6
 NOISE = ("noise.residuals-too-large", "noise.doubtful")
 PRIOR = ("prior.tolerances", "prior.components")
 OUTLIERS = ("outliers.some", "outliers.pose", "outliers.conflict", "outliers.ambiguous")
-TIME = ("residuals.drift", "residuals.trend", "residuals.sessions", "residuals.correlated")
+TIME = (
+    "residuals.drift",
+    "residuals.trend",
+    "residuals.sessions",
+    "residuals.correlated",
+    "residuals.perhaps-correlated",
+)
 POSE = ("residuals.model-discrepancy", "residuals.depend-on-reading")
 """Beginnings of the codes of the findings that explain a case: they name what is wrong."""
 

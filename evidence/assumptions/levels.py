@@ -11,7 +11,8 @@ STATED_LEVELS = {
     "prior.tolerances": 0.01,
     "residuals.common-errors": 0.01,
     "residuals.model-discrepancy": 0.05,
-    "residuals.patterns": 0.01,
+    "residuals.patterns": 0.05,
+    "residuals.perhaps-correlated": 0.001,
 }
 """Stated probabilities of alarms where every assumption holds, by group of codes."""
 

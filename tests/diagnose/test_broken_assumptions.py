@@ -1,5 +1,6 @@
 """The study of broken assumptions: what it simulates, how it judges, and that its results hold."""
 
+import inspect
 import json
 
 import numpy as np
@@ -11,6 +12,10 @@ from evidence.assumptions.evaluation import evaluate_case, is_met
 from evidence.assumptions.levels import STATED_LEVELS, name_group
 from evidence.assumptions.simulation import BrokenNoise, simulate_case
 from loopcal import load_robot
+from loopcal.diagnose import find_outliers
+from loopcal.diagnose.fit_checks import model_discrepancy, residual_patterns
+from loopcal.estimate.inference import residual_test
+from loopcal.estimate.methods import prior_conflict
 
 SCRIPTS = {"linear-delta": "delta", "five-bar": "five_bar", "hexapod-42": "hexapod"}
 
@@ -117,6 +122,17 @@ def test_codes_of_one_level_form_one_group():
     assert name_group("fit.beyond-tolerance") == "fit.beyond-tolerance"
 
 
+def test_levels_of_the_study_are_those_of_the_code():
+    default = inspect.signature(find_outliers).parameters["level"].default
+    assert STATED_LEVELS["outliers"] == default
+    assert STATED_LEVELS["noise.doubtful"] == residual_test.DOUBT
+    assert STATED_LEVELS["noise.residuals-too-large"] == residual_test.SIGNIFICANCE
+    assert STATED_LEVELS["residuals.perhaps-correlated"] == residual_test.SIGNIFICANCE
+    assert STATED_LEVELS["prior.tolerances"] == prior_conflict.LEVEL
+    assert STATED_LEVELS["residuals.model-discrepancy"] == model_discrepancy.LEVEL
+    assert STATED_LEVELS["residuals.patterns"] == residual_patterns.LEVEL
+
+
 @pytest.fixture(params=SCRIPTS.values())
 def document(request, root):
     """Return the committed results of one robot."""
@@ -126,6 +142,7 @@ def document(request, root):
     return json.loads(path.read_text("utf-8"))
 
 
+@pytest.mark.evidence
 def test_intervals_hold_or_a_finding_explains_why_not(document):
     statistics = document["statistics"]
     assert set(statistics) == {case.name for case in list_cases()}
@@ -136,6 +153,7 @@ def test_intervals_hold_or_a_finding_explains_why_not(document):
     assert missed == document["known to be missed"]
 
 
+@pytest.mark.evidence
 def test_no_alarm_exceeds_its_stated_level_in_clean_data(document):
     for case in (case for case in list_cases() if case.is_clean):
         statistics = document["statistics"][case.name]
@@ -151,6 +169,7 @@ FACTS = ("fit.beyond-tolerance",)
 """Alarms that state what the estimates are, and test nothing."""
 
 
+@pytest.mark.evidence
 def test_default_is_at_most_10_percent_worse_than_least_squares(document):
     for name, statistics in document["statistics"].items():
         assert statistics["median"] <= 1.1, name
