@@ -16,6 +16,7 @@ from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_c
 from loopcal.diagnose.fit_checks.residual_rows import collect_residual_rows
 from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
+from loopcal.findings import Severity
 from loopcal.mechanism import differentiate_pose, forward, sample_workspace
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
@@ -171,3 +172,13 @@ def test_data_of_another_fit_are_refused():
     fit = identify(ROBOTS["linear-delta"], data)
     with pytest.raises(lc.DataError):
         adjust_uncertainty(fit, other)
+
+
+@pytest.mark.parametrize(("drift", "severity"), [(2, Severity.INFO), (4.0, Severity.WARNING)])
+def test_only_what_independent_errors_hardly_ever_show_is_a_warning(drift, severity):
+    """A drift of z over the series, in sigmas: a weak one is allowed for, but raises no doubt."""
+    errors = draw_errors(40, 3, 5)
+    errors[:, 2] += drift * np.linspace(-0.5, 0.5, 40)
+    _, _, after = fit_and_adjust("linear-delta", "component", errors, 5)
+    found = {f.code: f.severity for f in after.findings if f.code in PATTERNS}
+    assert found == {"residuals.trend": severity}

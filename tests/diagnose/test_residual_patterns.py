@@ -11,7 +11,7 @@ from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
 from loopcal.diagnose.fit_checks.residual_effects import list_effects
-from loopcal.diagnose.fit_checks.residual_patterns import find_patterns
+from loopcal.diagnose.fit_checks.residual_patterns import account_for_tests, find_patterns
 from loopcal.diagnose.fit_checks.residual_patterns import test_correlation as compute_correlation
 from loopcal.diagnose.fit_checks.residual_patterns import test_effect as compute_tail
 from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
@@ -153,3 +153,10 @@ def test_rows_that_are_absent_are_left_out():
     assert collected is not None
     assert len(collected.residual) == 60 - 4
     assert np.isfinite(compute_correlation(collected)[1])
+
+
+def test_the_probability_of_a_pattern_counts_all_tests_of_the_fit() -> None:
+    """One p-value of 0.01 among ten is nothing special: 1 - 0.99^10."""
+    assert account_for_tests(0.01, 10) == pytest.approx(1.0 - 0.99**10)
+    assert account_for_tests(1e-12, 7) == pytest.approx(7e-12)
+    assert np.isnan(account_for_tests(np.nan, 3))

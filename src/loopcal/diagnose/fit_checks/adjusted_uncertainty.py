@@ -28,9 +28,10 @@ from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.covariance_parts import NOISE
+from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS
@@ -117,6 +118,7 @@ def _add_correlation(
         correlation=errors.correlation,
         order=patterns.order,
         ratio=ratio,
+        severity=_weigh(patterns.p_value) if patterns.is_correlated else None,
     )
     return add_covariance(fit, root, errors.degrees, finding)
 
@@ -195,6 +197,7 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
         "size": Quantity(float(effect.sizes[most]) / unit.factor_to_si, unit.symbol),
         "error": Quantity(float(effect.errors[most]) / unit.factor_to_si, unit.symbol),
         "ratio": ratio,
+        "severity": _weigh(effect.p_value),
     }
     source, name = effect.effect.source, effect.effect.name
     if source == TIME:
@@ -206,6 +209,11 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
     if source == READING:
         return report_finding("residuals.depend-on-reading", name=name, **shown)
     return report_finding("residuals.trend", **shown)
+
+
+def _weigh(p_value: float) -> Severity:
+    """Return how much a pattern counts: a warning where independent errors hardly ever show it."""
+    return Severity.WARNING if p_value < SIGNIFICANCE else Severity.INFO
 
 
 def _without_doubt_of_sigma(fit: Identification) -> Identification:

@@ -40,7 +40,8 @@ class EffectSizes:
 
     Attributes
     ----------
-    effect : what the residuals depend on. p_value : of its test.
+    effect : what the residuals depend on. p_value : probability that independent errors show an
+        effect as large, in any of the tests of a fit (Sidak).
     sizes, errors : (c,) [SI] estimates and standard deviations.
     moments : (c, c) [SI] expected products of the sizes.
     """
@@ -59,7 +60,8 @@ class ResidualPatterns:
     Attributes
     ----------
     tests : number of tests. effects : that are significant, the first found first.
-    correlation : of neighboring residuals, less what a fit causes. p_value : of it.
+    correlation : of neighboring residuals, less what a fit causes. p_value : probability of a
+        larger one for independent errors, in any of the tests (Sidak).
     is_correlated : whether it is significant. order : "time" or "order", that of the rows.
     rows : the residuals, as if the fit had estimated the effects.
     """
@@ -84,21 +86,27 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     effects = [e for e in listed if _is_testable(rows, e)]
     correlation, p_value = test_correlation(rows)
     tests = len(effects) + int(np.isfinite(p_value))
-    level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(tests, 1))
     found: list[EffectSizes] = []
     while effects:
         p_values = [test_effect(rows, effect) for effect in effects]
         best = int(np.argmin(p_values))
-        if not p_values[best] < level:
+        p_any = account_for_tests(p_values[best], tests)
+        if not p_any < LEVEL:
             break
         effect = effects.pop(best)
-        found.append(estimate_sizes(rows, effect, p_values[best]))
+        found.append(estimate_sizes(rows, effect, p_any))
         rows = rows.with_effects(effect.columns)
         effects = [e for e in effects if _is_testable(rows, e)]
     if found:
         correlation, p_value = test_correlation(rows)
-    is_correlated = p_value < level
-    return ResidualPatterns(tests, tuple(found), correlation, p_value, is_correlated, order, rows)
+    p_any = account_for_tests(p_value, tests)
+    is_correlated = p_any < LEVEL
+    return ResidualPatterns(tests, tuple(found), correlation, p_any, is_correlated, order, rows)
+
+
+def account_for_tests(p_value: float, tests: int) -> float:
+    """Return the probability that the smallest of so many p-values is as small (Sidak)."""
+    return float(-np.expm1(max(tests, 1) * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
 def test_effect(rows: ResidualRows, effect: Effect) -> float:
