@@ -17,6 +17,7 @@ from loopcal.estimate import (
     identify_trials,
 )
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.methods.inflated_tolerances import estimate_excess_noise
 from loopcal.estimate.methods.prior_conflict import assess_prior_conflict, compute_prior_statistic
 from loopcal.measure import sample_truth, simulate_trials
 from loopcal.numerics.decomposition import decompose
@@ -212,9 +213,9 @@ def test_tests_of_the_prior_reject_right_tolerances_as_often_as_stated():
     robot, measured = simulate_hexapods(300)
     fits = identify_trials(robot, measured, MAP())
     free = fits.free_parameters
+    rows = fits.decomposition.divided(estimate_excess_noise(fits.decomposition))
     conflicts = [
-        assess_prior_conflict(free, fits.decomposition.take(np.array([i])), 1.0, 1.0, np.zeros(42))
-        for i in range(300)
+        assess_prior_conflict(free, rows.take(np.array([i])), 1.0, np.zeros(42)) for i in range(300)
     ]
     # P(binomial(300, 0.01) > 8) = 4e-3; the tests of parameters are correlated, hence fewer
     assert sum(c.conflict for c in conflicts) <= 8

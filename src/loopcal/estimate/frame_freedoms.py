@@ -31,6 +31,7 @@ from loopcal.estimate.nuisance.elimination import (
     list_members,
 )
 from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_rows
+from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.measure import Measurements, NuisanceParameters
 from loopcal.measure.kinds import setup_parameters as setup
@@ -104,6 +105,7 @@ def find_measured_frames(
     prior: Prior | None = None,
     linearization: Linearization | None = None,
     noise: float = 1.0,
+    solution: PoseSolution | None = None,
 ) -> MeasuredFrames:
     """Return how the measurements of one machine determine frames, at deviation (1, p).
 
@@ -112,13 +114,13 @@ def find_measured_frames(
     problem, data : measurements. start : near the poses and setup parameters.
     prior : an earlier calibration, which may determine frames that these measurements do not.
     linearization : there; without it the frames of the instruments are not described.
-    noise : variance of the whitened rows.
+    noise : variance of the whitened rows. solution : poses there, where they are solved already.
     """
     readings = data.readings
     if len(readings) > MOST_READINGS:
         readings = readings[np.linspace(0, len(readings) - 1, MOST_READINGS).astype(int)]
     readings = readings[np.isfinite(readings).all(axis=1)]
-    located = problem.poses.locate(deviation, start)
+    located = problem.poses.locate(deviation, start, solution)
     if located is None:
         return MeasuredFrames(np.zeros((MOTIONS, 0)), readings)
     nuisance = None if problem.nuisance is None else start.nuisance

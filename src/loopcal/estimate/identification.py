@@ -65,11 +65,7 @@ from loopcal.estimate.poses.estimate import (
 )
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.estimate.poses.states import PoseSolution
-from loopcal.estimate.prior_inflation import (
-    add_factor_uncertainty,
-    report_untested,
-    run_prior_tests,
-)
+from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
@@ -260,15 +256,22 @@ def _assemble(
     d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
     test, sources = _test_noise(free, fit, options, data)
     solution = _solve_unweighted(problem, weighted, fit)
-    conflict = run_prior_tests(free, fit, method)
+    conflict, on_prior = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
     has_nuisance = weighted.nuisance is not None
     linearization = weighted.linearize(fit.deviation, fit.start) if has_nuisance else None
-    baseline = fit_setup_before(problem, robot, options, data.with_weights(weights), fit)
+    baseline = fit_setup_before(problem, robot, options, data, weights, fit)
     nuisance = _estimate_nuisance(weighted, linearization, robot, fit, sources, baseline)
     frames = find_measured_frames(
-        weighted, data, fit.deviation, fit.start, options.prior, linearization, sources.noise
+        weighted,
+        data,
+        fit.deviation,
+        fit.start,
+        options.prior,
+        linearization,
+        sources.noise,
+        solution,
     )
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
@@ -280,8 +283,7 @@ def _assemble(
         *([] if converged else [history.finding]),
         report_noise(data, robot, test),
         *report_divergence(free, fit.deviation[0], method, converged),
-        *(conflict.report() if converged and conflict is not None else []),
-        *report_untested(free, fit, method),
+        *on_prior,
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),

@@ -84,21 +84,20 @@ def choose_methods(
     return chosen
 
 
-def run_prior_tests(free: FreeParameters, fit: Descent, method: Method) -> PriorConflict | None:
-    """Return the tests of the prior, where the method uses one."""
+def run_prior_tests(
+    free: FreeParameters, fit: Descent, method: Method
+) -> tuple[PriorConflict | None, list[Finding]]:
+    """Return the tests of the prior, where the method uses one, and their findings: those on the
+    tolerances, and which deviations from them the data could not show.
+    """
     if not isinstance(method, MAP):
-        return None
-    rows = _restate_as_stated(free, fit, method)
+        return None, []
+    rows = _divide(_restate_as_stated(free, fit, method), method)
     inflation = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
-    sigma = float(method.sigma(fit.decomposition)[0])
-    return assess_prior_conflict(free, rows, inflation, sigma, fit.deviation[0], method.components)
-
-
-def report_untested(free: FreeParameters, fit: Descent, method: Method) -> list[Finding]:
-    """Return which deviations from the tolerances the data could not show."""
-    if not isinstance(method, MAP) or fit.status[0] != DescentStatus.CONVERGED:
-        return []
-    return report_undetectable(free, _divide(_restate_as_stated(free, fit, method), method))
+    conflict = assess_prior_conflict(free, rows, inflation, fit.deviation[0], method.components)
+    if fit.status[0] != DescentStatus.CONVERGED:
+        return conflict, []
+    return conflict, [*conflict.report(), *report_undetectable(free, rows)]
 
 
 def _restate_as_stated(free: FreeParameters, fit: Descent, method: MAP) -> Decomposition:

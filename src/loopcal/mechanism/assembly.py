@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -206,6 +207,20 @@ class Assembly:
     source: str = ""
     stored_parameters: tuple[str, ...] = ()
     common_errors: tuple[CommonError, ...] = ()
+
+    @cached_property
+    def limb_by_parameter(self) -> Mapping[str, str]:
+        """The limb that each parameter changes, by name; without those that change several."""
+        limb_of = {drive: limb.name for limb in reversed(self.limbs) for drive in limb.drives}
+        limb_of |= {limb.name: limb.name for limb in self.limbs}
+        owners: dict[str, set[str]] = {}
+        for entry in self.maps:
+            owners.setdefault(entry.parameter, set()).add(limb_of[entry.address.owner])
+        for shared in self.shared:
+            limbs = {limb_of[address.owner] for address in shared.outputs}
+            for name in shared.inputs:
+                owners.setdefault(name, set()).update(limbs)
+        return {name: next(iter(limbs)) for name, limbs in owners.items() if len(limbs) == 1}
 
 
 def check_assembly(assembly: Assembly) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.component_choice import predict
 from loopcal.estimate.methods.prior_conflict import LEVEL
-from loopcal.estimate.methods.tolerance_components import list_components
+from loopcal.estimate.methods.tolerance_components import list_shifts
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.numerics.decomposition import Decomposition
@@ -46,12 +46,18 @@ def report_undetectable(free: FreeParameters, rows: Decomposition) -> list[Findi
         return []
     least = find_information(WIDE, count)
     own, names = np.where(free.assumed, np.inf, np.diag(Q)), free.names
-    single = [int(i) for i in np.argsort(own) if own[i] < least]
-    shifts = [list(c.places) for c in list_components(free, "groups") if c.kind == "shift"]
-    shared = [places for places in shifts if Q[np.ix_(places, places)].sum() < least]
-    if not single and not shared:
+    order = np.argsort(own)
+    single = order[own[order] < least]
+    shifts = [list(shift.places) for shift in list_shifts(free)]
+    E = np.zeros((len(Q), len(shifts)))
+    for j, places in enumerate(shifts):
+        E[places, j] = 1.0
+    common = (E * (Q @ E)).sum(axis=0)
+    shared = np.flatnonzero(common < least)
+    if not single.size and not shared.size:
         return []
-    worst = min(shared, key=lambda places: float(Q[np.ix_(places, places)].sum()), default=[])
+    # the first of those that the data show least; rounding must not choose among several
+    worst = shifts[int(np.argmax(common <= common.min() + 1e-6 * least))] if shared.size else []
     return [
         report_finding(
             "prior.undetectable",

@@ -26,7 +26,7 @@ from typing import ClassVar
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.methods.inflated_tolerances import are_penalized, estimate_excess_noise
+from loopcal.estimate.methods.inflated_tolerances import are_penalized
 from loopcal.estimate.methods.tolerance_components import ToleranceComponent
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_tail
@@ -155,7 +155,6 @@ def assess_prior_conflict(
     free: FreeParameters,
     decomposition: Decomposition,
     inflation: float,
-    sigma: float,
     deviation: FloatArray,
     components: tuple[ToleranceComponent, ...] = (),
 ) -> PriorConflict:
@@ -163,18 +162,19 @@ def assess_prior_conflict(
 
     Parameters
     ----------
-    free : the parameters. decomposition : of the fit, for the stated tolerances.
+    free : the parameters. decomposition : of the fit, for the stated tolerances, its rows divided
+        by the noise that they show.
     inflation : factor by which the method inflated all of them.
-    sigma : factor on the stated sigmas. deviation : (p,) of the estimate, in tolerances.
+    deviation : (p,) of the estimate, in tolerances.
     components : parts of the tolerances that the method inflated further.
     """
-    scaled = decomposition.divided(np.full(1, sigma))
-    scaled = scaled.divided(estimate_excess_noise(scaled))
-    statistic, degrees = (float(value[0]) for value in compute_prior_statistic(scaled))
+    statistic, degrees = (float(value[0]) for value in compute_prior_statistic(decomposition))
     p_value = float(compute_chi_square_tail(degrees, statistic))
-    direction, parameter = _test_directions(free, scaled), _test_parameters(free, scaled)
-    order, names = np.argsort(-np.abs(deviation)), free.names
-    far = [i for i in order if abs(deviation[i]) > FAR and not free.assumed[i]][:NAMED]
+    direction = _test_directions(free, decomposition)
+    parameter = _test_parameters(free, decomposition)
+    distance = np.where(free.assumed, 0.0, np.abs(deviation))
+    order, names = np.argsort(-distance), free.names
+    far = order[distance[order] > FAR][:NAMED]
     return PriorConflict(
         statistic=statistic,
         degrees=degrees,
@@ -210,9 +210,9 @@ def _test_directions(free: FreeParameters, d: Decomposition) -> LargestDeviation
     values = np.where(testable, np.abs(d.projections[0]) / np.sqrt(1.0 + square), 0.0)
     worst = int(np.argmax(values))
     part = np.where(free.assumed, 0.0, np.abs(d.scale * d.directions[0][:, worst]))
-    order = [i for i in np.argsort(-part) if part[i] > MAIN_PART * part.max()]
-    names = free.names
-    return _largest(values, testable, tuple(names[i] for i in order))
+    order = np.argsort(-part)
+    order = order[part[order] > MAIN_PART * part.max()]
+    return _largest(values, testable, tuple(free.names[i] for i in order))
 
 
 def _test_parameters(free: FreeParameters, d: Decomposition) -> LargestDeviation:

@@ -13,7 +13,7 @@ column for each of them where they deviate independently (a group, or a single p
 
 from __future__ import annotations
 
-import re
+import string
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -22,7 +22,6 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.inflated_tolerances import By
-from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
 Kind = Literal["shift", "group", "single"]
@@ -34,6 +33,9 @@ KINDS: dict[By, tuple[Kind, ...]] = {
     "auto": ("shift", "group", "single"),
 }
 """Which components each setting of `InflatedTolerances` allows."""
+
+WITHOUT_DIGITS = str.maketrans("", "", string.digits)
+"""Translation that removes the digits of a text."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +95,11 @@ def list_components(free: FreeParameters, by: By) -> tuple[ToleranceComponent, .
     kinds, stated, names = KINDS[by], np.flatnonzero(~free.assumed).tolist(), free.names
     result: list[ToleranceComponent] = []
     if "shift" in kinds:
-        types = _collect(stated, [name_type(name) for name in names])
-        limbs = _collect(stated, _name_limbs(free.robot, names))
+        result += list_shifts(free)
+        types = {shift.name: shift.places for shift in result}
+        limb_of = free.robot.assembly.limb_by_parameter
+        limbs = _collect(stated, [limb_of.get(name, "") for name in names])
         dimensions = _collect(stated, [p.dimension.value for p in free.parameters])
-        shared = {name: places for name, places in types.items() if len(places) > 1}
-        result += [ToleranceComponent("shift", *item) for item in shared.items()]
         groups = {
             places: name
             for sets in (dimensions, limbs, types)
@@ -110,6 +112,12 @@ def list_components(free: FreeParameters, by: By) -> tuple[ToleranceComponent, .
     return tuple(result)
 
 
+def list_shifts(free: FreeParameters) -> list[ToleranceComponent]:
+    """Return the shifts that the parameters of a type can share, with variance 0."""
+    types = _collect(np.flatnonzero(~free.assumed).tolist(), [name_type(n) for n in free.names])
+    return [ToleranceComponent("shift", *item) for item in types.items() if len(item[1]) > 1]
+
+
 def name_type(name: str) -> str:
     """Return the type of a parameter: its name without limb and numbers.
 
@@ -119,23 +127,7 @@ def name_type(name: str) -> str:
     ('base.x', 'thBx', 'radius')
     """
     head, point, rest = name.partition(".")
-    return re.sub(r"\d+", "", rest if point else head)
-
-
-def _name_limbs(robot: Mechanism, names: Sequence[str]) -> list[str]:
-    """Return the limb of each parameter: the only one that it changes, or nothing."""
-    assembly = robot.assembly
-    limb_of = {drive: limb.name for limb in reversed(assembly.limbs) for drive in limb.drives}
-    limb_of |= {limb.name: limb.name for limb in assembly.limbs}
-    owners: dict[str, set[str]] = {}
-    for entry in assembly.maps:
-        owners.setdefault(entry.parameter, set()).add(limb_of[entry.address.owner])
-    for shared in assembly.shared:
-        for name in shared.inputs:
-            limbs = {limb_of[address.owner] for address in shared.outputs}
-            owners.setdefault(name, set()).update(limbs)
-    own = [owners.get(name, set()) for name in names]
-    return ["".join(limbs) if len(limbs) == 1 else "" for limbs in own]
+    return (rest if point else head).translate(WITHOUT_DIGITS)
 
 
 def _collect(stated: Iterable[int], labels: Sequence[str]) -> dict[str, tuple[int, ...]]:

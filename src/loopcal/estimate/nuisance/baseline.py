@@ -25,13 +25,18 @@ from loopcal.typing import FloatArray
 
 
 def fit_setup_before(
-    problem: Problem, robot: Mechanism, options: FitOptions, data: Measurements, fit: Descent
+    problem: Problem,
+    robot: Mechanism,
+    options: FitOptions,
+    data: Measurements,
+    weights: FloatArray,
+    fit: Descent,
 ) -> FloatArray | None:
     """Return the nuisance parameters (U,) that fit the robot from which a fit starts.
 
     Parameters
     ----------
-    data : with the weights of the fit.
+    weights : (n,) of the poses in the fit.
 
     Returns
     -------
@@ -43,7 +48,7 @@ def fit_setup_before(
     )
     if problem.nuisance is None or is_first:
         return None
-    return fit_setup_alone(robot, data, problem.nuisance.local)
+    return fit_setup_alone(robot, data.with_weights(weights), problem.nuisance.local)
 
 
 def fit_setup_alone(

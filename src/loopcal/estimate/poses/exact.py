@@ -183,10 +183,16 @@ class ExactPoses:
         return np.unique(np.concatenate(lost))
 
     def locate(
-        self, z: FloatArray, start: Start
+        self, z: FloatArray, start: Start, solution: PoseSolution | None = None
     ) -> tuple[FloatArray, dict[str, FloatArray]] | None:
-        """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost."""
-        located = [self._locate(block, z, start.predict_states(z)) for block in self.blocks]
+        """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost.
+
+        `solution` is one of these readings at z, if there is one.
+        """
+        if solution is not None and solution.linearized is not None:
+            located = [solution.linearized]
+        else:
+            located = [self._locate(block, z, start.predict_states(z)) for block in self.blocks]
         pairs = zip(self.blocks, located, strict=True)
         if any(poses.is_lost(block.is_needed)[0] for block, poses in pairs):
             return None

@@ -218,9 +218,10 @@ class UncertainPoses:
         return np.flatnonzero(~point.is_reached[0] & self.is_needed)
 
     def locate(
-        self, z: FloatArray, start: Start
+        self, z: FloatArray, start: Start, solution: PoseSolution | None = None
     ) -> tuple[FloatArray, dict[str, FloatArray]] | None:
         """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost."""
+        del solution
         assert start.poses is not None
         values, parts = self.free.values(z), []
         for block in self.blocks:
