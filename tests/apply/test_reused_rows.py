@@ -14,7 +14,21 @@ from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from, rec
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.inference.posterior import posterior_from_arrays
 from loopcal.findings import Severity
-from loopcal.measure import Measurements, collect_fitted_rows, fitted_rows_from_arrays
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    collect_fitted_rows,
+    fitted_rows_from_arrays,
+    simulate,
+)
+from loopcal.measure.kinds import Kind
+from loopcal.mechanism import sample_workspace
 from loopcal.workflow import CalibrationOptions, calibrate
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, list_codes
@@ -117,6 +131,54 @@ def test_rounded_copies_are_the_same_rows_and_repeats_are_not() -> None:
         assert STORED.find_in(repeat).count == 0
 
 
+DELTA = load_robot("linear-delta")
+
+
+def probe(kind: Kind, step: float, seed: int) -> Measurements:
+    """Return values of a delta at the same 40 readings, sigma 0.02 mm, rounded to a step [m]."""
+    poses = sample_workspace(DELTA, 40, 3).coordinates
+    size = 1 if kind.name == "component" else 3
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(size, 2e-5))),))
+    data = simulate(DELTA, poses, instrument, seed)
+    return replace_measured(data, np.round(data.observations[0].measured / step) * step)
+
+
+@pytest.mark.parametrize("step", [1e-6, 1e-5, 2.54e-5])
+@pytest.mark.parametrize("kind", [Component(("z",)), Position()])
+def test_repeats_of_rounded_values_are_no_copies(kind: Kind, step: float) -> None:
+    """A dial indicator shows the same height again in some of 40 poses; before, 2 to 20 of them
+    were refused. A copy, or half of one among repeats, is still recognized.
+    """
+    first = probe(kind, step, 0)
+    stored = collect_fitted_rows(first)
+    for seed in range(1, 11):
+        assert stored.find_in(probe(kind, step, seed)).count == 0
+    assert stored.find_in(first).count == 40
+    half = np.array(probe(kind, step, 1).observations[0].measured)
+    half[:20] = first.observations[0].measured[:20]
+    assert stored.find_in(replace_measured(first, half)).count >= 20
+
+
+def test_rows_of_another_kind_are_the_same_rows() -> None:
+    """Poses without their orientations are positions, and these are components; other measurements
+    at the same readings are none of them.
+    """
+    robot = load_robot("hexapod-42")
+    coordinates = sample_workspace(robot, 20, 3).coordinates
+    poses, positions = (
+        simulate(robot, coordinates, Instrument((Sensor(kind, Gaussian(np.full(size, 1e-5))),)), 0)
+        for kind, size in ((Pose(), 6), (Position(), 3))
+    )
+    positions = replace_measured(positions, poses.observations[0].measured[:, 3:6])
+    for fitted, data in ((poses, positions), (positions, poses)):
+        stored = collect_fitted_rows(fitted)
+        assert stored.find_in(data).count == 20
+        rows = data.observations[0]
+        sigma = np.sqrt(np.einsum("rii->ri", rows.covariance))
+        repeat = rows.measured + sigma * np.random.default_rng(1).standard_normal(sigma.shape)
+        assert stored.find_in(replace_measured(data, repeat)).count == 0
+
+
 def test_readings_alone_are_rows_only_where_they_were_fitted() -> None:
     bare = replace(FITTED, observations=())
     assert STORED.find_in(bare) == ((), 0, 0)
@@ -151,6 +213,7 @@ def test_no_row_counts_twice(data: Measurements, count: int, free_limb: str | No
     with expect_refusal("prior.rows-reused", DataError, count=count, total=data.n_poses) as found:
         recalibrate(hexapod(), data, FIRST.posterior, free_limb)
     assert len(found["poses"]) == count
+    assert found["others"] == data.n_poses - count
     with expect_refusal("prior.rows-reused", DataError):
         identify(hexapod(), data, options=FitOptions(prior=prior_from(FIRST.posterior)))
     if count == data.n_poses:

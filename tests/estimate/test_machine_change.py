@@ -126,3 +126,23 @@ def test_tolerances_in_an_earlier_calibration_are_no_noise() -> None:
     assert (share >= 0.0).all()
     options = FitOptions(prior=prior_from(fit.posterior))
     assert identify(DELTA, measure(truth, 9, 1.0), options=options).converged
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), None])
+def test_copies_in_an_unknown_form_agree_too_well(method) -> None:
+    """Rows rounded to 0.2 sigma are not recognized, but the change is too small; new rows and those
+    of a moved machine do not agree too well.
+    """
+    truth = DELTA.with_values(sample_truth(DELTA, 1, 4)[0])
+    data = measure(truth, 4, 1.0)
+    first = identify(DELTA, data, method)
+    rows = data.observations[0]
+    step = 0.2 * SIGMA
+    copy = replace(rows, measured=np.round(rows.measured / step) * step)
+    change = recalibrate(DELTA, replace(data, observations=(copy,)), first.posterior)[1]
+    assert change.finding.code == "prior.agrees-too-well"
+    assert change.moved is False
+    assert change.finding.data["p_value"] < 1e-3
+    for seed in range(5, 15):
+        other = recalibrate(DELTA, measure(truth, seed, 1.0), first.posterior)[1]
+        assert other.finding.code in ("prior.machine-unchanged", "prior.machine-changed")

@@ -116,7 +116,7 @@ def hint_for(finding: Finding) -> str | None:
     context = click.get_current_context(silent=True)
     command = None if context is None else context.command
     hint = find_hint(finding.code, command)
-    if hint is None or _is_limb_freed(finding):
+    if hint is None or _is_useless(finding):
         return None
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
@@ -126,10 +126,14 @@ def hint_for(finding: Finding) -> str | None:
     return hint
 
 
-def _is_limb_freed(finding: Finding) -> bool:
-    """Return whether a finding reports a change of a limb that the fit has freed already."""
+def _is_useless(finding: Finding) -> bool:
+    """Return whether the hint does not help: a limb that changed is free already, or no row would
+    be left.
+    """
     from loopcal.findings.catalog.phrases import MACHINE
 
+    if finding.code == "prior.rows-reused":
+        return not finding.data["others"]
     return finding.code == "prior.machine-changed" and finding.data["subject"] != MACHINE
 
 

@@ -41,6 +41,11 @@ MOST_TRIED = 60
 CHANGE_LEVEL = 0.05
 """Probability of finding a change of a machine that has not changed."""
 
+TOO_WELL = 1e-3
+"""Probability of a chi-square as small as that of new data which contain rows of the earlier
+calibration in a form that `loopcal.measure.FittedRows` does not recognize.
+"""
+
 NODES = 101
 """Values of the true noise of each calibration over which a probability is averaged."""
 
@@ -59,6 +64,7 @@ class Change:
     chi_square, degrees : of the change, in units of the noise that both calibrations show.
     p_value : probability of a larger chi_square, which allows for the uncertainty of that noise;
         NaN where the new rows determine none of these parameters, or a fit did not converge.
+        A p_value above 1 - TOO_WELL says that the two calibrations may share rows.
     moved : whether they have changed; None where it cannot be decided.
     finding : the result with its code.
     """
@@ -173,6 +179,9 @@ def assess_change(
     moved = p_value < CHANGE_LEVEL
     numbers = {"chi_square": gain, "degrees": degrees, "p_value": p_value, "level": CHANGE_LEVEL}
     code, single = "prior.machine-unchanged", {}
+    if p_value > 1.0 - TOO_WELL:
+        code = "prior.agrees-too-well"
+        numbers = {"chi_square": gain, "degrees": degrees, "p_value": 1.0 - p_value}
     if moved:
         code = "prior.machine-changed"
         single = _explain_by_one(robot, data, prior, names, kept.chi_square, options, progress)

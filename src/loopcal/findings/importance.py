@@ -37,6 +37,7 @@ IMPORTANCE = (
     "workflow.undetermined-combinations",
     "validation.setup-moved",
     "prior.machine-changed",
+    "prior.agrees-too-well",
     "prior.tolerances-inflated",
     "prior.tolerances-too-narrow",
     "prior.components-inflated",

@@ -2,8 +2,9 @@
 """Recognize rows that a calibration was fitted to in other measurements, by their numbers.
 
 A row is its readings and its measured values. A copy in another file, order or unit, without some
-of its columns, or rounded far below its noise is the same row. A repeated measurement differs by
-its noise: that all m values of a repeat agree by chance has a probability below 1e-6.
+of its columns, as another kind of measurement (a pose whose orientation was left out is a
+position), or rounded far below its noise is the same row. A repeated measurement differs by its
+noise, see `loopcal.measure.row_agreement`.
 """
 
 from __future__ import annotations
@@ -17,24 +18,11 @@ import numpy as np
 from loopcal.measure.kinds import ActuatorReadings
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.measure.row_agreement import ComparedRows, find_agreeing
+from loopcal.typing import FloatArray
 
 PREFIX = "fitted"
 """First word of the names of the stored arrays."""
-
-SAME = 1e-8
-"""Share of what a column spans up to which two numbers are the same."""
-
-SAME_READING = 1e-5
-"""The same for readings of rows whose measured values decide."""
-
-CHANCE = 1e-6
-"""Probability that the m measured values of a repeat agree: each differs by less than the m-th root
-of it, in standard deviations of the noise.
-"""
-
-LARGEST = 1e-2
-"""Largest such difference."""
 
 
 class ReusedRows(NamedTuple):
@@ -48,19 +36,6 @@ class ReusedRows(NamedTuple):
     poses: tuple[str, ...]
     count: int
     total: int
-
-
-class _Rows(NamedTuple):
-    """Rows of one kind: `content` (r, c) are `readings` columns of readings, then measured values
-    [SI]; `noise` (r, c) is the standard deviation of each number, zero where it is not known;
-    `poses` (r, l) are their poses.
-    """
-
-    kind: str
-    readings: int
-    content: FloatArray
-    noise: FloatArray
-    poses: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +80,8 @@ class FittedRows:
                 continue
             reused = np.zeros(len(rows.content), dtype=bool)
             for kind, content in self.groups:
-                if kind == rows.kind and content.shape[1] == rows.content.shape[1]:
-                    reused |= _is_among(rows, content)
+                is_same_form = kind == rows.kind and content.shape[1] == rows.content.shape[1]
+                reused |= find_agreeing(rows, content, is_same_form)
             labels += ["/".join(data.labels[j] for j in poses) for poses in rows.poses[reused]]
             total += len(reused)
         return ReusedRows(tuple(dict.fromkeys(labels)), len(labels), total)
@@ -132,7 +107,7 @@ def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | No
     return FittedRows(tuple((name.split("_", 2)[2], arrays[name]) for name in names))
 
 
-def _list_rows(data: Measurements) -> list[_Rows]:
+def _list_rows(data: Measurements) -> list[ComparedRows]:
     """Return the rows of each kind that count, then the readings of poses without such rows."""
     result, is_alone = [], np.ones(data.n_poses, dtype=bool)
     for o in data.observations:
@@ -143,12 +118,12 @@ def _list_rows(data: Measurements) -> list[_Rows]:
         readings = data.readings[poses].reshape(len(poses), poses.shape[1] * data.readings.shape[1])
         content = np.concatenate([readings, o.measured[counts]], axis=1)
         noise = np.concatenate([np.zeros(readings.shape), _state_noise(o)[counts]], axis=1)
-        result.append(_Rows(o.kind.name, readings.shape[1], content, noise, poses))
+        result.append(ComparedRows(o.kind.name, readings.shape[1], content, noise, poses))
     if data.reading_sigma is not None:
         is_alone &= np.isfinite(data.reading_sigma).any(axis=1)
     alone = data.readings[is_alone]
     poses = np.flatnonzero(is_alone)[:, None]
-    return [*result, _Rows(ActuatorReadings.name, 0, alone, np.zeros(alone.shape), poses)]
+    return [*result, ComparedRows(ActuatorReadings.name, 0, alone, np.zeros(alone.shape), poses)]
 
 
 def _state_noise(rows: Observations) -> FloatArray:
@@ -159,44 +134,3 @@ def _state_noise(rows: Observations) -> FloatArray:
     if variance.shape != rows.measured.shape:
         return np.zeros(rows.measured.shape)
     return np.sqrt(np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0))
-
-
-def _is_among(rows: _Rows, fitted: FloatArray) -> BoolArray:
-    """Return which rows (r,) agree with one of the fitted rows (k, c) in all numbers that both
-    have, among them a measured value.
-    """
-    result = np.zeros(len(rows.content), dtype=bool)
-    if not len(fitted) or not len(result):
-        return result
-    filled = np.where(np.isnan(fitted), 0.0, fitted)
-    span = np.maximum(np.ptp(filled, axis=0), 1e-3 * np.abs(filled).max(axis=0))
-    span = np.where(span > 0.0, span, 1.0)
-    masks, mine = np.unique(np.isfinite(rows.content), axis=0, return_inverse=True)
-    others, theirs = np.unique(np.isfinite(fitted), axis=0, return_inverse=True)
-    for i, mask in enumerate(masks):
-        own = np.flatnonzero(mine.reshape(-1) == i)
-        for j, other in enumerate(others):
-            common = mask & other
-            stored = fitted[theirs.reshape(-1) == j]
-            result[own] |= _agree(rows, own, stored, common, span)
-    return result
-
-
-def _agree(
-    rows: _Rows, own: np.ndarray, stored: FloatArray, common: BoolArray, span: FloatArray
-) -> BoolArray:
-    """Return which of the rows `own` agree with a stored row in the `common` columns (c,)."""
-    from scipy.spatial import KDTree
-
-    m = int(common[rows.readings :].sum())
-    if m == 0 and rows.content.shape[1] > rows.readings:
-        return np.zeros(len(own), dtype=bool)
-    share = np.full(len(span), SAME)
-    if m > 0 and rows.readings > 0:
-        share[: rows.readings] = SAME_READING
-    noise = np.median(rows.noise[own], axis=0)
-    limit = np.maximum(share * span, min(CHANCE ** (1.0 / max(m, 1)), LARGEST) * noise)[common]
-    distance, _ = KDTree(stored[:, common] / limit).query(
-        rows.content[own][:, common] / limit, p=np.inf, distance_upper_bound=1.0
-    )
-    return np.isfinite(distance)

@@ -256,7 +256,8 @@ def refuse_reused_rows(earlier: Prior | Posterior | None, data: Measurements) ->
         return
     reused = earlier.fitted_rows.find_in(data)
     if reused.count:
-        raise DataError(report_finding("prior.rows-reused", **reused._asdict()))
+        others = reused.total - reused.count
+        raise DataError(report_finding("prior.rows-reused", **reused._asdict(), others=others))
 
 
 def collect_used_rows(
