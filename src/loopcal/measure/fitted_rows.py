@@ -34,7 +34,7 @@ class ReusedRows(NamedTuple):
     """
 
     poses: tuple[str, ...]
-    count: int
+    count: int  # pyright: ignore[reportIncompatibleMethodOverride]
     total: int
 
 
