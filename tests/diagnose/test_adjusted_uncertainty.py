@@ -102,6 +102,17 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
     assert np.allclose(result.covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
 
 
+def test_exact_sigmas_are_the_limit_of_many_degrees_of_freedom():
+    _, data = measure("linear-delta", "component", draw_errors(14, 3, 3, 0.7), 3)
+    rows = collect_residual_rows(identify(ROBOTS["linear-delta"], data), data)
+    assert rows is not None
+    exact = estimate_correlated_errors(rows, np.inf)
+    limit = estimate_correlated_errors(rows, 1e8)
+    assert np.allclose(exact.covariance, limit.covariance, rtol=1e-5, atol=0.0)
+    assert exact.sigma == 1.0
+    assert exact.degrees == pytest.approx(limit.degrees, rel=1e-5)
+
+
 def test_slow_errors_that_no_test_shows_are_allowed_for_where_residuals_are_small():
     codes, inside, adjusted = [], [], []
     for seed in range(30):

@@ -12,13 +12,15 @@ import pytest
 from scipy.linalg import sqrtm
 from scipy.stats import binom
 
-from loopcal.diagnose import examine_fit
+from loopcal.diagnose import adjust_uncertainty, examine_fit
+from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.cluster_covariance import (
     LIMIT,
     check_clusters,
     compute_robust_spread,
 )
 from loopcal.diagnose.fit_checks.independent_units import Clusters, divide_into_clusters
+from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Instrument, Measurements, Pose, Position, Sensor, simulate
@@ -150,6 +152,32 @@ def test_covariance_and_degrees_equal_a_dense_computation(sensor, sessions, meth
     ratio = spread.compare(effect)
     assert np.isclose(ratio.ratio, np.sqrt(robust / stated), rtol=1e-3)
     assert np.isclose(ratio.degrees, dense.degrees(wide), rtol=1e-2)
+
+
+def test_the_ratio_refers_to_the_uncertainty_that_the_fit_states():
+    """Offsets of sessions are in the stated uncertainty once, not also in a factor on top of it."""
+    offset = np.array([0.0] * 3 + [40 * UM] * 3)
+    data = measure(KNOWN_POSE, 60, 1, 6, offset)
+    fit = identify(hexapod(), data, LeastSquares())
+    adjusted = adjust_uncertainty(fit, data)
+    before, after = check_clusters(fit, data), check_clusters(adjusted, data)
+    assert "residuals.sessions-differ" in {finding.code for finding in adjusted.findings}
+    assert before.finding.code == "residuals.common-errors"
+    assert after.finding.code == "residuals.common-errors-small"
+    solution = locate_measured_poses(fit, data)
+    stated = []
+    for each in (fit, adjusted):
+        errors = linearize_tool_errors(each.posterior, solution, FITTED)
+        root = each.posterior.without_discrepancy.root / each.posterior.unit[:, None]
+        by_machine = errors.by_parameters[:, 3:] @ root
+        stated.append((by_machine**2).sum() + (errors.by_discrepancy[:, 3:] ** 2).sum())
+    expected = before.position.ratio * np.sqrt(stated[0] / stated[1])
+    assert np.isclose(after.position.ratio, expected, rtol=1e-6)
+    assert after.position.p_value == pytest.approx(before.position.p_value)
+    name, ratio = after.parameter
+    place = fit.names.index(name)
+    growth = adjusted.standard_deviations[place] / fit.standard_deviations[place]
+    assert growth > 1.0 and ratio * growth <= before.parameter[1] * (1.0 + 1e-9)
 
 
 def test_the_ratio_is_one_on_average_for_independent_errors():

@@ -14,9 +14,14 @@ from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, FitOptions, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.covariance_parts import combine_degrees
-from loopcal.estimate.inference.residual_test import coverage_factor
+from loopcal.estimate.inference.residual_test import (
+    count_sigma_degrees,
+    coverage_factor,
+    run_residual_test,
+)
 from loopcal.measure import sample_truth, simulate
 from loopcal.mechanism import forward, inverse
+from loopcal.numerics.decomposition import decompose
 from tests import zoo
 from tests.estimate.problems import UM, hexapod, hexapod_data, hexapod_poses, tracker
 
@@ -68,6 +73,26 @@ def test_stated_sigmas_count_as_eight_degrees_of_freedom():
     np.testing.assert_allclose(exact.interval(), 1.959964 * exact.standard_deviations, rtol=1e-6)
     half = identify(hexapod(), data, options=FitOptions(LeastSquares(), sigma_uncertainty=0.5))
     assert half.residual_test.noise_degrees == 20.0
+
+
+@pytest.mark.parametrize(
+    ("noise", "u", "degrees"),
+    [("given", 0.25, 8.0), ("given", 0.1, 50.0), ("given", 0.0, np.inf), ("estimated", 0.25, 0.0),
+     ("assumed", 0.25, 2.0), ("assumed", 0.0, np.inf)],
+)  # fmt: skip
+def test_all_checks_count_stated_sigmas_alike(noise, u, degrees):
+    """The noise scale, correlated errors and the model discrepancy use one definition."""
+    assert count_sigma_degrees(noise, u) == pytest.approx(degrees)
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([rng.standard_normal((30, 4)), rng.standard_normal(30)])
+    factor = np.linalg.qr(rows, mode="r")[None]
+    d = decompose(factor, np.array([30.0]))
+    test = run_residual_test(d, np.zeros((1, 4)), noise, u)
+    assert test.sigma_degrees == pytest.approx(degrees)
+    wrong = factor.copy()
+    wrong[..., -1] *= 10.0
+    test = run_residual_test(decompose(wrong, np.array([30.0])), np.zeros((1, 4)), noise, u)
+    assert test.sigma_degrees == 0.0  # the residuals contradict the stated sigmas
 
 
 def test_contradicted_sigmas_are_replaced_but_never_by_smaller_ones():

@@ -58,3 +58,11 @@ def test_a_large_component_is_found_with_about_as_many_degrees_as_elements():
     found = estimate_variance_component(weights, y)
     assert found.variance == pytest.approx(100.0, rel=0.2)
     assert 150.0 < found.degrees < 220.0
+
+
+def test_an_exact_sigma_is_the_limit_of_many_degrees_of_freedom():
+    rng = np.random.default_rng(1)
+    weights = np.geomspace(1e-2, 1e2, 12)
+    y = rng.standard_normal(12) * np.sqrt(1.0 + 0.1 * weights)
+    exact = estimate_variance_component(weights, y, np.inf)
+    assert np.allclose(exact, estimate_variance_component(weights, y, 1e9), rtol=1e-5)

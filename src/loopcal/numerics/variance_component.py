@@ -60,18 +60,21 @@ def estimate_variance_component(
 ) -> VarianceComponent:
     """Return the size of a component; arguments as of `compute_component_tail`.
 
-    `known` degrees of freedom say that sigma is 1.
+    `known` degrees of freedom say that sigma is 1; infinite ones, that it is exactly 1.
     """
     largest = float(weights.max())
     tau = np.geomspace(SMALLEST, LARGEST, STEPS) / np.sqrt(largest)
     ratio = tau**2
     scale = 1.0 + ratio[:, None] * weights
-    square = (y**2 / scale).sum(axis=1) + known
-    count = len(y) + known
-    density = -0.5 * np.log(scale).sum(axis=1) - 0.5 * count * np.log(square)
+    square, count = (y**2 / scale).sum(axis=1), len(y) + known
+    if np.isinf(known):
+        by_size, variance = -0.5 * square, np.ones(STEPS)
+    else:
+        by_size, variance = -0.5 * count * np.log(square + known), (square + known) / count
+    density = by_size - 0.5 * np.log(scale).sum(axis=1)
     share = np.exp(density - density.max()) * np.gradient(tau)
     share /= share.sum()
-    values = ratio * square / count
+    values = ratio * variance
     mean = float(share @ values)
     # sigma^2 at each tau has a relative variance of its own
     own = 2.0 / max(count - 4.0, 1.0)

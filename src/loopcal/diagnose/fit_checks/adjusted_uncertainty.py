@@ -29,15 +29,11 @@ from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.covariance_parts import NOISE
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
-from loopcal.estimate.options import FitOptions
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS
-
-EXACT = 1e6
-"""Degrees of freedom that sigmas count for where they are stated to be exact."""
 
 NOTICEABLE = 1.05
 """Factor of the uncertainty of the measured poses from which a correlation that no test shows is
@@ -103,7 +99,7 @@ def _add_correlation(
     parameters may have taken up errors that are too slow for the tests.
     """
     rows = patterns.rows
-    errors = estimate_correlated_errors(rows, count_sigma_degrees(fit.options))
+    errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.zeros_like(errors.covariance)
     for part in (part for part in fit.posterior.parts if part.source == NOISE):
         scaled = part.root / fit.tolerance[:, None]
@@ -153,16 +149,6 @@ def state_tool_uncertainty(fit: Identification, data: Measurements) -> ToolUncer
     angle, position = D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
     stated = (_sum_squares(angle @ posterior.root), _sum_squares(position @ posterior.root))
     return ToolUncertainty((angle, position), stated)
-
-
-def count_sigma_degrees(options: FitOptions) -> float:
-    """Return the degrees of freedom that the stated sigmas count for: 1 / (2 u^2) with their
-    relative standard uncertainty u (JCGM 100 G.4.2), none where the noise is estimated.
-    """
-    if options.noise == "estimated":
-        return 0.0
-    u = options.sigma_uncertainty
-    return min(0.5 / u**2, EXACT) if u > 0.0 else EXACT
 
 
 def take_root(moments: FloatArray) -> FloatArray:

@@ -11,7 +11,8 @@ The factor (I - H_gg)^(-1/2) is the small-sample correction CR2 of Bell and McCa
 independent errors the expectation of C_robust is exactly C, however few clusters there are. Its
 scatter is that of a chi-square whose degrees of freedom have the moments of the quadratic form
 (Satterthwaite; Pustejovsky and Tipton, 2018). B is never formed: all is computed in the directions
-of the decomposition. See docs/theory/uncertainty.md.
+of the decomposition. What the residuals or a prior have added to C (`add_covariance`) belongs to
+the stated covariance with which C_robust is compared. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from loopcal.diagnose.fit_checks.influence import TESTABLE
 from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.inference.covariance_parts import NOISE
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
@@ -63,7 +66,7 @@ COMMON = 1e-9
 
 
 class Ratio(NamedTuple):
-    """Cluster-robust standard uncertainty of poses over the stated one.
+    """Cluster-robust standard uncertainty of poses over the one that the fit states.
 
     Attributes
     ----------
@@ -170,9 +173,9 @@ class RobustSpread:
         """(G, h) rows that a residual can judge."""
         return self.correction > 0.0
 
-    def compare(self, effect: FloatArray) -> Ratio:
+    def compare(self, effect: FloatArray, added: float = 0.0) -> Ratio:
         """Return the ratio for quantities whose change is effect (m, p) times the deviation in
-        tolerances.
+        tolerances. `added` : sum of the variances that they have beyond C.
         """
         root = effect @ self.root
         total = float((root**2).sum())
@@ -186,22 +189,24 @@ class RobustSpread:
         mean, observed = float((parts**2).sum()), float(((self.scores @ E) ** 2).sum())
         if not mean > 0.0:
             return NO_RATIO
-        ratio = float(np.sqrt(max(total + observed - mean, 0.0) / total))
+        ratio = float(np.sqrt(max(total + observed - mean, 0.0) / (total + added)))
         degrees = self._degrees(parts, mean)
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
         return Ratio(ratio, degrees, mean / by_rows, p_value)
 
-    def parameter_ratios(self) -> FloatArray:
-        """Return the ratio (p,) of each parameter; NaN without a standard deviation."""
-        stated = (self.root**2).sum(axis=1)
+    def parameter_ratios(self, added: FloatArray | float = 0.0) -> FloatArray:
+        """Return the ratio (p,) of each parameter; NaN without a standard deviation. `added` (p,) :
+        variances beyond C.
+        """
+        own = (self.root**2).sum(axis=1)
         observed = ((self.scores @ self.root.T) ** 2).sum(axis=0)
-        expected = np.zeros(len(stated))
+        expected = np.zeros(len(own))
         for parts in self.parts * self.is_tested[:, None, :]:
             expected += ((self.root @ parts) ** 2).sum(axis=1)
         square = np.divide(
-            observed - expected, stated, out=np.full(len(stated), np.nan), where=stated > 0.0
+            own + observed - expected, own + added, out=np.full(len(own), np.nan), where=own > 0.0
         )
-        return np.asarray(np.sqrt(np.maximum(1.0 + square, 0.0)))
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
     def _degrees(self, parts: FloatArray, mean: float) -> float:
         """Return the degrees of freedom 2 mean^2 / variance of Q for independent normal errors.
@@ -281,13 +286,14 @@ def _compare(
 ) -> ClusterCheck | None:
     """Return the comparison for clusters; None where residuals cannot judge the poses."""
     spread = compute_robust_spread(fit, data, clusters)
-    effects = _pose_effects(fit, data, frame)
-    angle, position = (spread.compare(effect) for effect in effects)
+    effects = _list_pose_effects(fit, data, frame)
+    angle, position = (spread.compare(each.by_parameters, each.added) for each in effects)
     sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
     sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
     if not sizes:
         return None
-    ratios = spread.parameter_ratios()
+    added = _find_added_root(fit.posterior) / fit.tolerance[:, None]
+    ratios = spread.parameter_ratios((added**2).sum(axis=1))
     largest = int(np.nanargmax(ratios))
     parameter = (fit.names[largest], float(ratios[largest]))
     beyond = [r for r in sizes if r.ratio > LIMIT and r.p_value < SIGNIFICANCE]
@@ -302,16 +308,38 @@ def _compare(
     return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
 
 
-def _pose_effects(
-    fit: Identification, data: Measurements, frame: str
-) -> tuple[FloatArray, FloatArray]:
-    """Return changes of orientation (3 n, p) and of the tool's position (3 n, p) of the measured
-    poses, in a frame, by deviations in tolerances.
+class _PoseEffects(NamedTuple):
+    """Changes (3 n, p) of the measured poses by deviations in tolerances, and the sum of the
+    variances that they have beyond those by C.
     """
+
+    by_parameters: FloatArray
+    added: float
+
+
+def _list_pose_effects(
+    fit: Identification, data: Measurements, frame: str
+) -> tuple[_PoseEffects, _PoseEffects]:
+    """Return the effects on orientation and on the tool's position, in a frame."""
     posterior = fit.posterior
-    D = linearize_tool_errors(posterior, locate_measured_poses(fit, data), frame).by_parameters
-    D, p = D * (fit.tolerance / posterior.unit), len(posterior.unit)
-    return D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
+    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data), frame)
+    p = len(posterior.unit)
+    by_part = errors.by_parameters @ (
+        _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]
+    )
+    added = np.concatenate([by_part, errors.by_discrepancy], axis=2) ** 2
+    D = errors.by_parameters * (fit.tolerance / posterior.unit)
+    angle, position = (
+        _PoseEffects(D[:, rows].reshape(-1, p), float(added[:, rows].sum()))
+        for rows in (slice(0, 3), slice(3, 6))
+    )
+    return angle, position
+
+
+def _find_added_root(posterior: Posterior) -> FloatArray:
+    """Return the root (p, k) [SI] of what was added to the covariance of a fit."""
+    roots = [part.root for part in posterior.parts if part.source != NOISE]
+    return np.concatenate([np.zeros((len(posterior.unit), 0)), *roots], axis=1)
 
 
 def _not_compared(code: str, **data: Any) -> ClusterCheck:

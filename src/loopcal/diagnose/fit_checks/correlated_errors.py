@@ -9,10 +9,11 @@ parameters, and the scale are
     log p(rho, a) = -(log |K| + log |X'K^-1 X| + (nu0 + nu) log(nu0 + S)) / 2 + const
     s^2 = (nu0 + S) / (nu0 + nu),    S = min over b of (r - X b)'K^-1 (r - X b)
 
-nu0 are the degrees of freedom of the stated sigmas. An estimate root G'e then has the covariance
-root (s^2 G'K G) root', averaged over rho and a with this likelihood, so that few rows, which leave
-them open, give a wide covariance. Estimates do not change. Source: Harville, Maximum likelihood
-approaches to variance component estimation, JASA 72 (1977).
+nu0 are the degrees of freedom of the stated sigmas, 0 where the residuals contradict them; exact
+sigmas, of infinite ones, give S in place of the last term, and s = 1. An estimate root G'e then has
+the covariance root (s^2 G'K G) root', averaged over rho and a with this likelihood, so that few
+rows, which leave them open, give a wide covariance. Estimates do not change. Source: Harville,
+Maximum likelihood approaches to variance component estimation, JASA 72 (1977).
 """
 
 from __future__ import annotations
@@ -30,6 +31,9 @@ RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)
 
 SHARE = (1.0, 0.75, 0.5, 0.3, 0.15)
 """Shares a of the correlated noise."""
+
+LEAST_SCATTER = 1e-9
+"""Relative variance of the size of the covariance below which it counts as known."""
 
 LONGEST = 400
 """Rows of a series whose correlation is considered at once; longer series are cut."""
@@ -63,7 +67,8 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
 
     Parameters
     ----------
-    rows : of a fit. sigma_degrees : degrees of freedom nu0 that the stated sigmas count for.
+    rows : of a fit. sigma_degrees : degrees of freedom nu0 that the stated sigmas count for,
+        infinite where they are exact.
     """
     segments = _cut_series(rows.series)
     nu = rows.degrees + sigma_degrees
@@ -71,10 +76,13 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
     for rho in RHO:
         for share in SHARE if rho > 0.0 else (1.0,):
             log_det, square, explained = _evaluate(rows, segments, rho, share)
-            total = sigma_degrees + square
-            logs.append(-0.5 * (log_det + nu * np.log(total)))
-            scales.append(total / nu)
-            covariances.append(total / nu * explained)
+            by_size, scale = square, 1.0
+            if np.isfinite(nu):
+                scale = (sigma_degrees + square) / nu
+                by_size = nu * np.log(scale)
+            logs.append(-0.5 * (log_det + by_size))
+            scales.append(scale)
+            covariances.append(scale * explained)
             neighbors.append(share * rho)
     weight = np.exp(np.array(logs) - max(logs))
     weight /= weight.sum()
@@ -84,7 +92,7 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
     scatter = float(weight @ (sizes - mean) ** 2) / mean**2
     return CorrelatedErrors(
         covariance,
-        2.0 / (scatter + 2.0 / nu),
+        2.0 / max(scatter + 2.0 / nu, LEAST_SCATTER),
         float(weight @ np.array(neighbors)),
         float(np.sqrt(weight @ np.array(scales))),
     )

@@ -26,7 +26,11 @@ from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
-from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, SIGNIFICANCE
+from loopcal.estimate.inference.residual_test import (
+    FEWEST_DEGREES,
+    SIGNIFICANCE,
+    count_sigma_degrees,
+)
 from loopcal.estimate.poses.smooth_errors import CENTERS, SmoothErrors, describe_smooth_errors
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
@@ -43,9 +47,6 @@ from loopcal.units import Dimension
 
 LEVEL = 0.05
 """Probability of adding a discrepancy at all where there is none."""
-
-EXACT = 1e6
-"""Degrees of freedom that stand for a sigma that is known exactly."""
 
 FEWEST_POSES = 5
 """Different poses below which nothing can be said of how errors vary with the pose."""
@@ -124,7 +125,7 @@ def find_slow_errors(fit: Identification, data: Measurements) -> SlowErrors | No
     every = (project_slow_errors(fit, data, *kernel) for kernel in KERNELS)
     tested = [rows for rows in every if rows is not None]
     level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(len(tested), 1))
-    known = _known_degrees(fit)
+    known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     slow = [SlowErrors(rows, detect_slow_errors(rows, known, level)) for rows in tested]
     slow = [each for each in slow if each.found]
     if slow:
@@ -260,14 +261,6 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     variances, axes = np.linalg.eigh(rows @ rows.T)
     kept = variances > NEGLIGIBLE * variances[-1]
     return axes[:, kept], variances[kept]
-
-
-def _known_degrees(fit: Identification) -> float:
-    """Return the degrees of freedom with which the stated noise is known (JCGM 100, G.4.2)."""
-    u = fit.options.sigma_uncertainty
-    if fit.residual_test.noise == "estimated":
-        return 0.0
-    return 0.5 / u**2 if u > 0.0 else EXACT
 
 
 def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:

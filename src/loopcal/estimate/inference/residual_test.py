@@ -87,6 +87,13 @@ class ResidualTest:
         return self.noise == "given" and self.p_value < SIGNIFICANCE
 
     @property
+    def sigma_degrees(self) -> float:
+        """Degrees of freedom of s that come from the stated sigmas: nu0, or 0 where the residuals
+        contradict them.
+        """
+        return self.noise_degrees if self.weighted else self.noise_degrees - max(self.degrees, 0.0)
+
+    @property
     def finding(self) -> Finding:
         """The result of the test."""
         if not self.converged:
@@ -172,17 +179,30 @@ def _estimate_scale(
     """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
     if noise == "estimated" or p_value < SIGNIFICANCE:
         return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
-    if uncertainty == 0.0:
-        return 1.0, np.inf
-    stated = (
-        0.5 / (max(uncertainty, ASSUMED_UNCERTAINTY) if noise == "assumed" else uncertainty) ** 2
-    )
-    if weighted or degrees <= 0:
+    stated = count_sigma_degrees(noise, uncertainty)
+    if weighted or degrees <= 0 or np.isinf(stated):
         return 1.0, stated
     total = stated + degrees
     if p_value > 1.0 - SIGNIFICANCE:
         return 1.0, total
     return float(np.sqrt((stated + unexplained) / total)), total
+
+
+def count_sigma_degrees(noise: str, uncertainty: float) -> float:
+    """Return nu0, the degrees of freedom that the stated sigmas count for: infinite where they are
+    exact, 0 where the noise is estimated.
+
+    Parameters
+    ----------
+    noise : "given", "estimated" or "assumed". uncertainty : relative standard uncertainty u of the
+        stated sigmas.
+    """
+    if noise == "estimated":
+        return 0.0
+    if uncertainty == 0.0:
+        return np.inf
+    u = max(uncertainty, ASSUMED_UNCERTAINTY) if noise == "assumed" else uncertainty
+    return 0.5 / u**2
 
 
 def _compute_tail(degrees: float, square: float) -> float:
