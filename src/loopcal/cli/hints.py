@@ -54,7 +54,7 @@ HINTS = {
     "gates.correction-not-written": "use --force to write it nevertheless",
     "gates.run-not-calibrated": "use --force to write them nevertheless",
     "gates.run-without-verdict": "use --force to write its numbers nevertheless",
-    "noise.residuals-too-large": "exclude a pose with --drop POSE, or use --loss huber",
+    "noise.residuals-too-large": "use --verbose for all findings",
     "noise.residuals-too-small": "use --noise estimated",
     "noise.few-degrees": "use --noise given",
     "prior.machine-changed": "use --free-limb LIMB",
@@ -90,6 +90,7 @@ HINTS = {
     "workflow.no-parameter-chosen": "leave out --choose-model",
     "workflow.next-check-outliers": "exclude a pose with --drop POSE, or use --loss huber",
     "workflow.next-check-noise": "use --noise estimated, or --verbose for all findings",
+    "workflow.next-check-residuals": "use --verbose for all findings",
     "workflow.next-check-data": "see loopcal identifiability ROBOT DATA",
     "workflow.next-measure-more": "use --choose-model to free fewer parameters, or loopcal plan",
     "workflow.next-resolve-warnings": "use --verbose for all findings, loopcal validate for other "

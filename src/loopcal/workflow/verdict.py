@@ -22,6 +22,19 @@ TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDE
 """Findings that leave the verdict open."""
 
 
+DEPENDENT = (
+    "residuals.drift",
+    "residuals.trend",
+    "residuals.sessions-differ",
+    "residuals.depend-on-temperature",
+    "residuals.depend-on-reading",
+    "residuals.correlated",
+    "residuals.common-errors",
+    "residuals.model-discrepancy",
+)
+"""Findings that residuals are not independent: a cause of large residuals other than sigma."""
+
+
 class Verdict(Enum):
     """Whether the calibrated geometry can be used; the value is how people read it."""
 
@@ -93,5 +106,7 @@ def choose_next_step(
     if any(code.startswith("fit.") for code in failed) or "gates.poses-unreachable" in failed:
         return report_finding("workflow.next-check-data")
     if any(code.startswith("noise.") for code in failed):
+        if any(finding.code in DEPENDENT for finding in findings):
+            return report_finding("workflow.next-check-residuals")
         return report_finding("workflow.next-check-noise")
     return report_finding("workflow.next-measure-more")

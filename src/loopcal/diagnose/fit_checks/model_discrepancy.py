@@ -22,6 +22,7 @@ import numpy as np
 
 from loopcal.diagnose.fit_checks.repeated_poses import LEVEL as REPEATS_LEVEL
 from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
+from loopcal.diagnose.fit_checks.residual_patterns import LEVEL
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance
@@ -44,9 +45,6 @@ from loopcal.numerics.variance_component import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-LEVEL = 0.05
-"""Probability of adding a discrepancy at all where there is none."""
 
 FEWEST_POSES = 5
 """Different poses below which nothing can be said of how errors vary with the pose."""

@@ -28,7 +28,12 @@ from loopcal.numerics.chi_square import compute_f_tail
 from loopcal.typing import FloatArray
 
 LEVEL = 0.05
-"""Probability that independent errors show any pattern, over all tests of a fit (Sidak)."""
+"""Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the
+same for slow errors of the poses (`model_discrepancy`).
+"""
+
+FALSE_ALARMS = 1.0 - (1.0 - LEVEL) ** 2
+"""Probability that independent errors change the uncertainty of a fit: patterns or slow errors."""
 
 FEWEST_LEFT = 3.0
 """Degrees of freedom of the residuals for each size of an effect that is tested, at least."""
