@@ -205,3 +205,27 @@ def test_the_next_step_is_the_cause_that_the_residuals_name():
         report = lc.calibrate(ROBOTS["linear-delta"], data)
         assert report.failures[0].code == "noise.residuals-too-large"
         assert report.next_step.code == f"workflow.next-check-{step}"
+
+
+@pytest.mark.parametrize(
+    ("correlation", "severity"), [(0.3, Severity.WARNING), (0.9, Severity.INFO)]
+)
+def test_a_weak_dependence_does_not_silence_residuals_that_are_too_small(correlation, severity):
+    errors = 0.3 * draw_errors(24, 3, 4, correlation)
+    _, before, after = fit_and_adjust("linear-delta", "component", errors, 4)
+    assert "noise.residuals-too-small" in {f.code for f in before.findings}
+    found = {f.code: f.severity for f in after.findings if f.code.startswith("noise.")}
+    assert found == {"noise.not-independent": severity}
+
+
+def test_a_fit_with_a_loss_says_which_tests_are_not_made():
+    """It does not say that the noise is not tested beside a finding that it is contradicted."""
+    ramp = np.linspace(-4.0, 4.0, 40)[:, None]
+    _, data = measure("linear-delta", "component", 2.0 * (draw_errors(40, 3, 1) + ramp), 1)
+    fit = identify(ROBOTS["linear-delta"], data, options=FitOptions(loss=Huber()))
+    adjusted = adjust_uncertainty(fit, data)
+    texts = {f.code: str(f) for f in adjusted.findings}
+    assert "noise.loss-contradicted" in texts
+    assert not PATTERNS & set(texts)
+    assert "time, order" in texts["noise.weighted"]
+    assert "noise is not tested" not in texts["noise.weighted"]

@@ -203,9 +203,17 @@ def _weigh(p_value: float) -> Severity:
 
 
 def _without_doubt_of_sigma(fit: Identification) -> Identification:
-    """Return a fit that does not call sigma too large: correlated errors make residuals small."""
+    """Return a fit that does not call sigma alone too large: correlated errors make residuals
+    small. Where the dependence is no warning, the small residuals still are.
+    """
+    warned = any(
+        f.code.startswith("residuals.") and f.severity is Severity.WARNING for f in fit.findings
+    )
+    severity = Severity.INFO if warned else Severity.WARNING
     findings = tuple(
-        report_finding("noise.not-independent", ratio=f.data["ratio"]) if f.code == TOO_SMALL else f
+        report_finding("noise.not-independent", ratio=f.data["ratio"], severity=severity)
+        if f.code == TOO_SMALL
+        else f
         for f in fit.findings
     )
     return replace(fit, findings=findings)
