@@ -185,7 +185,7 @@ def test_calibrate_with_a_prior_reports_whether_the_freed_limb_changed(
     assert code == 0, err
     assert out.startswith("Undecided: hexapod-42")
     result = json.loads((example_folder / "second" / "result.json").read_text())
-    assert result["change"]["what"] == "leg3"
+    assert result["change"]["subject"] == "leg3"
     assert result["change"]["moved"] is False
     assert set(result["made_by"]["inputs"]) == {"robot", "data", "prior"}
     first, second = (

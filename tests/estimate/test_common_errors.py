@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loopcal.diagnose import identifiability
 from loopcal.engine import fold
-from loopcal.errors import FileError
-from loopcal.estimate import MAP, LeastSquares, identify
+from loopcal.errors import FileError, MechanismError
+from loopcal.estimate import MAP, LeastSquares, Ridge, identify
 from loopcal.io import load_robot
 from loopcal.measure import Component, Gaussian, Instrument, Sensor, sample_truth, simulate
 from loopcal.mechanism import Mechanism, forward, sample_workspace
@@ -115,6 +116,39 @@ def test_a_batch_that_is_off_is_found_by_whoever_declares_it(delta: Mechanism) -
     assert declared < 0.8 * least_squares
     assert np.mean(inside, axis=0)[0] > 0.93
     assert np.mean(inside, axis=0)[1] < 0.85
+
+
+def test_identifiability_uses_the_common_errors(delta: Mechanism) -> None:
+    """Standard deviations with the tolerances as a prior are those of dense normal equations, and
+    those of a fit. Independent tolerances would promise 10 % less or more.
+    """
+    instrument = Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 5e-5))),))
+    analysis = identifiability(delta, instrument, poses=20)
+    table, free = delta.parameters, np.flatnonzero(delta.parameters.free)
+    information = analysis.factor.T @ analysis.factor
+    correlation = table.correlation()[np.ix_(free, free)]
+    expected, independent = (
+        np.sqrt(np.diag(np.linalg.inv(information + np.linalg.inv(prior))))
+        for prior in (correlation, np.eye(len(free)))
+    )
+    left = np.array([parameter.left for parameter in analysis.parameters])
+    np.testing.assert_allclose(left, expected, rtol=1e-9)
+    sd = np.sqrt((analysis.posterior.root**2).sum(axis=1)) / table.tolerance[free]
+    np.testing.assert_allclose(sd, expected, rtol=1e-9)
+    assert np.abs(independent / expected - 1.0).max() > 0.1
+
+
+def test_ridge_with_correlated_tolerances_advises_what_helps(delta: Mechanism) -> None:
+    instrument = Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 5e-5))),))
+    data = simulate(delta, sample_workspace(delta, 20, 1).coordinates, instrument, 1)
+    fit = identify(delta, data, Ridge(3.0))
+    (finding,) = (f for f in fit.findings if f.code == "fit.ridge-without-intervals")
+    assert "(their errors are correlated). Use the method map." in str(finding)
+
+
+def test_names_of_common_errors_differ(tmp_path: Path) -> None:
+    with pytest.raises(MechanismError, match="two common errors are called 'batch of rods'"):
+        delta_with(f"{RODS}\n  - {RODS}", tmp_path)
 
 
 @pytest.mark.parametrize(

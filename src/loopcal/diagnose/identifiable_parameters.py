@@ -23,6 +23,7 @@ from loopcal.estimate.inference.null_space import (
 )
 from loopcal.estimate.inference.posterior import Posterior, compute_posterior
 from loopcal.estimate.information import collect_information, count_equations
+from loopcal.estimate.methods.tolerance_components import compute_symmetric_root
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
@@ -224,6 +225,11 @@ class Identifiability:
     def posterior(self) -> Posterior:
         """What is known of the parameters with the tolerances as a prior."""
         free, d = self.free_parameters, self.decomposition
+        if free.correlation is not None:
+            rows = np.zeros((1, len(free) + 1, len(free) + 1))
+            rows[0, :-1, :-1] = self.factor
+            root = compute_symmetric_root(free.correlation)
+            d = decompose(rows, d.rows, tolerance=d.tolerance, root=root)
         penalty = np.ones_like(d.singular_values)
         return compute_posterior(free.robot, free.places, free.tolerance, d, penalty)
 
@@ -295,12 +301,12 @@ def identifiability(
     return _summarize(free, decomposition, factor[0, :-1, :-1])
 
 
-def compute_remaining_sd(rows: FloatArray) -> FloatArray:
+def compute_remaining_sd(rows: FloatArray, root: FloatArray) -> FloatArray:
     """Return the standard deviations (p,) over tolerances by rows (m, p) and the tolerances as a
-    prior.
+    prior, whose correlation is root root'.
     """
-    _, s, vt = np.linalg.svd(rows, full_matrices=False)
-    return np.sqrt((vt**2 / (1.0 + s[:, None] ** 2)).sum(axis=0))
+    _, s, vt = np.linalg.svd(rows @ root, full_matrices=False)
+    return np.sqrt(((root @ vt.T) ** 2 / (1.0 + s**2)).sum(axis=1))
 
 
 def _summarize(
@@ -319,7 +325,9 @@ def _summarize(
         unidentifiable=interpret_combinations(free, combinations),
         weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
         indices=compute_observability(s, rank, equations),
-        parameters=_judge_parameters(free, null, compute_remaining_sd(factor)),
+        parameters=_judge_parameters(
+            free, null, compute_remaining_sd(factor, free.correlation_root())
+        ),
     )
 
 

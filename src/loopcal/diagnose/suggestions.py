@@ -136,7 +136,8 @@ def suggest_measurements(
     leading = [free.names.index(c.names[0]) for c in combinations]
     measurements: list[list[FurtherMeasurement]] = [[] for _ in leading]
     # an observed direction must exceed the rounding of the existing rows, too
-    floor, present = float(np.linalg.norm(factor, ord=2)), compute_remaining_sd(factor)
+    root, floor = free.correlation_root(), float(np.linalg.norm(factor, ord=2))
+    present = compute_remaining_sd(factor, root)
     joints = _passive_joints(free.robot)
     scene = _draw_scene(free, [name for name, _ in joints])
     for words, kind in _list_candidates(free.robot, joints):
@@ -148,7 +149,7 @@ def suggest_measurements(
             continue  # this kind has nothing to measure on this robot
         determined = _find_determined(X, B, floor)
         if determined.any():
-            left = compute_remaining_sd(np.concatenate([factor, X]))
+            left = compute_remaining_sd(np.concatenate([factor, X]), root)
             better = determined & (left[leading] < IMPROVEMENT * present[leading])
             for i in np.flatnonzero(better):
                 measurement = FurtherMeasurement(words, kind.name, float(left[leading[i]]))

@@ -70,7 +70,7 @@ class Change:
     """
 
     JSON_FIELDS: ClassVar[Mapping[str, str]] = {
-        "what": "subject",
+        "subject": "subject",
         "names": "names",
         "change": "change",
         "chi_square": "chi_square",

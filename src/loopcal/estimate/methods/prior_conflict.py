@@ -87,7 +87,7 @@ class PriorConflict:
         "worst_direction": "direction",
         "worst_parameter": "parameter",
         "joint_p_value": "joint_p_value",
-        "spread": "inflation",
+        "inflation": "inflation",
         "components": "component_rows",
         "conflict": "conflict",
         "farthest": "farthest",

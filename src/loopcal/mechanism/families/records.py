@@ -258,6 +258,11 @@ class RobotRecord:
         )
         present = tuple(name for name in names if name in stored)
         common = tuple(record.resolve(parameters) for record in self.common_errors)
+        titles = [error.name for error in common]
+        if duplicate := [title for title in titles if titles.count(title) > 1]:
+            raise MechanismError(
+                f"two common errors are called {duplicate[0]!r}; give each its own name"
+            )
         return replace(
             expanded, parameters=parameters, stored_parameters=present, common_errors=common
         )
