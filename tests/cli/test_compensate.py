@@ -138,7 +138,7 @@ def test_invalid_target_file_is_refused_in_one_sentence(
         ("compensate run targets.csv --controller nobody", "nobody"),
         (
             "calibrate hexapod-42 measurements.csv -o new --prior run",
-            "the earlier run was fitted to these measurements",
+            "Measure again: these data add nothing to the earlier calibration",
         ),
         ("calibrate hexapod-42 measurements.csv -o new --free-limb leg3", "Hint: add --prior RUN"),
         (
