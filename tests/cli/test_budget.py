@@ -34,6 +34,20 @@ def test_page_has_one_line_for_each_source_and_fits_a_screen(run, capsys):
     assert max(map(len, lines)) <= 132
 
 
+def test_a_platform_that_does_not_rotate_has_no_column_of_orientations(tmp_path, capsys):
+    data, folder = str(tmp_path / "data.csv"), str(tmp_path / "run")
+    kind = ["--kind", "component", "--components", "x,y,z"]
+    assert main(["simulate", "linear-delta", "-o", data, *kind, "--draw-errors"]) == 0
+    assert main(["calibrate", "linear-delta", data, "-o", folder]) == 0
+    capsys.readouterr()
+    assert main(["budget", folder]) == 0
+    page = capsys.readouterr().out
+    assert "orientation" not in page
+    rows = [line.split() for line in page.splitlines() if line.startswith(("tolerances", "all "))]
+    assert all(float(cell) > 0.0 for cell in rows[0][-4:])
+    assert rows[-1][-2:] == ["-", "-"]
+
+
 def test_json_is_what_the_run_folder_holds(run, capsys):
     capsys.readouterr()
     assert main(["budget", str(run), "--json"]) == 0

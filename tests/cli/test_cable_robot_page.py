@@ -45,7 +45,8 @@ def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, cap
         capsys.readouterr()
         assert main([*command.split(), *["--verbose"] * command.startswith("calibrate")]) == 0
     printed = read_table_rows(capsys.readouterr().out)
-    assert len(printed) == 32  # 2 errors, 3 kinds, 21 parameters, 4 motors, 2 statistics
+    # 2 errors, 3 kinds, 21 parameters, 3 tests of tolerances, 5 sources, 4 motors, 2 statistics
+    assert len(printed) == 40
     assert [
         row
         for block in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
@@ -103,6 +104,11 @@ def test_import_and_calibrate_give_the_page_numbers_for_a_real_machine(
     assert result["examination"]["outliers"]["blocks"] == 44
     assert result["examination"]["outliers"]["outliers"] == []
     rows = {row["name"]: row for row in result["fit"]["parameters"]}
+    codes = {finding["code"] for finding in result["findings"]}
+    assert "residuals.model-discrepancy" in codes
+    noise = [
+        s for s in result["expected_error"]["sources"] if s["kind"] in ("instrument", "readings")
+    ]
     page = (root / "docs" / "cable-robots.md").read_text("utf-8")
     for line in "ABCD":
         table = re.search(rf"^\| {line} \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
@@ -112,8 +118,10 @@ def test_import_and_calibrate_give_the_page_numbers_for_a_real_machine(
         for axis, (value, half), other in zip("xyz", said, published, strict=True):
             row = rows[f"{line}.anchor.{axis}"]
             assert row["estimate"] == pytest.approx(value, abs=0.06)  # one decimal is printed [mm]
-            assert row["plus_minus"] == pytest.approx(half, rel=0.03)
-            assert abs(row["estimate"] - other) < 1.05 * row["plus_minus"]
+            variance = sum(source["parameters"][row["name"]] for source in noise)  # [m^2]
+            assert 1.96e3 * variance**0.5 == pytest.approx(half, rel=0.03)
+            assert half < row["plus_minus"] < 2.1 * half
+            assert abs(row["estimate"] - other) < 1.05 * half
 
 
 def test_import_from_json_needs_the_option_format(folder, capsys) -> None:

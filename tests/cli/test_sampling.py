@@ -103,6 +103,9 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, cap
     text = capsys.readouterr().out
     assert "+/- all at once" in text
     assert "Joint 90 % region" in text
+    assert "degrees of freedom)" in " ".join(text.split())
+    assert main(["region", run, "-p", "leg1.base.x"]) == 0
+    assert "95 % intervals that hold for 1 parameter\n" in capsys.readouterr().out
     assert main(["region", run, "--rule", "scheffe"]) == 0
     assert "all 42 parameters at once" in capsys.readouterr().out
 
@@ -111,12 +114,14 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, cap
     ("words", "text"),
     [
         (["bootstrap", "RUN", "--method", "ls"], "has no effect with a run folder"),
-        (["bootstrap", "RUN", "--unit", "day"], "too few units 'day'"),
+        (["bootstrap", "RUN", "--unit", "day"], "at least 5 units 'day'"),
+        (["bootstrap", "RUN", "--unit", "month"], "must be one of pose, block, session, day"),
         (["sample", "RUN", "--count", "5"], "100"),
         (["sample", "hexapod-42", "DATA", "--method", "ridge"], "penalty without a probability"),
         (["region", "RUN", "-p", "leg9.base.x"], "no free parameter is called 'leg9.base.x'"),
         (["region", "RUN", "--level", "1.5"], "1.5"),
         (["bootstrap", "hexapod-42"], "run folder"),
+        (["sample", "DATA"], "give a run folder, or the files of measurements after"),
     ],
 )
 def test_wrong_use_is_refused_in_one_sentence(folder, capsys, words, text) -> None:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The study of broken assumptions: what it simulates, how it judges, and that its results hold."""
 
 import inspect

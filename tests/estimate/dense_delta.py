@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A linear delta in closed form, with dense least squares: nothing of loopcal's estimation.
 
 The nozzle is the lower point at the distance arm_k from the three carriages, which is the

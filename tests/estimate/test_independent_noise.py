@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The noise scale, its degrees of freedom, pose uncertainties and the test of a moved machine
 against dense scipy code that shares only the measured values with loopcal.
 """

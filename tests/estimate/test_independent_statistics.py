@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Statistics of fits against dense scipy code that shares only the measured values with loopcal."""
 
 import numpy as np

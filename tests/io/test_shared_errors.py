@@ -76,6 +76,23 @@ def test_a_session_bias_is_declared_in_one_line_and_estimated(tmp_path):
     assert error < error_before
 
 
+def test_the_difference_of_two_sessions_is_stated_with_the_uncertainty_of_the_difference():
+    session = np.repeat(["mon", "tue"], 15)
+    errors = draw_errors(30, 3, 4)
+    errors[:, 0] += np.where(session == "mon", 8.0, -8.0)
+    _, data = measure("linear-delta", "component", errors, 4, session)
+    (finding,) = (
+        f
+        for f in adjust_uncertainty(identify(DELTA, data), data).findings
+        if f.code == "residuals.sessions-differ"
+    )
+    assert finding.data["component"] == "x"
+    size, error = (finding.data[key].value for key in ("size", "error"))
+    true = 8.0 * LENGTH * 1e3  # [mm]
+    assert abs(abs(size) - true) < 4.0 * error
+    assert error < 0.2 * true
+
+
 @pytest.mark.parametrize("is_sorted", [True, False])
 def test_a_drift_is_declared_in_one_line_and_estimated(tmp_path, is_sorted):
     order = np.arange(30) if is_sorted else np.random.default_rng(1).permutation(30)
@@ -128,6 +145,7 @@ def test_components_without_a_line_have_no_bias_and_files_are_written_as_read(tm
     ("line", "words"),
     [
         ("session_bias: yes", "write 'session_bias: unknown'"),
+        ("session_bias: {}", "write 'session_bias: unknown'"),
         ("session_bias: {w: 1 um}", "'w'"),
         ("session_bias: {x: 5}", "unit"),
         ("session_bias: {x: 5 deg}", "deg"),

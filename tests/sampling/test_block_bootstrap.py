@@ -187,7 +187,9 @@ def test_wrong_input_is_refused_with_what_is_allowed() -> None:
         ({"scheme": "jackknife"}, "wild, pairs or normal"),
         ({"count": 1}, "at least 2"),
         ({"unit": "day"}, "14 poses"),
-        ({"unit": 14}, "at least 5 blocks"),
+        ({"unit": 14}, "at least 5 blocks of the unit '14-pose run'"),
+        ({"unit": 5}, "at least 5 blocks of the unit '5-pose run'"),
+        ({"unit": "month"}, "'month'; it must be one of pose, block, session, day"),
         ({"unit": 0}, "at least 1"),
         ({"scheme": "pairs"}, "Use the scheme 'wild'"),
     ):

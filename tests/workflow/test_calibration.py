@@ -15,7 +15,7 @@ import loopcal as lc
 from loopcal.cli import main
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP
-from loopcal.findings import Severity, report_finding
+from loopcal.findings import Quantity, Severity, report_finding
 from loopcal.io import load_run, save_run
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
@@ -251,6 +251,15 @@ def test_most_severe_finding_decides_the_verdict():
     assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
     step = choose_next_step(Verdict.RESERVATIONS, (warning,), ())
     assert step.code == "workflow.next-resolve-warnings"
+    data = {"ratio": 3.9, "degrees": 81.0, "p_value": 1e-9}
+    noise = report_finding("noise.residuals-too-large", Severity.FAILURE, **data)
+    data = {"component": "x", "size": Quantity(0.03, "mm"), "error": Quantity(0.002, "mm")}
+    sessions = report_finding("residuals.sessions-differ", **data, ratio=1.8)
+    for findings, code in (
+        ((noise,), "workflow.next-check-noise"),
+        ((noise, sessions), "workflow.next-check-residuals"),
+    ):
+        assert choose_next_step(Verdict.NOT_CALIBRATED, findings, ()).code == code
 
 
 def test_measurements_made_in_python_are_checked_for_wrong_conventions(robot, data) -> None:

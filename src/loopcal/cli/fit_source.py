@@ -17,7 +17,7 @@ from loopcal.cli.options import (
     refuse_given,
     take_flags,
 )
-from loopcal.errors import EstimationError
+from loopcal.errors import EstimationError, LoopcalError
 from loopcal.findings import report_finding
 
 if TYPE_CHECKING:
@@ -54,6 +54,11 @@ def load_fit(
         measurements = leave_out_held_out(read_checked_measurements(data, robot, **flags))
         fit = identify(robot, measurements, options=make_fit_options(options))
     else:
+        if Path(source).is_file():
+            raise LoopcalError(
+                f"{source}: this is a file; give a run folder, or the files of measurements after "
+                "that of the robot"
+            )
         refuse_given(options, "with a run folder")
         fit, measurements = _repeat_run(load_run(source))
     return adjust_uncertainty(fit, measurements), measurements

@@ -51,7 +51,9 @@ def view_budget(budget: Mapping[str, Any], robot: Mechanism) -> list[Block]:
 
 
 def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
-    """Return one line for each source of errors, and their sum."""
+    """Return one line for each source of errors, and their sum; without orientation where the
+    platform does not rotate.
+    """
     length, angle = (units_of(robot)[d] for d in (Dimension.LENGTH, Dimension.ANGLE))
     worst = budget["worst_parameter"]
     table = robot.parameters
@@ -63,13 +65,15 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     titles = [("position", length.symbol), ("orientation", angle.symbol)]
     if worst:
         titles.append((worst, unit.symbol))
-    columns = [word_column("source"), word_column("type"), Column("degrees")]
+    columns = [word_column("source"), word_column("type"), Column("degrees of freedom")]
     columns += [Column(title, symbol) for title, symbol in titles]
     columns += [Column(f"halved: {title}", symbol) for title, symbol in titles]
+    orientations = (4, 4 + len(titles)) if budget["orientation"]["rms"] == 0.0 else ()
+    shown = [(i, column) for i, column in enumerate(columns) if i not in orientations]
     return build_table(
         MEANING.format(poses=budget["poses"], over=over),
         rows,
-        *((column, lambda row, i=i: row[i]) for i, column in enumerate(columns)),
+        *((column, lambda row, i=i: row[i]) for i, column in shown),
     )
 
 

@@ -47,6 +47,7 @@ def view_region(
         for name in intervals.names
     ]
     level, count = f"{100 * intervals.level:.4g} %", len(intervals.names)
+    together = f"all {count} parameters at once" if count > 1 else "1 parameter"
     rows = []
     for i, (name, unit) in enumerate(zip(intervals.names, units, strict=True)):
         value, single, half = (
@@ -63,13 +64,17 @@ def view_region(
         word_column("unit"),
     )
     blocks: list[Block] = [
-        f"{robot.name}: intervals that hold for all {count} parameters at once with {level}",
+        f"{robot.name}: {level} intervals that hold for {together}",
         f"Rule: {intervals.rule}.",
         Table("Intervals", columns, tuple(rows)),
     ]
     if region is None:
         return blocks
-    degrees = "known noise" if np.isinf(region.degrees) else f"{region.degrees:.3g} degrees"
+    degrees = (
+        "known noise"
+        if np.isinf(region.degrees)
+        else f"noise with {region.degrees:.3g} degrees of freedom"
+    )
     text = f"Joint {level} region: squared distance up to {region.square:.4g} ({degrees})."
     return [*blocks, text, _build_axes(region)]
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.diagnose.fit_checks.independent_units import Clusters, divide_into_clusters
+from loopcal.diagnose.fit_checks.independent_units import (
+    FEWEST_CLUSTERS,
+    Clusters,
+    divide_into_clusters,
+)
 from loopcal.errors import EstimationError
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.findings import report_finding
@@ -17,6 +21,10 @@ ENOUGH_BLOCKS = 12
 """Blocks of a unit with which it is resampled by default: with fewer, the scatter of the resamples
 is itself known to 20 % at best.
 """
+
+
+UNITS = ("pose", "block", "session", "day")
+"""Names of units."""
 
 
 def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters:
@@ -34,6 +42,11 @@ def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters
     """
     if isinstance(unit, int):
         return _consecutive(data, unit)
+    if unit is not None and unit not in UNITS:
+        raise EstimationError(
+            f"unit is {unit!r}; it must be one of {', '.join(UNITS)}, or a number of consecutive "
+            "poses"
+        )
     divisions = divide_into_clusters(data)
     if not divisions:
         raise EstimationError(report_finding("sampling.too-few-blocks", unit=unit or "pose"))
@@ -63,8 +76,7 @@ def _consecutive(data: Measurements, length: int) -> Clusters:
     links: IntArray = np.column_stack([run, run.max() + 1 + linked])
     joined = connected_groups(links, int(links.max()) + 1)[run]
     names, member = np.unique(joined, return_inverse=True)
-    if len(names) < 2:
-        raise EstimationError(
-            report_finding("sampling.too-few-blocks", unit=f"run of {length} poses")
-        )
-    return Clusters(f"run of {length} poses", member, len(names))
+    name = f"{length}-pose run"
+    if len(names) < FEWEST_CLUSTERS:
+        raise EstimationError(report_finding("sampling.too-few-blocks", unit=name))
+    return Clusters(name, member, len(names))

@@ -128,6 +128,7 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
 
     Sizes that the residuals hardly show, because they are like a parameter of the machine, get the
     variance that the others have: g ~ N(0, tau^2) in units of the noise, tau^2 by its moments.
+    Combinations that change no row, such as an equal offset of all sessions, count as zero.
     """
     length = np.linalg.norm(effect.columns, axis=0) / np.sqrt(len(rows.residual))
     scaled = effect.columns / length
@@ -140,7 +141,7 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
     tau2 = max(excess, noise) / float((s[seen] ** 2).sum())
     variance = 1.0 / (s**2 / noise + 1.0 / tau2)
     mean = vt.T @ (variance * s * c / noise)
-    spread = vt.T * np.sqrt(variance)
+    spread = _span_rows(scaled) @ (vt.T * np.sqrt(variance))
     back = 1.0 / length
     return EffectSizes(
         effect,
@@ -149,6 +150,13 @@ def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> Effect
         back * np.linalg.norm(spread, axis=1),
         back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back,
     )
+
+
+def _span_rows(columns: FloatArray) -> FloatArray:
+    """Return the projection (c, c) on the combinations of columns (R, c) that change a row."""
+    _, s, vt = np.linalg.svd(columns, full_matrices=False)
+    kept = vt[s > 1e-10 * s.max(initial=0.0)]
+    return kept.T @ kept
 
 
 def test_correlation(rows: ResidualRows) -> tuple[float, float]:

@@ -50,7 +50,7 @@ def read_shared_errors(
             continue
         place, stated = (*location, key), node[key]
         components = dict(list_components(kind))
-        if stated != UNKNOWN and not isinstance(stated, dict):
+        if stated != UNKNOWN and not (isinstance(stated, dict) and stated):
             example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components)
             sentence = f"{key!r} is {stated!r}; write '{key}: {UNKNOWN}', or standard deviations"
             raise file.error(f"{sentence}, as '{key}: {{{example}}}'", place)
