@@ -12,6 +12,7 @@ SMOOTH_ERROR = 15e-6
 
 NOISE = ("noise.residuals-too-large", "noise.doubtful")
 PRIOR = ("prior.tolerances", "prior.components")
+TAILS = "residuals.heavy-tailed"
 OUTLIERS = ("outliers.some", "outliers.pose", "outliers.conflict", "outliers.ambiguous")
 TIME = (
     "residuals.drift",
@@ -128,6 +129,6 @@ def list_cases() -> tuple[Case, ...]:
         ),
         *(Case(f"a batch {k} tolerances off", PRIOR, group=k, is_coarse=True) for k in (4.0, 6.0)),
         Case("5 % of the poses 20 sigma off", (*OUTLIERS, *NOISE), outliers=0.05),
-        Case("noise of Student's t, 3 degrees", (*OUTLIERS, *NOISE), degrees=3.0),
+        Case("noise of Student's t, 3 degrees", (*OUTLIERS, *NOISE, TAILS), degrees=3.0),
         Case("smooth model error of 15 um", POSE, smooth=SMOOTH_ERROR),
     )

@@ -19,7 +19,7 @@ from evidence.assumptions.cases import OUTLIERS, Case, Setup, list_cases
 from evidence.assumptions.levels import name_group
 from evidence.assumptions.simulation import Array, BoolArray, Simulation, simulate_case
 from loopcal.apply import pose_uncertainty
-from loopcal.diagnose import adjust_uncertainty, check_clusters, find_outliers
+from loopcal.diagnose import adjust_uncertainty, check_clusters, check_heavy_tails, find_outliers
 from loopcal.estimate import FitOptions, LeastSquares, identify, identify_trials
 from loopcal.findings import Severity
 from loopcal.io import load_robot
@@ -72,7 +72,9 @@ def evaluate_fit(
     fit = adjust_uncertainty(identify(robot, data, options=options), data)
     examination = None
     if is_examined and fit.converged:
-        findings = (*find_outliers(fit, data).findings, check_clusters(fit, data).finding)
+        outliers = find_outliers(fit, data)
+        tails = check_heavy_tails(fit, data, outliers.suspects)
+        findings = (*outliers.findings, *tails.findings, check_clusters(fit, data).finding)
         examination = {finding.code: finding.severity for finding in findings}
     truth = simulation.trials.truth[i][fit.free_parameters.places]
     predicted = forward(fit.robot, simulation.q)

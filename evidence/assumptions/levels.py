@@ -10,6 +10,7 @@ STATED_LEVELS = {
     "prior.components-inflated": 0.03,
     "prior.tolerances": 0.01,
     "residuals.common-errors": 0.01,
+    "residuals.heavy-tailed": 0.001,
     "residuals.model-discrepancy": 0.05,
     "residuals.patterns": 0.05,
     "residuals.perhaps-correlated": 0.001,

@@ -130,6 +130,7 @@ def test_levels_of_the_study_are_those_of_the_code():
     assert STATED_LEVELS["noise.residuals-too-large"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["residuals.perhaps-correlated"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["prior.tolerances"] == prior_conflict.LEVEL
+    assert STATED_LEVELS["residuals.heavy-tailed"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["residuals.model-discrepancy"] == model_discrepancy.LEVEL
     assert STATED_LEVELS["residuals.patterns"] == residual_patterns.LEVEL
 

@@ -28,6 +28,8 @@ from loopcal.diagnose.fit_checks.correlations import (
 from loopcal.diagnose.fit_checks.expected_errors import (
     estimate_calibration_gain as estimate_calibration_gain,
 )
+from loopcal.diagnose.fit_checks.heavy_tails import HeavyTails as HeavyTails
+from loopcal.diagnose.fit_checks.heavy_tails import check_heavy_tails as check_heavy_tails
 from loopcal.diagnose.fit_checks.held_out_rows import check_held_out_rows as check_held_out_rows
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck as OutlierCheck
 from loopcal.diagnose.fit_checks.outliers import find_outliers as find_outliers

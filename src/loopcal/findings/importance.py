@@ -47,6 +47,7 @@ IMPORTANCE = (
     "residuals.lack-of-fit",
     "residuals.repeatability-larger",
     "residuals.common-errors",
+    "residuals.heavy-tailed",
     "noise.doubtful",
     "noise.no-degrees-of-freedom",
     "noise.consistent",

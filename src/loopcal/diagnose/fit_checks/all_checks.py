@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Examine a fit in one call: outliers, lack of fit, common errors, correlations, expected gain."""
+"""Examine a fit in one call: outliers, heavy tails, lack of fit, common errors, correlations,
+expected gain.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck, check_clusters
 from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_correlated_groups
 from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimate_calibration_gain
+from loopcal.diagnose.fit_checks.heavy_tails import HeavyTails, check_heavy_tails
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit, check_lack_of_fit
 from loopcal.estimate.fit_input import check_fitted_data
@@ -27,6 +30,7 @@ class FitExamination:
     outliers : poses that do not fit the others. lack_of_fit : the test against repeated poses.
     clusters : the uncertainty that allows for common errors of a day, session or pose.
     correlated : groups of strongly correlated parameters. gain : expected errors before and after.
+    tails : the test of the other residuals for heavy tails.
     """
 
     outliers: OutlierCheck
@@ -34,6 +38,7 @@ class FitExamination:
     clusters: ClusterCheck
     correlated: tuple[CorrelatedGroup, ...]
     gain: CalibrationGain
+    tails: HeavyTails
 
     JSON_FIELDS = {  # noqa: RUF012
         "outliers": "outliers",
@@ -41,6 +46,7 @@ class FitExamination:
         "clusters": "clusters",
         "correlated": "correlated",
         "worth": "gain",
+        "heavy_tails": "tails",
         "findings": "findings",
     }
 
@@ -51,7 +57,7 @@ class FitExamination:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All findings, the most important ones first."""
-        findings = list(self.outliers.findings)
+        findings = [*self.outliers.findings, *self.tails.findings]
         if self.gain.is_worthwhile is not None:
             findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
         if self.lack_of_fit.groups:
@@ -75,10 +81,12 @@ def examine_fit(
     frame : in which expected errors are stated, see `choose_error_frame`.
     """
     check_fitted_data(fit, data)
+    outliers = find_outliers(fit, data, progress=progress)
     return FitExamination(
-        find_outliers(fit, data, progress=progress),
+        outliers,
         check_lack_of_fit(fit, data),
         check_clusters(fit, data, frame),
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data, frame),
+        check_heavy_tails(fit, data, outliers.suspects),
     )

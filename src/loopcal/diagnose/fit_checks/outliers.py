@@ -122,6 +122,12 @@ class OutlierCheck:
         return tuple(label for outlier in self.outliers for label in outlier.poses)
 
     @property
+    def suspects(self) -> tuple[str, ...]:
+        """Labels of all poses of the outliers, and of the blocks of which one does not fit."""
+        blocks = (poses for conflict in self.ambiguous for poses in conflict.poses)
+        return (*self.names, *(label for poses in blocks for label in poses))
+
+    @property
     def findings(self) -> tuple[Finding, ...]:
         """The summary, then every outlier and every conflict.
 
