@@ -263,15 +263,9 @@ def _assemble(
     linearization = weighted.linearize(fit.deviation, fit.start) if has_nuisance else None
     baseline = fit_setup_before(problem, robot, options, data, weights, fit)
     nuisance = _estimate_nuisance(weighted, linearization, robot, fit, sources, baseline)
+    noise = sources.noise
     frames = find_measured_frames(
-        weighted,
-        data,
-        fit.deviation,
-        fit.start,
-        options.prior,
-        linearization,
-        sources.noise,
-        solution,
+        weighted, data, fit.deviation, fit.start, options.prior, linearization, noise, solution
     )
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
