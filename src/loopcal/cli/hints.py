@@ -25,6 +25,7 @@ HINTS = {
     "conventions.strokes-explained": "use --allow-outside-stroke to accept them",
     "conventions.target-never-moves": "use --allow-still to accept it",
     "outliers.some": "use --drop POSE, or --loss huber",
+    "residuals.heavy-tailed": "use --loss huber",
     "files.output-exists": "use --force to replace it",
     "files.folder-in-use": "use --force to replace it",
     "files.groups-in-plan": "use --kind and the sigmas instead of --like",
