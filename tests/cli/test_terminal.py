@@ -122,3 +122,12 @@ def test_width_without_a_terminal_is_80(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     monkeypatch.setattr(sys, "__stdout__", None)
     assert terminal.width() == 80
+
+
+def test_copies_of_all_rows_have_no_hint_to_exclude_them():
+    data = {"count": 3, "total": 3, "poses": ("1", "2", "3")}
+    nothing_left, some_left = (
+        report_finding("prior.rows-reused", **data, others=others) for others in (0, 20)
+    )
+    assert hint_for(nothing_left) is None
+    assert hint_for(some_left) == "exclude poses with --drop POSE"

@@ -17,8 +17,9 @@ from importlib import import_module
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.hints import find_hint
+from loopcal.cli.hints import find_hint, is_hint_useless
 from loopcal.errors import LoopcalError, suggest_names
+from loopcal.findings import Finding
 
 SECTIONS = {
     "Describe the robot": {
@@ -152,7 +153,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         return _refuse(error.format_message())
     except LoopcalError as error:
-        return _refuse(str(error), find_hint(error.code, command))
+        found = error.args[0] if error.args else None
+        is_useless = isinstance(found, Finding) and is_hint_useless(found)
+        return _refuse(str(error), None if is_useless else find_hint(error.code, command))
     except (KeyboardInterrupt, click.exceptions.Abort):
         return _refuse("stopped before the end; no result was written.")
     except BrokenPipeError:

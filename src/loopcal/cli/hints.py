@@ -118,7 +118,7 @@ def hint_for(finding: Finding) -> str | None:
     context = click.get_current_context(silent=True)
     command = None if context is None else context.command
     hint = find_hint(finding.code, command)
-    if hint is None or _is_useless(finding):
+    if hint is None or is_hint_useless(finding):
         return None
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
@@ -128,7 +128,7 @@ def hint_for(finding: Finding) -> str | None:
     return hint
 
 
-def _is_useless(finding: Finding) -> bool:
+def is_hint_useless(finding: Finding) -> bool:
     """Return whether the hint does not help: a limb that changed is free already, or no row would
     be left.
     """
