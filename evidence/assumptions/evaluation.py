@@ -54,6 +54,11 @@ class Outcome:
     error: float
 
     @property
+    def codes(self) -> set[str]:
+        """Codes of all findings, those of the examination included."""
+        return set(self.findings) | set(self.examination or {})
+
+    @property
     def alarms(self) -> set[str]:
         """Codes of the findings that say that something may be wrong."""
         findings = self.findings | (self.examination or {})
@@ -128,7 +133,7 @@ def evaluate_case(
         "rms": float(np.sqrt(np.mean(errors**2) / np.mean(reference**2))),
         "explained": None
         if not case.explaining
-        else float(np.mean([is_explained(case, o.alarms - common) for o in outcomes])),
+        else float(np.mean([is_explained(case, o.codes - common) for o in outcomes])),
         "codes": dict(sorted(rates.items())),
         "groups": count_codes([{name_group(code) for code in o.alarms} for o in outcomes]),
         "alarms": sorted(set().union(*(o.alarms for o in outcomes))),
@@ -141,9 +146,9 @@ def count_codes(findings: Sequence[Iterable[str]]) -> dict[str, float]:
     return {code: count / len(findings) for code, count in counts.items()}
 
 
-def is_explained(case: Case, alarms: set[str]) -> bool:
-    """Return whether an alarm names the assumption that the case breaks."""
-    return any(code.startswith(case.explaining) for code in alarms)
+def is_explained(case: Case, codes: set[str]) -> bool:
+    """Return whether a finding names the assumption that the case breaks."""
+    return any(code.startswith(case.explaining) for code in codes)
 
 
 def evaluate_setup(setup: Setup, fits: int = FITS) -> dict[str, dict[str, Any]]:
