@@ -161,8 +161,9 @@ MISSED = {
         "one parameter 10.0 tolerances off",
     },
 }
-"""Cases whose requirement is not reached, with figures on the page on evidence: errors of parameters
-that these measurements hardly determine are covered by too few intervals, and rarely found.
+"""Cases whose requirement is not reached; the page on evidence has their figures. Errors of
+parameters that these measurements hardly determine are covered by too few intervals, and rarely
+found.
 """
 
 

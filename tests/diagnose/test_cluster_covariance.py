@@ -177,7 +177,8 @@ def test_the_ratio_refers_to_the_uncertainty_that_the_fit_states():
     name, ratio = after.parameter
     place = fit.names.index(name)
     growth = adjusted.standard_deviations[place] / fit.standard_deviations[place]
-    assert growth > 1.0 and ratio * growth <= before.parameter[1] * (1.0 + 1e-9)
+    assert growth > 1.0
+    assert ratio * growth <= before.parameter[1] * (1.0 + 1e-9)
 
 
 def test_the_ratio_is_one_on_average_for_independent_errors():
