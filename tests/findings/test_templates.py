@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from loopcal.findings import Quantity
+from loopcal.findings import Quantity, report_finding
 from loopcal.findings.wording import depends_on_data, fill_template, list_fields
 
 LEGS = ({"leg": "a", "error": 0.12345}, {"leg": "b", "error": 2.0})
@@ -60,3 +60,12 @@ def test_only_templates_with_conditions_or_phrases_depend_on_data():
 )
 def test_quantities_of_thousands_have_no_power_of_ten(value, text) -> None:
     assert str(Quantity(value, "mm")) == text
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1.2, "1.2 times as wide"), (1.002, "less than 0.5 % wider")]
+)
+def test_a_factor_near_one_is_not_called_1_times(factor: float, words: str) -> None:
+    sentence = str(report_finding("prior.inflation", factor=factor, parts=()))
+    assert f"tolerances {words}" in sentence
+    assert " 1 times" not in sentence

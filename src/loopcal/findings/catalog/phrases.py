@@ -194,7 +194,10 @@ def inflated_tolerances(data: Data) -> str:
     found = [fill_template(shift if p["kind"] == "shift" else wide, **p) for p in data["parts"]]
     if data["factor"] > 1.0 or not found:
         others = "the others" if found else "tolerances"
-        found.append(fill_template(others + " {factor} times as wide as stated", **data))
+        wider = " {factor} times as wide as stated"
+        if 1.0 < data["factor"] < 1.005:  # else it would read "1 times"
+            wider = " less than 0.5 % wider than stated"
+        found.append(fill_template(others + wider, **data))
     return list_names(found, len(found))
 
 
