@@ -23,7 +23,7 @@ def keep_uncertainty(fit: Identification, _: Measurements) -> Identification:
 
 
 if not hasattr(loopcal.diagnose, "adjust_uncertainty"):
-    vars(loopcal.diagnose)["adjust_uncertainty"] = keep_uncertainty
+    loopcal.diagnose.__dict__["adjust_uncertainty"] = keep_uncertainty
 
 from evidence.assumptions.cases import SETUPS, Case, list_cases  # noqa: E402
 from evidence.assumptions.evaluation import FITS, evaluate_case  # noqa: E402

@@ -243,6 +243,7 @@ def test_half_a_sigma_is_a_new_fit_with_half_the_sigma(source):
         )
         other = replace(finer, reading_sigma=data.reading_sigma)
     elif source == "readings":
+        assert data.reading_sigma is not None
         other = replace(data, reading_sigma=0.5 * data.reading_sigma)
     else:
         other = with_stated_targets(data, 10 * UM)

@@ -61,7 +61,9 @@ def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(
     assert in_mm
     meters = [*head[:-1], head[-1].replace("[mm]", "[m]")]
     old, new, third = rows[:20], rows[20:30], rows[30:]
-    write("old.csv", old), write("new.csv", new), write("third.csv", third)
+    write("old.csv", old)
+    write("new.csv", new)
+    write("third.csv", third)
     copies = {
         "blank.csv": ["", *old],
         "order.csv": old[::-1],

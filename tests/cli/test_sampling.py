@@ -124,7 +124,7 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, cap
         (["sample", "DATA"], "give a run folder, or the files of measurements after"),
     ],
 )
-def test_wrong_use_is_refused_in_one_sentence(folder, capsys, words, text) -> None:
+def test_wrong_use_is_refused_in_one_sentence(folder, capsys, words: list[str], text) -> None:
     names = {"RUN": str(folder / "run"), "DATA": str(folder / "measurements.csv")}
     assert main([names.get(word, word) for word in words]) == 1
     out, err = capsys.readouterr()

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -237,7 +238,8 @@ def test_a_run_folder_keeps_the_discrepancy(tmp_path):
     from loopcal.estimate.inference.posterior import posterior_from_arrays
 
     _, adjusted, _ = bent_fit()
-    np.savez(tmp_path / "arrays.npz", **adjusted.arrays())
+    arrays: dict[str, Any] = {**adjusted.arrays()}
+    np.savez(tmp_path / "arrays.npz", **arrays)
     with np.load(tmp_path / "arrays.npz") as stored:
         read = posterior_from_arrays(adjusted.robot, dict(stored))
     poses = sample_workspace(adjusted.robot, 20, 4).solution

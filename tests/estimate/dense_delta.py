@@ -6,6 +6,7 @@ intersection of three spheres. Derivatives are complex steps.
 """
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -76,7 +77,7 @@ def fit_delta(readings, measured, sigma, penalty=0.0):
         return np.vstack([D.reshape(-1, 9) / sigma, np.sqrt(penalty) * np.eye(9)])
 
     result = least_squares(
-        residual, np.zeros(9), slope, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12
+        residual, np.zeros(9), cast(Any, slope), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     m = measured.size
     return DenseFit(NOMINAL + TOLERANCE * result.x, -result.fun[:m], slope(result.x)[:m])

@@ -4,6 +4,7 @@ ending.
 """
 
 from functools import lru_cache
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -253,7 +254,7 @@ def test_one_wire_with_an_unknown_anchor_converges_by_least_squares():
     found = least_squares(
         lambda z: evaluate(tuple(z))[:, -1],
         np.zeros(p),
-        lambda z: evaluate(tuple(z))[:, :-1],
+        cast(Any, lambda z: evaluate(tuple(z))[:, :-1]),
         method="trf",
         ftol=1e-6,
     )

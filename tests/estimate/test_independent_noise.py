@@ -128,7 +128,9 @@ def test_change_of_a_machine_is_tested_with_the_noise_of_both_calibrations():
         # what unmoved machines with unknown noise give
         draws = 20_000
         roots = [np.linalg.cholesky(C) for C in covariances]
-        moved = sum(rng.standard_normal((draws, 9)) @ root.T for root in roots)
+        moved = sum(
+            (rng.standard_normal((draws, 9)) @ root.T for root in roots), np.zeros((draws, 9))
+        )
         shown = [rng.chisquare(dof, draws) / dof for _, dof in noises]
         P = sum(s[:, None, None] * C for s, C in zip(shown, covariances, strict=True))
         solved = np.linalg.solve(P, moved[..., None])[..., 0]

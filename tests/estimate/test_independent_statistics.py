@@ -56,6 +56,7 @@ def test_estimate_and_covariance_agree_with_dense_least_squares(penalty):
 def test_most_probable_factor_on_the_tolerances_maximizes_the_density_of_the_data(tolerance):
     for data in measure(Case("", tolerance=tolerance, is_coarse=True), 2).measurements:
         fit = identify(ROBOT, data, MAP(InflatedTolerances(by="global")))
+        assert fit.prior_conflict is not None
         factor = fit.prior_conflict.inflation
         dense = fit_densely(data, COARSE, 1.0 / factor**2)
         identity = np.eye(len(dense.b))
@@ -78,6 +79,7 @@ def test_prior_predictive_tests_agree_with_draws_from_the_prior(off):
     fit = identify(ROBOT, data, MAP())
     dense = fit_densely(data, COARSE, 1.0)
     conflict = fit.prior_conflict
+    assert conflict is not None
     draws = 40_000
     rng = np.random.default_rng(1)
     A, p = dense.A, 9
@@ -117,7 +119,9 @@ def test_correlation_of_neighbors_agrees_with_draws_of_independent_errors(correl
 
     draws = correlate(np.random.default_rng(2).standard_normal((20_000, 3 * n)))
     observed = correlate(dense.b[None])[0]
-    excess, p_value = measure_correlation(collect_residual_rows(fit, data))
+    rows = collect_residual_rows(fit, data)
+    assert rows is not None
+    excess, p_value = measure_correlation(rows)
     tail = float((draws >= observed).mean())
     assert excess == pytest.approx(observed - draws.mean(), abs=5e-3)
     assert p_value == pytest.approx(tail, abs=4.0 * np.sqrt(tail * (1.0 - tail) / 2e4) + 2e-3)
@@ -128,6 +132,7 @@ def test_covariance_by_correlated_errors_agrees_with_dense_generalized_least_squ
     data = measure(Case("", correlation=0.6)).measurements[0]
     fit = identify(ROBOT, data, LeastSquares())
     rows = collect_residual_rows(fit, data)
+    assert rows is not None
     errors = estimate_correlated_errors(rows, 8.0)
     dense, n = fit_densely(data, FINE), len(data.readings)
     A, b = dense.A, dense.b

@@ -12,7 +12,7 @@ from tests.findings.expectations import list_codes
 
 def fit_lines(loss, A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return estimates (t, p) by reweighting single rows b (t, n), and the weights (t, n)."""
-    weight = np.ones(b.shape)
+    weight, z = np.ones(b.shape), np.zeros((len(b), A.shape[1]))
     for _ in range(20):
         M = np.einsum("np,tn,nq->tpq", A, weight, A, optimize=True)
         z = np.linalg.solve(M, np.einsum("np,tn->tp", A, weight * b)[..., None])[..., 0]

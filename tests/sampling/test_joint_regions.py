@@ -2,6 +2,7 @@
 """Joint regions and simultaneous intervals against scipy, and against draws from the covariance."""
 
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def test_the_simulated_maximum_equals_the_normal_probability_of_the_box(fit) -> 
     found = lc.compute_simultaneous_intervals(fit, NAMES, 0.95)
     region = lc.compute_joint_region(fit, NAMES)
     k = found.factor[0]
-    box = multivariate_normal(np.zeros(3), region.correlation)
+    box = multivariate_normal(np.zeros(3), cast(Any, region.correlation))
     inside = box.cdf(np.full(3, k), lower_limit=np.full(3, -k))
     assert inside == pytest.approx(0.95, abs=0.003)
     again = lc.compute_simultaneous_intervals(fit, NAMES, 0.95)
@@ -104,7 +105,7 @@ def test_names_are_patterns_and_unknown_ones_are_refused(fit) -> None:
     with pytest.raises(EstimationError, match="between 0 and 1"):
         lc.compute_joint_region(fit, NAMES, 95)
     with pytest.raises(EstimationError, match="must be one of maximum"):
-        lc.compute_simultaneous_intervals(fit, NAMES, rule="tukey")
+        lc.compute_simultaneous_intervals(fit, NAMES, rule="tukey")  # pyright: ignore[reportArgumentType]
 
 
 def test_what_the_data_do_not_determine_has_no_region() -> None:

@@ -242,7 +242,8 @@ def _covariance(
         covariance[pose, component, component] = np.inf
     covariance[~solution.converged] = np.nan
     squares = [] if slow is None else slow.split_squares(by_discrepancy)
-    return covariance, *_count_degrees(posterior, covariance, D, of_frame, squares)
+    degrees = _count_degrees(posterior, covariance, D, of_frame, squares)
+    return covariance, degrees.components, degrees.position, degrees.orientation
 
 
 def _count_degrees(

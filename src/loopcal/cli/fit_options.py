@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -13,6 +13,7 @@ from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.estimate import FitOptions
+    from loopcal.estimate.methods.inflated_tolerances import By
 
 METHODS = ("auto", "map", "ls", "ridge", "tsvd")
 INFLATIONS = ("auto", "global", "groups", "heavy-tailed", "none")
@@ -85,7 +86,7 @@ fit_options = add_options(
 """Decorator of a command that fits; `make_fit_options` takes their values."""
 
 
-def _make_default(inflation: str) -> Any:
+def _make_default(inflation: By | Literal["none"]) -> Any:
     """Return the default method, None, or MAP with another choice of what is inflated."""
     from loopcal.estimate import MAP, InflatedTolerances
 

@@ -95,7 +95,7 @@ def _read_options(run: Run) -> dict[str, Any]:
     """Return the options of the command `calibrate` that made a run; none for a run of Python."""
     from loopcal.cli.calibration_commands import calibrate
 
-    words = list((run.result.get("made_by") or {}).get("command") or ())
+    words: list[str] = list((run.result.get("made_by") or {}).get("command") or ())
     if "calibrate" not in words:
         return {}
     given = words[words.index("calibrate") + 1 :]

@@ -85,6 +85,16 @@ def report_weights(data: Measurements, weights: FloatArray, loss: Loss | None) -
     ]
 
 
+def report_used_poses(
+    data: Measurements, weights: FloatArray, loss: Loss | None, excluded: tuple[str, ...]
+) -> list[Finding]:
+    """Return which poses the loss gives little weight, and which ones the options exclude."""
+    findings = report_weights(data, weights, loss)
+    return (
+        [*findings, report_finding("fit.excluded-poses", poses=excluded)] if excluded else findings
+    )
+
+
 def report_equations(equations: int, parameters: int, method: Method) -> list[Finding]:
     """Return how many directions are known from tolerances alone."""
     if equations >= parameters or not isinstance(method, MAP):

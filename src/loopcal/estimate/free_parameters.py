@@ -82,15 +82,16 @@ class FreeParameters:
 
     def correlation_root(self) -> FloatArray:
         """Return the Cholesky factor (p, p) of the correlation of the deviations z."""
-        return (
-            np.eye(len(self)) if self.correlation is None else np.linalg.cholesky(self.correlation)
-        )
+        if self.correlation is None:
+            return np.eye(len(self))
+        return np.asarray(np.linalg.cholesky(self.correlation), dtype=np.float64)
 
     def prior_rows(self) -> FloatArray:
         """Return independent rows (k, p) of unit variance by deviations z, that the stated
         tolerances amount to: the inverse of the Cholesky factor.
         """
-        return np.asarray(np.linalg.inv(self.correlation_root())[~self.assumed])
+        inverse = np.asarray(np.linalg.inv(self.correlation_root()), dtype=np.float64)
+        return inverse[~self.assumed]
 
     def display(self) -> tuple[FloatArray, tuple[str, ...]]:
         """Return the factor to SI (p,) and the symbol of the unit in which each one is shown: that

@@ -15,7 +15,7 @@ from loopcal.estimate.fit_findings import (
     report_divergence,
     report_equations,
     report_unknown_bias,
-    report_weights,
+    report_used_poses,
 )
 from loopcal.estimate.fit_input import (
     check_count,
@@ -69,7 +69,7 @@ from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_t
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
@@ -249,9 +249,7 @@ def _assemble(
     problem: Problem,
     weighted: Problem,
 ) -> Identification:
-    """Return the result; the weighted problem is linearized once more where it has nuisance
-    parameters.
-    """
+    """Return the result of a fit with all diagnostics."""
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
     d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
     test, sources = _test_noise(free, fit, options, data)
@@ -259,8 +257,7 @@ def _assemble(
     conflict, on_prior = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
-    has_nuisance = weighted.nuisance is not None
-    linearization = weighted.linearize(fit.deviation, fit.start) if has_nuisance else None
+    linearization = _linearize_nuisance(weighted, fit)
     baseline = fit_setup_before(problem, robot, options, data, weights, fit)
     nuisance = _estimate_nuisance(weighted, linearization, robot, fit, sources, baseline)
     noise = sources.noise
@@ -285,8 +282,7 @@ def _assemble(
         *([] if regularization is None else [regularization.finding]),
         *report_unknown_bias(free, method, sources.prior),
         *report_equations(int(problem.equations[0]), problem.parameters, method),
-        *report_weights(data, weights, options.loss),
-        *_report_excluded(excluded),
+        *report_used_poses(data, weights, options.loss, excluded),
         *_report_poses(problem, corrected, poses),
     ]
     return Identification(
@@ -333,6 +329,11 @@ def _record_history(free: FreeParameters, fit: Descent) -> History:
     return History(status, steps, fit.cost_history[:, 0], values)
 
 
+def _linearize_nuisance(weighted: Problem, fit: Descent) -> Linearization | None:
+    """Return the rows linearized once more at the estimate; None without nuisance parameters."""
+    return None if weighted.nuisance is None else weighted.linearize(fit.deviation, fit.start)
+
+
 def _estimate_nuisance(
     problem: Problem,
     linearization: Linearization | None,
@@ -354,11 +355,6 @@ def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:
     """Return why the fit did not begin with the closure, where the options ask for it."""
     unused = report_unused_closure(problem) if options.begin == "closure" else None
     return [] if unused is None else [unused]
-
-
-def _report_excluded(excluded: tuple[str, ...]) -> list[Finding]:
-    """Return which poses the options exclude."""
-    return [report_finding("fit.excluded-poses", poses=excluded)] if excluded else []
 
 
 def _report_poses(

@@ -102,8 +102,9 @@ def _list_row(line: Mapping[str, Any], worst: str, units: Sequence[Any]) -> list
         values.append(line["parameters"][worst])
         left.append(None if halved is None else halved["worst_parameter_sd"])
     degrees = line["degrees"]
+    kind: str = line["kind"]
     return [
-        WORDS.get(line["kind"], line["kind"]).format(name=line["name"]),
+        WORDS.get(kind, kind).format(name=line["name"]),
         line["evaluation"],
         ABSENT if degrees is None else format_number(degrees, 3),
         *(_show(None if v is None else np.sqrt(v), u) for v, u in zip(values, units, strict=False)),

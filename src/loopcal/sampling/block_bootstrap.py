@@ -34,7 +34,7 @@ from loopcal.sampling.block_errors import compute_block_errors
 from loopcal.sampling.block_scatter import BlockScatter, describe_scatter
 from loopcal.sampling.blocks import choose_blocks
 from loopcal.sampling.intervals import Intervals, compare_ends, half_widths, report_intervals
-from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 Scheme = Literal["wild", "pairs", "normal"]
 """How resamples are drawn."""
@@ -341,7 +341,7 @@ class _Draw:
         mean = fit.nuisance.estimate if is_recentered else table.nominal
         return center, prior, mean + sd * rng.standard_normal((count, len(sd)))
 
-    def _count_rows(self) -> FloatArray:
+    def _count_rows(self) -> IntArray:
         """Return the number (G,) of present residuals of each block."""
         total = np.zeros(self.blocks.count, dtype=np.int64)
         for rows in self.linear.problem.rows:

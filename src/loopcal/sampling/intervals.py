@@ -151,7 +151,7 @@ def half_widths(level: float, degrees: FloatArray | float = np.inf) -> FloatArra
 def report_intervals(intervals: Intervals, agrees: str, differs: str) -> list[Finding]:
     """Return whether linear intervals hold, with the codes for yes and no."""
     off, size = np.flatnonzero(intervals.is_off), intervals.largest_shift
-    share = {"limit": OFF, "level": intervals.level}
+    share: dict[str, Any] = {"limit": OFF, "level": intervals.level}
     if not len(off):
         return [report_finding(agrees, **share, count=len(intervals.names))]
     order = off[np.argsort(-size[off])]

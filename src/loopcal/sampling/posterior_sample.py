@@ -268,5 +268,6 @@ class _Proposal:
             weight = normalize_weights(power * log_weight)
         mean = weight @ v
         spread = (v - mean) * np.sqrt(weight)[:, None]
-        triangle = np.linalg.qr(np.concatenate([spread, 0.1 * np.eye(size)]), mode="r")
+        rows = np.concatenate([spread, 0.1 * np.eye(size)])
+        triangle = np.asarray(np.linalg.qr(rows, mode="r"))
         return _Proposal(mean, triangle.T, self.degrees)

@@ -8,7 +8,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError
-from loopcal.measure import KINDS, Gaussian, Observations, Sensor, collect_nuisance_parameters
+from loopcal.measure import (
+    KINDS,
+    Component,
+    Distance,
+    Gaussian,
+    Observations,
+    Pose,
+    Sensor,
+    collect_nuisance_parameters,
+)
 from loopcal.measure.kinds.shared_errors import measure_progress
 from tests.measure.kinds.test_contract import (
     attach_frame_and_tool,
@@ -50,7 +59,7 @@ def test_what_is_measured_with_a_bias_has_no_residual_and_right_derivatives(kind
 
 def test_only_known_setup_items_are_allowed_and_the_message_names_the_errors():
     with pytest.raises(DataError, match="bias, drift"):
-        KINDS["pose"](unknown=("offset",))
+        Pose(unknown=("offset",))
 
 
 def test_progress_is_that_in_time_within_each_session():
@@ -65,7 +74,7 @@ def test_progress_is_that_in_time_within_each_session():
 
 
 def test_rows_take_their_part_of_a_drift():
-    kind = KINDS["component"](("x", "z"), unknown=("bias", "drift")).with_tool(np.eye(4))
+    kind = Component(("x", "z"), unknown=("bias", "drift")).with_tool(np.eye(4))
     rows = Observations.from_sigma(kind, np.arange(3), np.zeros((3, 2)), 1e-6, session="s")
     setup = collect_nuisance_parameters([rows], ("1", "2", "3"))
     assert setup.table.names == tuple(
@@ -73,15 +82,17 @@ def test_rows_take_their_part_of_a_drift():
     )
     used = setup.select(0, np.array([[1.0, 2.0, 10.0, 20.0]]))
     assert_allclose(used[0], [[1, 2, -5, -10], [1, 2, 0, 0], [1, 2, 5, 10]])
-    sensor = Sensor(kind, Gaussian(np.full(2, 1e-6)), np.arange(3), session="s").assign_rows(3)
-    assert_allclose(
-        collect_nuisance_parameters([sensor], ("1", "2", "3")).factors[0], used[0] / [1, 2, 10, 20]
-    )
+    sensor = Sensor(
+        kind, Gaussian(np.full(2, 1e-6)), np.arange(3), session=np.array("s")
+    ).assign_rows(3)
+    factors = collect_nuisance_parameters([sensor], ("1", "2", "3")).factors[0]
+    assert factors is not None
+    assert_allclose(factors, used[0] / [1, 2, 10, 20])
 
 
 def test_two_instruments_have_errors_of_their_own():
     wires = [
-        KINDS["distance"](anchor=np.ones(3), anchor_name=name, unknown=("bias",))
+        Distance(anchor=np.ones(3), anchor_name=name, unknown=("bias",))
         for name in ("wire1", "wire2")
     ]
     names = [p.name for kind in wires for p in kind.nuisance_parameters]

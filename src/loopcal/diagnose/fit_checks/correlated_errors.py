@@ -124,6 +124,6 @@ def _evaluate(
         white.append(np.linalg.solve(L, columns[members]).reshape(count * n, q + 1))
         part = np.matmul(L.T, rows.gain[members]).reshape(count * n, k)
         spread += part.T @ part
-    R = np.linalg.qr(np.concatenate(white), mode="r")
+    R = np.asarray(np.linalg.qr(np.concatenate(white), mode="r"))
     log_det += 2.0 * float(np.log(np.abs(np.diag(R)[:q])).sum())
     return log_det, float(R[-1, -1] ** 2), spread

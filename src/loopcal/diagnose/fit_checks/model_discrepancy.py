@@ -232,7 +232,7 @@ def project_slow_errors(
     factor = extended.factor[0]
     p = len(used)
     columns = np.concatenate([factor[:, :p] @ to_z, factor[:, p:]], axis=1)
-    R = np.linalg.qr(np.concatenate([columns, prior[penalty > 0.0]]), mode="r")
+    R = np.asarray(np.linalg.qr(np.concatenate([columns, prior[penalty > 0.0]]), mode="r"))
     degrees = int(extended.equations[0] + (penalty > 0.0).sum()) - k
     if degrees < FEWEST_DEGREES:
         return None

@@ -66,6 +66,7 @@ def add_to_posterior(posterior: Posterior, part: CovariancePart) -> Posterior:
     is_finite = np.isfinite(variance)
     first, second = is_finite & posterior.determined, is_finite & ~posterior.determined
     added = np.linalg.solve(posterior.directions, part.root / posterior.unit[:, None])
+    added = np.asarray(added, dtype=np.float64)
     spread = np.concatenate([np.diag(np.sqrt(np.where(is_finite, variance, 0.0))), added], axis=1)
     directions, variance = posterior.directions.copy(), variance.copy()
     turned, squares, towards = _diagonalize(spread[first])

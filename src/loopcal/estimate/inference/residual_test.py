@@ -18,6 +18,7 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -126,7 +127,7 @@ class ResidualTest:
         """The result where the noise is estimated."""
         if not self.intervals:
             return report_finding("noise.not-estimated")
-        data = {"scale": self.sigma_scale, "dof": self.noise_degrees}
+        data: dict[str, Any] = {"scale": self.sigma_scale, "dof": self.noise_degrees}
         if self.noise_degrees < FEWEST_DEGREES:
             factor = coverage_factor(self.noise_degrees)
             return report_finding("noise.few-degrees", factor=float(factor), **data)

@@ -284,7 +284,7 @@ class MAP(Method):
         """Return the factor (t,) on all tolerances."""
         rule = self.inflation
         if not callable(rule):
-            return np.full(len(decomposition.rows), rule)
+            return np.full(len(decomposition.rows), rule, dtype=np.float64)
         return np.asarray(rule(decomposition.divided(self.sigma(decomposition))))
 
     def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:

@@ -185,6 +185,10 @@ class _MeasuredPoses:
         del point, candidate
         return np.ones(len(step.T), dtype=bool), np.ones(len(step.T))
 
+    def objective(self, point: _Point) -> FloatArray:
+        """Return the cost of the points, which full steps do not look at."""
+        return point.cost
+
     def ending(
         self, point: _Point, step: _FullStep, candidate: _Point, accepted: BoolArray
     ) -> IntArray:

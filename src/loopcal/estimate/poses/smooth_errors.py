@@ -138,7 +138,7 @@ def describe_smooth_errors(
     x = (x - origin) / scale
     centers = x[_spread(x, most)]
     triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
-    whitening = np.asarray(np.linalg.inv(triangle).T)
+    whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
     return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.ones(6))
 
 

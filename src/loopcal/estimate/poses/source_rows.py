@@ -125,9 +125,13 @@ def _stack(
 
 def _mask(kind: KindRows, kept: BoolArray) -> KindRows:
     """Return the rows of a kind with zeros for those that are not kept."""
+
+    def mask(array: FloatArray) -> FloatArray:
+        return array * kept.reshape(-1, *[1] * (array.ndim - 2))
+
     return KindRows(
-        *(
-            None if array is None else array * kept.reshape(-1, *[1] * (array.ndim - 2))
-            for array in kind
-        )
+        mask(kind.residual),
+        mask(kind.by_parameters),
+        None if kind.by_nuisance is None else mask(kind.by_nuisance),
+        None if kind.by_coordinates is None else mask(kind.by_coordinates),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import MISSING, fields
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,9 +13,8 @@ import numpy as np
 def list_changed_settings(kind: Any) -> Iterator[str]:
     """Give `name=value` of each setting of a kind (a dataclass) that differs from its default."""
     for setting in fields(kind):
-        value, usual = getattr(kind, setting.name), setting.default
-        if setting.default_factory is not MISSING:
-            usual = setting.default_factory()
+        value, factory = getattr(kind, setting.name), setting.default_factory
+        usual = cast(Any, setting.default) if factory is MISSING else factory()
         if setting.init and not np.array_equal(value, usual):
             text = repr(value)
             if isinstance(value, np.ndarray):
