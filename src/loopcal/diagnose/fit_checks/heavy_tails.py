@@ -158,7 +158,8 @@ def _belong_to(rows: ResidualRows, data: Measurements, labels: Sequence[str]) ->
     result = np.zeros(len(rows.residual), dtype=bool)
     for number, o in enumerate(o for o in data.observations if len(o)):
         own = rows.kind == number
-        result[own] = is_named[o.rows].reshape(len(o), -1).any(axis=1)[rows.row[own]]
+        is_held = np.asarray(is_named[o.rows].reshape(len(o), -1).any(axis=1))
+        result[own] = is_held[rows.row[own]]
     return result
 
 

@@ -284,8 +284,8 @@ class MAP(Method):
         """Return the factor (t,) on all tolerances."""
         rule = self.inflation
         if not callable(rule):
-            return np.full(len(decomposition.rows), rule, dtype=np.float64)
-        return np.asarray(rule(decomposition.divided(self.sigma(decomposition))))
+            return np.full(len(decomposition.rows), rule)
+        return np.asarray(rule(decomposition.divided(self.sigma(decomposition))), dtype=np.float64)
 
     def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
         """Return the factor (t,) on all tolerances that the penalty (t, p) of a fit contains; 1
