@@ -194,10 +194,9 @@ def inflated_tolerances(data: Data) -> str:
     found = [fill_template(shift if p["kind"] == "shift" else wide, **p) for p in data["parts"]]
     if data["factor"] > 1.0 or not found:
         others = "the others" if found else "tolerances"
-        wider = " {factor} times as wide as stated"
-        if 1.0 < data["factor"] < 1.005:  # else it would read "1 times"
-            wider = " less than 0.5 % wider than stated"
-        found.append(fill_template(others + wider, **data))
+        is_near_one = 1.0 < data["factor"] < 1.005  # it would read "1 times"
+        wider = "less than 0.5 % wider than" if is_near_one else "{factor} times as wide as"
+        found.append(fill_template(f"{others} {wider} stated", **data))
     return list_names(found, len(found))
 
 
@@ -370,9 +369,8 @@ def violations(data: Data) -> str:
     words = []
     for reason in data["reasons"][:SHOWN_REASONS]:
         place = "no straight path from home: " if reason["on_path"] else ""
-        words.append(
-            f"{place}{fill_template(CONSTRAINTS[reason['code']], **reason)} ({reason['count']})"
-        )
+        violated = fill_template(CONSTRAINTS[reason["code"]], **reason)
+        words.append(f"{place}{violated} ({reason['count']})")
     return "; ".join([*words, *(["..."] if len(data["reasons"]) > SHOWN_REASONS else [])])
 
 
