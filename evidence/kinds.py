@@ -357,7 +357,8 @@ def _setup_covered(
         # other tests cover the start values
         at = alone.linearize(z, alone.start(z, seek=False).with_nuisance(truth[None]))
         d, penalty = found.decomposition.take(one), found.penalty[one]
-        local = estimate_nuisance(problem.nuisance, at, free.robot, d, penalty, 1.0)
+        variance = d.variances(penalty)[0]
+        local = estimate_nuisance(problem.nuisance, at, free.robot, d, variance, 1.0)
         off = local.estimate - truth
         inside.append((np.abs(off) <= NORMAL_95 * local.sd)[np.isfinite(local.sd)])
     return np.concatenate(inside)
