@@ -14,7 +14,7 @@ from evidence.assumptions.levels import STATED_LEVELS, name_group
 from evidence.assumptions.simulation import BrokenNoise, simulate_case
 from loopcal import load_robot
 from loopcal.diagnose import find_outliers
-from loopcal.diagnose.fit_checks import model_discrepancy, residual_patterns
+from loopcal.diagnose.fit_checks import residual_patterns
 from loopcal.estimate.inference import residual_test
 from loopcal.estimate.methods import prior_conflict
 
@@ -131,7 +131,7 @@ def test_levels_of_the_study_are_those_of_the_code():
     assert STATED_LEVELS["residuals.perhaps-correlated"] == residual_test.SIGNIFICANCE
     assert STATED_LEVELS["prior.tolerances"] == prior_conflict.LEVEL
     assert STATED_LEVELS["residuals.heavy-tailed"] == residual_test.SIGNIFICANCE
-    assert STATED_LEVELS["residuals.model-discrepancy"] == model_discrepancy.LEVEL
+    assert STATED_LEVELS["residuals.model-discrepancy"] == residual_patterns.LEVEL
     assert STATED_LEVELS["residuals.patterns"] == residual_patterns.LEVEL
 
 

@@ -13,7 +13,8 @@ from loopcal import geometry
 from loopcal.apply import pose_uncertainty
 from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.fit_checks.held_out_rows import Predictor
-from loopcal.diagnose.fit_checks.model_discrepancy import LEVEL, add_model_discrepancy
+from loopcal.diagnose.fit_checks.model_discrepancy import add_model_discrepancy
+from loopcal.diagnose.fit_checks.residual_patterns import LEVEL
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY

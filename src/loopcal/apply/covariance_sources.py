@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit, linearize_rows_of
+from loopcal.estimate.inference.covariance_parts import NOISE, CovariancePart
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
-from loopcal.estimate.inference.posterior import NOISE, CovariancePart
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.poses.source_rows import fold_sources
 from loopcal.estimate.problem import Problem

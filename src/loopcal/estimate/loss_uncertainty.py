@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.estimate.inference.added_covariance import add_covariance
-from loopcal.estimate.inference.posterior import NOISE
+from loopcal.estimate.inference.covariance_parts import NOISE
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.minimization.descent import Descent

@@ -19,7 +19,8 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import DataError, EstimationError, suggest_names
-from loopcal.estimate.inference.posterior import NOISE, CovariancePart, Posterior
+from loopcal.estimate.inference.covariance_parts import NOISE, CovariancePart
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.problem import Problem
 from loopcal.findings import Finding, report_finding
