@@ -6,6 +6,7 @@ from __future__ import annotations
 STATED_LEVELS = {
     "noise.doubtful": 0.01,
     "noise.residuals-too-large": 0.001,
+    "noise.residuals-too-small": 0.001,
     "outliers": 0.05,
     "prior.components-inflated": 0.03,
     "prior.tolerances": 0.01,
