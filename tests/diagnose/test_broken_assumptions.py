@@ -149,7 +149,14 @@ MISSED = {
     "linear-delta": {
         "clean, least squares",  # 96.5 % of parameters, a little too many: 95 +/- 1.5 % is demanded
         "a batch 4.0 tolerances off",
-    }
+    },
+    "five-bar": {
+        "errors 1.7 times the tolerances",
+        "errors 3.0 times the tolerances",
+        "one parameter 5.0 tolerances off",
+        "a batch 4.0 tolerances off",
+        "a batch 6.0 tolerances off",
+    },
 }
 """Cases whose requirement is not reached, of robots whose 400 fits were examined; the page on
 evidence has their figures. Errors of parameters that these measurements hardly determine are
@@ -157,9 +164,7 @@ covered by too few intervals, and rarely found.
 """
 
 MOST_MISSED = 10
-"""The same as a number, for the other robots: runs of 25 to 100 fits missed 5 (five-bar) and 6
-(hexapod) of 25 cases, all of tolerances that are too narrow or of few degrees of freedom.
-"""
+"""The same as a number, for the hexapod: runs of 25 to 100 fits missed 6 of 25 cases."""
 
 
 @pytest.mark.evidence

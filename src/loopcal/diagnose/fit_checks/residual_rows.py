@@ -76,9 +76,16 @@ class ResidualRows:
 
 def span_columns(columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one."""
+    from scipy.linalg import svd
+
     length = np.linalg.norm(columns, axis=0)
     scaled = columns[:, length > 0.0] / length[length > 0.0]
-    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    if not scaled.size:
+        return scaled
+    # the triangle first: the divide-and-conquer driver may fail on many rows, this one does not
+    Q, R = np.linalg.qr(scaled)
+    inner, s, _ = svd(R, full_matrices=False, lapack_driver="gesvd")
+    u = Q @ inner
     return np.asarray(u[:, s > EXPLAINED])
 
 
