@@ -17,6 +17,7 @@ from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_c
 from loopcal.diagnose.fit_checks.residual_patterns import FALSE_ALARMS
 from loopcal.diagnose.fit_checks.residual_rows import collect_residual_rows
 from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.findings import Severity
 from loopcal.mechanism import differentiate_pose, forward, sample_workspace
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
@@ -83,7 +84,8 @@ def test_poses_are_covered_where_the_instrument_drifts():
 def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
     errors = draw_errors(14, 3, 3, 0.7)
     _, data = measure("linear-delta", "component", errors, 3)
-    rows = collect_residual_rows(identify(ROBOTS["linear-delta"], data), data)
+    fit = identify(ROBOTS["linear-delta"], data)
+    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
     assert rows is not None
     result = estimate_correlated_errors(rows, 8.0)
     # the likelihood of the rows A r that no parameter changes, A from the full QR of the basis
@@ -105,12 +107,13 @@ def test_the_covariance_is_that_of_a_dense_restricted_likelihood():
 
 def test_exact_sigmas_are_the_limit_of_many_degrees_of_freedom():
     _, data = measure("linear-delta", "component", draw_errors(14, 3, 3, 0.7), 3)
-    rows = collect_residual_rows(identify(ROBOTS["linear-delta"], data), data)
+    fit = identify(ROBOTS["linear-delta"], data)
+    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
     assert rows is not None
     exact = estimate_correlated_errors(rows, np.inf)
     limit = estimate_correlated_errors(rows, 1e8)
     assert np.allclose(exact.covariance, limit.covariance, rtol=1e-5, atol=0.0)
-    assert exact.sigma == 1.0
+    assert np.isclose(exact.sigma, 1.0, rtol=1e-12)  # a weighted mean of ones
     assert exact.degrees == pytest.approx(limit.degrees, rel=1e-5)
 
 

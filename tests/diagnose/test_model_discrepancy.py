@@ -13,9 +13,10 @@ from loopcal import geometry
 from loopcal.apply import pose_uncertainty
 from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.fit_checks.held_out_rows import Predictor
-from loopcal.diagnose.fit_checks.model_discrepancy import add_model_discrepancy
+from loopcal.diagnose.fit_checks.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.fit_checks.residual_patterns import LEVEL
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.measure import (
@@ -128,6 +129,12 @@ def test_a_wrong_sigma_is_no_discrepancy():
         for data in (measure(delta(), 30, seed, 2.0) for seed in range(16))
     ]
     assert np.mean(found) <= LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 16)
+
+
+def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
+    """Return a fit whose uncertainty includes the slow errors that its residuals show."""
+    slow = find_slow_errors(fit, data, linearize_fit(fit, data))
+    return fit if slow is None else add_slow_errors(fit, slow)
 
 
 @cache

@@ -16,13 +16,15 @@ from loopcal.diagnose.fit_checks.residual_patterns import test_correlation as co
 from loopcal.diagnose.fit_checks.residual_patterns import test_effect as compute_tail
 from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.estimate import LeastSquares, Ridge, identify
+from loopcal.estimate.fit_linearization import linearize_fit
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
 
 def collect(robot, kind, errors, seed, method=None, **context):
     """Return the residual rows of a fit, and its data."""
     _, data = measure(robot, kind, errors, seed, **context)
-    rows = collect_residual_rows(identify(ROBOTS[robot], data, method), data)
+    fit = identify(ROBOTS[robot], data, method)
+    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
     assert rows is not None
     return rows, data
 
@@ -149,7 +151,8 @@ def test_rows_that_are_absent_are_left_out():
     measured = np.array(rows.measured)
     measured[3, 1] = measured[7] = np.nan
     holes = replace(data, observations=(replace(rows, measured=measured),))
-    collected = collect_residual_rows(identify(ROBOTS["linear-delta"], holes), holes)
+    fit = identify(ROBOTS["linear-delta"], holes)
+    collected = collect_residual_rows(fit, holes, linearize_fit(fit, holes))
     assert collected is not None
     assert len(collected.residual) == 60 - 4
     assert np.isfinite(compute_correlation(collected)[1])

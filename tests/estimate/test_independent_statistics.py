@@ -13,6 +13,7 @@ from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_c
 from loopcal.diagnose.fit_checks.residual_patterns import test_correlation as measure_correlation
 from loopcal.diagnose.fit_checks.residual_rows import collect_residual_rows
 from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.mechanism import forward
 from tests.estimate.dense_delta import NOMINAL, TOLERANCE, fit_delta, locate_nozzle
 
@@ -119,7 +120,7 @@ def test_correlation_of_neighbors_agrees_with_draws_of_independent_errors(correl
 
     draws = correlate(np.random.default_rng(2).standard_normal((20_000, 3 * n)))
     observed = correlate(dense.b[None])[0]
-    rows = collect_residual_rows(fit, data)
+    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
     assert rows is not None
     excess, p_value = measure_correlation(rows)
     tail = float((draws >= observed).mean())
@@ -131,7 +132,7 @@ def test_correlation_of_neighbors_agrees_with_draws_of_independent_errors(correl
 def test_covariance_by_correlated_errors_agrees_with_dense_generalized_least_squares():
     data = measure(Case("", correlation=0.6)).measurements[0]
     fit = identify(ROBOT, data, LeastSquares())
-    rows = collect_residual_rows(fit, data)
+    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
     assert rows is not None
     errors = estimate_correlated_errors(rows, 8.0)
     dense, n = fit_densely(data, FINE), len(data.readings)

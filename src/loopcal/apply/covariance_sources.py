@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit, linearize_rows_of
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_rows_of
 from loopcal.estimate.inference.covariance_parts import NOISE, CovariancePart
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.estimate.linearization import Linearization
@@ -86,15 +86,16 @@ class _Penalty(NamedTuple):
     noise: float
 
 
-def split_covariance(fit: Identification, data: Measurements) -> CovarianceSplit:
+def split_covariance(
+    fit: Identification, data: Measurements, linear: FitLinearization
+) -> CovarianceSplit:
     """Return the covariance of a fit by source.
 
     Parameters
     ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses.
+        excluded poses. linear : of both, see `linearize_fit`.
     """
-    linear = linearize_fit(fit, data)
     assumed, evaluated = _read_penalty(fit, linear), _evaluate_noise(fit)
     names, members = _number_sources(data, linear.problem)
     sources = [Source(kind, name, *evaluated) for kind, name in names]
@@ -126,15 +127,14 @@ def split_covariance(fit: Identification, data: Measurements) -> CovarianceSplit
 
 
 def halve_sigma(
-    fit: Identification, data: Measurements, source: Source
+    fit: Identification, data: Measurements, linear: FitLinearization, source: Source
 ) -> tuple[FloatArray, Linearization, Problem] | None:
     """Return a root (p, k) [SI] of the covariance without added parts if the sigma of a source of
     rows or of the tolerances were half as large, with its linearization; None for other sources.
 
     Every weight is that of the smaller sigma. Estimates stay, and so does a scale of the noise that
-    the residuals gave.
+    the residuals gave. The other arguments are as of `split_covariance`.
     """
-    linear = linearize_fit(fit, data)
     assumed = _read_penalty(fit, linear)
     changed, other = data, fit
     if source.kind == TOLERANCES:

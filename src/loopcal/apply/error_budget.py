@@ -33,6 +33,7 @@ from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.diagnose.tool_errors import ToolErrors, linearize_tool_errors, locate_measured_poses
 from loopcal.errors import MechanismError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.estimate.result import Identification
@@ -211,12 +212,13 @@ def compute_error_budget(
     if not len(solution.q):
         return None
     effects = linearize_tool_errors(fit.posterior, solution, frame)
-    split = split_covariance(fit, data)
+    linear = linearize_fit(fit, data)
+    split = split_covariance(fit, data, linear)
     lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
     places = _Places(solution, frame)
-    lines = [replace(each, halved=_halve(fit, data, each, lines, places)) for each in lines]
+    lines = [replace(each, halved=_halve(fit, data, linear, each, lines, places)) for each in lines]
     position, orientation = _add_kinds(lines)
     n = len(solution.q)
     finding = _word(fit, (position, orientation), n, is_workspace, effects.reference)
@@ -287,6 +289,7 @@ def _select_discrepancy(twists: FloatArray, name: str) -> FloatArray:
 def _halve(
     fit: Identification,
     data: Measurements,
+    linear: FitLinearization,
     line: SourceBudget,
     lines: list[SourceBudget],
     places: _Places,
@@ -296,7 +299,7 @@ def _halve(
     position, orientation = (sum(getattr(each, name) for each in lines) for name in _LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in _OF_ROWS:
-        halved = halve_sigma(fit, data, line.source)
+        halved = halve_sigma(fit, data, linear, line.source)
         if halved is None:
             return None
         root, linearization, problem = halved

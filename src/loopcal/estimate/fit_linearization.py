@@ -11,6 +11,7 @@ from loopcal.estimate.inference.posterior import VarianceSources, find_variance_
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.poses.smooth_errors import SmoothErrors
+from loopcal.estimate.poses.states import PoseStates
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
@@ -103,16 +104,17 @@ def factor_known_setup(fit: Identification, data: Measurements) -> FloatArray:
 
 
 def linearize_smooth_errors(
-    fit: Identification, data: Measurements, errors: SmoothErrors
+    fit: Identification, data: Measurements, errors: SmoothErrors, linear: FitLinearization
 ) -> Linearization:
     """Linearize the rows of a fit also by the coefficients of errors of the poses, whose columns
     follow those of the parameters.
 
     Parameters
     ----------
-    fit, data : as of `linearize_fit`.
+    fit, data : as of `linearize_fit`. linear : of both; the poses begin where it has them.
     """
-    return _linearize(fit, data, is_setup_known=False, errors=errors)[1]
+    states = linear.linearization.next_start.poses
+    return _linearize(fit, data, is_setup_known=False, errors=errors, states=states)[1]
 
 
 def _linearize(
@@ -121,6 +123,7 @@ def _linearize(
     *,
     is_setup_known: bool,
     errors: SmoothErrors | None = None,
+    states: PoseStates | None = None,
 ) -> tuple[Problem, Linearization]:
     """Return the weighted problem of a fit, and its linearization with an earlier calibration."""
     setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
@@ -134,6 +137,7 @@ def _linearize(
     z = free.deviation(fit.robot.values[None])
     start = problem.start(z, seek=False)
     start = start.with_nuisance(values[None]) if len(setup) else start
+    start = start if states is None else replace(start, poses=states)
     prior = fit.options.prior
     with_prior = problem if prior is None else prior.added(problem)
     return problem, with_prior.linearize(z, start)

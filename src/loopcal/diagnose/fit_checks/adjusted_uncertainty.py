@@ -26,6 +26,7 @@ from loopcal.diagnose.fit_checks.residual_patterns import (
 from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.covariance_parts import NOISE
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
@@ -62,8 +63,9 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return fit
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    rows = collect_residual_rows(fit, data)
-    slow = find_slow_errors(fit, data)
+    linear = linearize_fit(fit, data)
+    rows = collect_residual_rows(fit, data, linear)
+    slow = find_slow_errors(fit, data, linear)
     if rows is not None:
         fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
     return fit if slow is None else add_slow_errors(fit, slow)

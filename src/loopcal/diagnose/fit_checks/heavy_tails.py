@@ -24,6 +24,7 @@ import numpy as np
 
 from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
@@ -109,7 +110,7 @@ def check_heavy_tails(
     if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
         return nothing
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    rows = collect_residual_rows(fit, data)
+    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
     if rows is None:
         return nothing
     wrong = np.flatnonzero(_belong_to(rows, data, outliers))

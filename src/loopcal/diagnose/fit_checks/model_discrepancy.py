@@ -23,8 +23,8 @@ import numpy as np
 from loopcal.diagnose.fit_checks.repeated_poses import LEVEL as REPEATS_LEVEL
 from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
 from loopcal.diagnose.fit_checks.residual_patterns import LEVEL
-from loopcal.estimate.fit_input import exclude_poses
-from loopcal.estimate.fit_linearization import linearize_fit, linearize_smooth_errors
+from loopcal.diagnose.tool_errors import locate_measured_poses
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
 from loopcal.estimate.inference.residual_test import (
@@ -32,11 +32,10 @@ from loopcal.estimate.inference.residual_test import (
     SIGNIFICANCE,
     count_sigma_degrees,
 )
-from loopcal.estimate.poses.smooth_errors import CENTERS, SmoothErrors, describe_smooth_errors
+from loopcal.estimate.poses.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.mechanism import forward
+from loopcal.measure import Measurements
 from loopcal.numerics.chi_square import compute_f_tail
 from loopcal.numerics.variance_component import (
     VarianceComponent,
@@ -100,27 +99,25 @@ class SlowErrors:
     is_slow: bool = True
 
 
-def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
-    """Return a fit whose uncertainty includes a model discrepancy, where its residuals show one.
-
-    The parameters get what the discrepancy does to them, and poses what is left of it. Estimates
-    stay.
+def find_slow_errors(
+    fit: Identification, data: Measurements, linear: FitLinearization
+) -> SlowErrors | None:
+    """Return the slow errors that the residuals of a fit show; None without any, or where nothing
+    can be tested.
 
     Parameters
     ----------
-    fit : an identification. data : the measurements it was made from.
+    fit : with intervals. data : its measurements, with the sigma of their readings, without
+        excluded poses. linear : of both, see `linearize_fit`.
     """
-    slow = find_slow_errors(fit, data)
-    return fit if slow is None else add_slow_errors(fit, slow)
-
-
-def find_slow_errors(fit: Identification, data: Measurements) -> SlowErrors | None:
-    """Return the slow errors that the residuals of a fit show; None without any, or where nothing
-    can be tested.
-    """
-    if not (fit.converged and fit.residual_test.intervals):
+    T, tool = locate_measured_poses(fit, data).T, fit.robot.tool[:3, 3]
+    if len(T) < FEWEST_POSES:
         return None
-    every = (project_slow_errors(fit, data, *kernel) for kernel in KERNELS)
+    kernels = (
+        describe_smooth_errors(T, tool, length, by_rotation=by_rotation)
+        for length, by_rotation in KERNELS
+    )
+    every = (project_slow_errors(fit, data, linear, errors) for errors in kernels)
     tested = [rows for rows in every if rows is not None]
     level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(len(tested), 1))
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
@@ -128,10 +125,12 @@ def find_slow_errors(fit: Identification, data: Measurements) -> SlowErrors | No
     slow = [each for each in slow if each.found]
     if slow:
         return min(slow, key=lambda each: min(p for _, p in each.found.values()))
-    return find_rough_errors(fit, data)
+    return find_rough_errors(fit, data, linear, describe_smooth_errors(T, tool, ROUGH, MOST_ROUGH))
 
 
-def find_rough_errors(fit: Identification, data: Measurements) -> SlowErrors | None:
+def find_rough_errors(
+    fit: Identification, data: Measurements, linear: FitLinearization, errors: SmoothErrors
+) -> SlowErrors | None:
     """Return errors that every pose has of its own, where repeats of a pose agree much better with
     each other than with the fit; None elsewhere.
 
@@ -141,7 +140,7 @@ def find_rough_errors(fit: Identification, data: Measurements) -> SlowErrors | N
     lack = check_lack_of_fit(fit, data)
     if lack.is_explained is not False:
         return None
-    rows = project_slow_errors(fit, data, ROUGH, True, MOST_ROUGH)
+    rows = project_slow_errors(fit, data, linear, errors)
     if rows is None:
         return None
     found = {}
@@ -157,7 +156,10 @@ def find_rough_errors(fit: Identification, data: Measurements) -> SlowErrors | N
 
 
 def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
-    """Return a fit whose uncertainty includes slow errors that were found in its residuals."""
+    """Return a fit whose uncertainty includes slow errors that were found in its residuals.
+
+    The parameters get what the errors do to them, and poses what is left of them. Estimates stay.
+    """
     rows, first = slow.rows, fit.posterior
     amplitude, degrees = np.zeros(6), np.full(2, np.inf)
     for part, (component, _) in slow.found.items():
@@ -205,23 +207,14 @@ def detect_slow_errors(
 
 
 def project_slow_errors(
-    fit: Identification, data: Measurements, length: float, by_rotation: bool, most: int = CENTERS
+    fit: Identification, data: Measurements, linear: FitLinearization, errors: SmoothErrors
 ) -> SlowErrorRows | None:
     """Return residuals and slow errors without what the parameters explain; None where there are
-    too few poses or residuals. `length`, `by_rotation`, `most` : see `describe_smooth_errors`.
+    too few different poses or residuals.
     """
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
-    readings = readings[np.isfinite(readings).all(axis=1)]
-    solution = forward(fit.robot, readings)
-    T = solution.T[solution.converged]
-    if len(T) < FEWEST_POSES:
-        return None
-    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], length, most, by_rotation=by_rotation)
     if len(errors.centers) < FEWEST_POSES:
         return None
-    linear = linearize_fit(fit, data)
-    extended = linearize_smooth_errors(fit, data, errors)
+    extended = linearize_smooth_errors(fit, data, errors, linear)
     d, m, used = linear.decomposition, errors.count, linear.decomposition.used[0]
     k = int(used.sum())
     to_z = d.deviation(np.eye(len(used)))[used].T

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements, Observations
 from loopcal.typing import FloatArray, IntArray
@@ -89,16 +89,17 @@ def span_columns(columns: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > EXPLAINED])
 
 
-def collect_residual_rows(fit: Identification, data: Measurements) -> ResidualRows | None:
+def collect_residual_rows(
+    fit: Identification, data: Measurements, linear: FitLinearization
+) -> ResidualRows | None:
     """Return the residuals of a fit in the order of measurement; None where rows cannot be told
     apart, because their readings are uncertain, or where there are none.
 
     Parameters
     ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses.
+        excluded poses. linear : of both, see `linearize_fit`.
     """
-    linear = linearize_fit(fit, data)
     if linear.problem.is_uncertain:
         return None
     observations = [rows for rows in data.observations if len(rows)]
