@@ -74,12 +74,6 @@ def test_user_error_prints_one_sentence_and_gives_exit_code_1(
     assert err.strip().count("\n") == 0
 
 
-def test_programming_error_is_raised_with_its_traceback(monkeypatch) -> None:
-    monkeypatch.setattr(robot_commands.check, "callback", lambda **_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        main(["check", "hexapod-42"])
-
-
 def test_closed_output_pipe_causes_no_traceback() -> None:
     code = "import sys; from loopcal.cli import main; sys.exit(main(['check', 'hexapod-42']))"
     with subprocess.Popen(

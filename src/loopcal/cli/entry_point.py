@@ -2,8 +2,9 @@
 """The command `loopcal`: its groups of commands, and the one place where an error becomes a
 sentence and an exit code.
 
-Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met. Nothing heavier than
-click is imported before a command runs, so that `loopcal --help` answers at once.
+Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met, 3 a defect of loopcal.
+Nothing heavier than click is imported before a command runs, so that `loopcal --help` answers at
+once.
 """
 
 from __future__ import annotations
@@ -123,6 +124,7 @@ def commands() -> None:
       0  good
       1  wrong use, or input that is refused
       2  a quality gate is not met (see calibrate, validate, compensate, import and export)
+      3  a defect of loopcal; the message names a report to send to the developers
     """  # noqa: D301
 
 
@@ -139,38 +141,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
-    command = find_command(words[0]) if words else None
+    command = None
     try:
+        command = find_command(words[0]) if words else None
         code = commands.main(words, prog_name="loopcal", standalone_mode=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
-    except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message(), err=True)
-        return 1
-    except (click.BadParameter, click.NoSuchOption) as error:
-        path = "loopcal" if error.ctx is None else error.ctx.command_path
-        return _refuse(error.format_message(), f"see {path} --help")
-    except click.ClickException as error:
-        return _refuse(error.format_message())
-    except LoopcalError as error:
-        found = error.args[0] if error.args else None
-        is_useless = isinstance(found, Finding) and is_hint_useless(found)
-        return _refuse(str(error), None if is_useless else find_hint(error.code, command))
-    except (KeyboardInterrupt, click.exceptions.Abort):
-        return _refuse("stopped before the end; no result was written.")
     except BrokenPipeError:
         # The reader of our output stopped (`loopcal ... | head`). Keep the interpreter from
         # complaining at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        reason = (error.strerror or str(error)).lower()
-        return _refuse(
-            f"{place}the operating system refused ({reason}); check the path and its permissions."
-        )
-    except MemoryError:
-        return _refuse("there is not enough memory for this; use fewer poses at a time.")
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
+        return _report(error, command, words)
+
+
+def _report(error: BaseException, command: click.Command | None, words: Sequence[str]) -> int:
+    """Print what an exception means for the user, and return the exit code."""
+    match error:
+        case click.exceptions.NoArgsIsHelpError():
+            click.echo(error.format_message(), err=True)
+            return 1
+        case click.BadParameter() | click.NoSuchOption():
+            path = "loopcal" if error.ctx is None else error.ctx.command_path
+            return _refuse(error.format_message(), f"see {path} --help")
+        case click.ClickException():
+            return _refuse(error.format_message())
+        case LoopcalError():
+            found = error.args[0] if error.args else None
+            is_useless = isinstance(found, Finding) and is_hint_useless(found)
+            return _refuse(str(error), None if is_useless else find_hint(error.code, command))
+        case KeyboardInterrupt() | click.exceptions.Abort():
+            return _refuse("stopped before the end; no result was written.")
+        case OSError():
+            place = f"{error.filename}: " if error.filename else ""
+            reason = (error.strerror or str(error)).lower()
+            return _refuse(
+                f"{place}the operating system refused ({reason}); check the path and its "
+                "permissions."
+            )
+        case MemoryError():
+            return _refuse("there is not enough memory for this; use fewer poses at a time.")
+        case _:
+            from loopcal.cli.defect_report import DEFECT_CODE, describe_defect
+
+            _refuse(describe_defect(error, words))
+            return DEFECT_CODE
 
 
 def _refuse(sentence: str, hint: str | None = None) -> int:
