@@ -11,12 +11,13 @@ from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
 from loopcal.diagnose.fit_checks.residual_effects import list_effects
-from loopcal.diagnose.fit_checks.residual_patterns import account_for_tests, find_patterns
+from loopcal.diagnose.fit_checks.residual_patterns import find_patterns
 from loopcal.diagnose.fit_checks.residual_patterns import test_correlation as compute_correlation
 from loopcal.diagnose.fit_checks.residual_patterns import test_effect as compute_tail
 from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.estimate import LeastSquares, Ridge, identify
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.numerics.multiple_tests import compute_any_probability, compute_single_level
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
 
@@ -160,6 +161,9 @@ def test_rows_that_are_absent_are_left_out():
 
 def test_the_probability_of_a_pattern_counts_all_tests_of_the_fit() -> None:
     """One p-value of 0.01 among ten is nothing special: 1 - 0.99^10."""
-    assert account_for_tests(0.01, 10) == pytest.approx(1.0 - 0.99**10)
-    assert account_for_tests(1e-12, 7) == pytest.approx(7e-12)
-    assert np.isnan(account_for_tests(np.nan, 3))
+    assert compute_any_probability(0.01, 10) == pytest.approx(1.0 - 0.99**10)
+    assert compute_any_probability(1e-12, 7) == pytest.approx(7e-12)
+    assert np.isnan(compute_any_probability(np.nan, 3))
+    for tests in (1, 2, 100, 10_000):
+        single = compute_single_level(0.05, tests)
+        assert compute_any_probability(single, tests) == pytest.approx(0.05, rel=1e-12)

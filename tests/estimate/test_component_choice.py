@@ -28,12 +28,13 @@ from loopcal.estimate.methods.component_choice import (
     predict,
 )
 from loopcal.estimate.methods.detectable_deviations import find_information
-from loopcal.estimate.methods.prior_conflict import LEVEL, correct_probability
+from loopcal.estimate.methods.prior_conflict import LEVEL
 from loopcal.estimate.methods.tolerance_components import ToleranceComponent, list_components
 from loopcal.io import load_robot
 from loopcal.measure import Component, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
 from loopcal.mechanism import forward_trials, sample_workspace
 from loopcal.numerics.decomposition import decompose
+from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.report.calibration_view import view_fit
 from tests.estimate.problems import fold_rows
 from tests.findings.expectations import get_finding
@@ -246,7 +247,10 @@ def test_deviation_that_counts_as_detectable_is_detected_in_four_of_five_machine
     rng = np.random.default_rng(2)
     # t = N(x sqrt(q), 1) for a deviation x with the information q, in one of the 9 statistics
     statistic = np.abs(5.0 * np.sqrt(least) + rng.standard_normal(20000))
-    p = [correct_probability(correct_probability(float(chi2.sf(t**2, 1)), 9), 3) for t in statistic]
+    p = [
+        compute_any_probability(compute_any_probability(float(chi2.sf(t**2, 1)), 9), 3)
+        for t in statistic
+    ]
     assert np.mean(np.array(p) < LEVEL) == pytest.approx(0.8, abs=0.01)
 
 

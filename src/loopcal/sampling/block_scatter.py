@@ -19,6 +19,7 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
+from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.sampling.intervals import NAMED, OFF
 from loopcal.typing import BoolArray, FloatArray
 
@@ -70,7 +71,7 @@ class BlockScatter:
     def find_off(self, ratio: FloatArray) -> BoolArray:
         """Return which ratios (p,) are off by more than `OFF`, beyond chance."""
         tested = np.isfinite(self.tail) & (self.noise_degrees >= FEWEST_DEGREES)
-        level = 0.5 * (1.0 - (1.0 - FALSE_ALARMS) ** (1.0 / max(int(tested.sum()), 1)))
+        level = 0.5 * compute_single_level(FALSE_ALARMS, int(tested.sum()))
         larger = (ratio > 1.0 + OFF) & (self.tail < level)
         smaller = (ratio < 1.0 / (1.0 + OFF)) & (self.tail > 1.0 - level)
         return np.asarray(tested & (larger | smaller))

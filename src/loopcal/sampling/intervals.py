@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.findings import Finding, report_finding
+from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.sampling.weighted_sample import weighted_quantiles
 from loopcal.typing import BoolArray, FloatArray
 
@@ -69,7 +70,7 @@ class Intervals:
         tested = int(np.isfinite(self.shift).sum())
         if not tested:
             return np.zeros(len(self.names), dtype=bool)
-        quantile = float(half_widths((1.0 - FALSE_ALARMS) ** (1.0 / tested)))
+        quantile = float(half_widths(1.0 - compute_single_level(FALSE_ALARMS, tested)))
         beyond = np.abs(self.shift) - quantile * self.shift_error
         return np.asarray((np.where(np.isnan(beyond), 0.0, beyond) > OFF).any(axis=0))
 

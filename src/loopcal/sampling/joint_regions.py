@@ -29,7 +29,9 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
+from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.sampling.intervals import half_widths
 from loopcal.typing import FloatArray, IntArray
 
@@ -216,7 +218,8 @@ def compute_simultaneous_intervals(
         rank = int((np.linalg.eigvalsh(chosen.correlation) > SMALLEST).sum())
         factor = np.full(q, np.sqrt(_find_square(rank, least, level)))
     else:
-        single = level ** (1.0 / q) if rule == "sidak" else 1.0 - (1.0 - level) / q
+        tail = 1.0 - level
+        single = 1.0 - (compute_single_level(tail, q) if rule == "sidak" else tail / q)
         factor = half_widths(single, degrees)
     return SimultaneousIntervals(
         chosen.names,
@@ -307,11 +310,7 @@ def _find_places(available: tuple[str, ...], names: Sequence[str]) -> IntArray:
 
 def _find_square(count: int, degrees: float, level: float) -> float:
     """Return the largest squared distance of `count` quantities within a region."""
-    from scipy.special import chdtri, fdtri
-
-    if np.isinf(degrees):
-        return float(chdtri(count, 1.0 - level))
-    return float(count * fdtri(count, degrees, level))
+    return count * float(compute_f_quantile(count, degrees, 1.0 - level))
 
 
 def _simulate_maximum(correlation: FloatArray, level: float, degrees: float, seed: int) -> float:

@@ -29,7 +29,7 @@ from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.covariance_parts import NOISE
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE
+from loopcal.estimate.inference.residual_test import choose_severity
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
@@ -116,7 +116,7 @@ def _add_correlation(
         correlation=errors.correlation,
         order=patterns.order,
         ratio=ratio,
-        severity=_weigh(patterns.p_value) if patterns.is_correlated else None,
+        severity=choose_severity(patterns.p_value) if patterns.is_correlated else None,
     )
     return add_covariance(fit, root, errors.degrees, finding)
 
@@ -185,7 +185,7 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
         "size": Quantity(float(effect.sizes[most]) / unit.factor_to_si, unit.symbol),
         "error": Quantity(float(effect.errors[most]) / unit.factor_to_si, unit.symbol),
         "ratio": ratio,
-        "severity": _weigh(effect.p_value),
+        "severity": choose_severity(effect.p_value),
     }
     source, name = effect.effect.source, effect.effect.name
     if source == TIME:
@@ -197,11 +197,6 @@ def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
     if source == READING:
         return report_finding("residuals.depend-on-reading", name=name, **shown)
     return report_finding("residuals.trend", **shown)
-
-
-def _weigh(p_value: float) -> Severity:
-    """Return how much a pattern counts: a warning where independent errors hardly ever show it."""
-    return Severity.WARNING if p_value < SIGNIFICANCE else Severity.INFO
 
 
 def _without_doubt_of_sigma(fit: Identification) -> Identification:

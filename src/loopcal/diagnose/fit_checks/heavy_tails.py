@@ -25,7 +25,7 @@ import numpy as np
 from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE
+from loopcal.estimate.inference.residual_test import choose_severity
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
@@ -80,7 +80,7 @@ class HeavyTails:
             return ()
         finding = report_finding(
             "residuals.heavy-tailed",
-            severity=Severity.WARNING if self.p_value < SIGNIFICANCE else None,
+            severity=choose_severity(self.p_value),
             p_value=self.p_value,
             median=self.median,
             expected=self.expected,

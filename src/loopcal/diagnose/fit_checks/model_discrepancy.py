@@ -29,14 +29,15 @@ from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
 from loopcal.estimate.inference.residual_test import (
     FEWEST_DEGREES,
-    SIGNIFICANCE,
+    choose_severity,
     count_sigma_degrees,
 )
 from loopcal.estimate.poses.smooth_errors import SmoothErrors, describe_smooth_errors
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.numerics.chi_square import compute_f_tail
+from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.numerics.variance_component import (
     VarianceComponent,
     compute_component_tail,
@@ -119,7 +120,7 @@ def find_slow_errors(
     )
     every = (project_slow_errors(fit, data, linear, errors) for errors in kernels)
     tested = [rows for rows in every if rows is not None]
-    level = 1.0 - (1.0 - LEVEL) ** (1.0 / max(len(tested), 1))
+    level = compute_single_level(LEVEL, len(tested))
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     slow = [SlowErrors(rows, detect_slow_errors(rows, known, level)) for rows in tested]
     slow = [each for each in slow if each.found]
@@ -183,7 +184,7 @@ def detect_slow_errors(
     finding any without such errors.
     """
     parts = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
-    level = 1.0 - (1.0 - level) ** (1.0 / max(len(parts), 1))
+    level = compute_single_level(level, len(parts))
     whitening, found = np.eye(len(rows.residuals)), {}
     while parts:
         y = whitening @ rows.residuals
@@ -260,7 +261,7 @@ def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:
     """
     component, p_value = slow.found[part]
     dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
-    finding = report_finding(
+    return report_finding(
         DISCREPANCY,
         quantity=("orientation", "position")[part],
         amplitude=fit.robot.to_quantity(float(np.sqrt(component.variance)), dimension),
@@ -268,8 +269,8 @@ def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:
         p_value=p_value,
         is_slow=slow.is_slow,
         level=LEVEL if slow.is_slow else REPEATS_LEVEL,
+        severity=choose_severity(p_value),
     )
-    return replace(finding, severity=Severity.WARNING) if p_value < SIGNIFICANCE else finding
 
 
 def _is_seen(rows: SlowErrorRows, part: int) -> bool:

@@ -26,6 +26,7 @@ from loopcal.numerics.chi_square import (
     compute_chi_square_tail,
     compute_f_tail,
 )
+from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 MOST_ROUNDS = 20
@@ -156,7 +157,7 @@ def search_blocks(
     whole = first = refit(np.zeros_like(low_weight))
     if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
         first = without
-    limit = -float(np.expm1(np.log1p(-level) / max(whole.tested, 1)))
+    limit = compute_single_level(level, whole.tested)
     most = int(MOST_EXCLUDED * whole.tested)
     fits = search_suspects(refit, whole, first, limit, most, progress)
     return BlockSearch(refit, whole, limit, fits)

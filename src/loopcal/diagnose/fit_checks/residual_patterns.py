@@ -25,6 +25,7 @@ from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, span_columns
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_f_tail
+from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.typing import FloatArray
 
 LEVEL = 0.05
@@ -32,7 +33,7 @@ LEVEL = 0.05
 same for slow errors of the poses (`model_discrepancy`).
 """
 
-FALSE_ALARMS = 1.0 - (1.0 - LEVEL) ** 2
+FALSE_ALARMS = compute_any_probability(LEVEL, 2)
 """Probability that independent errors change the uncertainty of a fit: patterns or slow errors."""
 
 FEWEST_LEFT = 3.0
@@ -95,7 +96,7 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     while effects:
         p_values = [test_effect(rows, effect) for effect in effects]
         best = int(np.argmin(p_values))
-        p_any = account_for_tests(p_values[best], tests)
+        p_any = compute_any_probability(p_values[best], tests)
         if not p_any < LEVEL:
             break
         effect = effects.pop(best)
@@ -104,14 +105,9 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
         effects = [e for e in effects if _is_testable(rows, e)]
     if found:
         correlation, p_value = test_correlation(rows)
-    p_any = account_for_tests(p_value, tests)
+    p_any = compute_any_probability(p_value, tests)
     is_correlated = p_any < LEVEL
     return ResidualPatterns(tests, tuple(found), correlation, p_any, is_correlated, order, rows)
-
-
-def account_for_tests(p_value: float, tests: int) -> float:
-    """Return the probability that the smallest of so many p-values is as small (Sidak)."""
-    return float(-np.expm1(max(tests, 1) * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
 def test_effect(rows: ResidualRows, effect: Effect) -> float:

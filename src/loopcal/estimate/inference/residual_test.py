@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import Finding, Severity, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
@@ -132,6 +132,13 @@ class ResidualTest:
             factor = coverage_factor(self.noise_degrees)
             return report_finding("noise.few-degrees", factor=float(factor), **data)
         return report_finding("noise.estimated", **data)
+
+
+def choose_severity(p_value: float) -> Severity:
+    """Return how much an effect counts that a test found: it is a warning where chance hardly ever
+    shows it, else information.
+    """
+    return Severity.WARNING if p_value < SIGNIFICANCE else Severity.INFO
 
 
 def run_residual_test(

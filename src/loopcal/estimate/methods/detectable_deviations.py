@@ -23,6 +23,7 @@ from loopcal.estimate.methods.tolerance_components import list_shifts
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.multiple_tests import compute_single_level
 
 POWER_QUANTILE = 0.8416212335729143
 """Normal quantile of the power 0.8."""
@@ -77,6 +78,6 @@ def find_information(size: float, count: int) -> float:
     ----------
     size : of the deviation, in tolerances. count : number of statistics of the test.
     """
-    level = -np.expm1(np.log1p(-LEVEL) / (3.0 * count))
+    level = compute_single_level(LEVEL, 3 * count)
     threshold = float(np.sqrt(compute_chi_square_quantile(1.0, level)))
     return ((threshold + POWER_QUANTILE) / size) ** 2

@@ -31,6 +31,7 @@ from loopcal.estimate.methods.tolerance_components import ToleranceComponent
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.typing import BoolArray, FloatArray
 
 LEVEL = 0.01
@@ -181,7 +182,9 @@ def assess_prior_conflict(
         p_value=p_value,
         direction=direction,
         parameter=parameter,
-        joint_p_value=correct_probability(min(p_value, direction.p_value, parameter.p_value), 3),
+        joint_p_value=compute_any_probability(
+            min(p_value, direction.p_value, parameter.p_value), 3
+        ),
         inflation=inflation,
         farthest=tuple((names[i], float(deviation[i])) for i in far),
         components=components,
@@ -234,9 +237,4 @@ def _largest(values: FloatArray, testable: BoolArray, names: tuple[str, ...]) ->
         return LargestDeviation(0.0, 0, 1.0, ())
     largest = float(values.max())
     single = float(compute_chi_square_tail(1.0, largest**2))
-    return LargestDeviation(largest, count, correct_probability(single, count), names)
-
-
-def correct_probability(p_value: float, count: int) -> float:
-    """Return the probability 1 - (1 - p)^count that any of several tests is as significant."""
-    return float(-np.expm1(count * np.log1p(-min(p_value, 1.0 - 1e-16))))
+    return LargestDeviation(largest, count, compute_any_probability(single, count), names)
