@@ -13,9 +13,9 @@ from scipy.stats import binom
 
 import loopcal as lc
 from loopcal.diagnose import adjust_uncertainty
-from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_correlated_errors
-from loopcal.diagnose.fit_checks.residual_patterns import FALSE_ALARMS
-from loopcal.diagnose.fit_checks.residual_rows import collect_residual_rows
+from loopcal.diagnose.residuals.correlated_errors import RHO, SHARE, estimate_correlated_errors
+from loopcal.diagnose.residuals.residual_patterns import FALSE_ALARMS
+from loopcal.diagnose.residuals.residual_rows import collect_residual_rows
 from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.findings import Severity

@@ -8,8 +8,8 @@ import pytest
 from scipy.stats import kstest
 
 from loopcal.diagnose import adjust_uncertainty, examine_fit
-from loopcal.diagnose.fit_checks.heavy_tails import assess_tails, check_heavy_tails
-from loopcal.diagnose.fit_checks.residual_rows import ResidualRows
+from loopcal.diagnose.residuals.heavy_tails import assess_tails, check_heavy_tails
+from loopcal.diagnose.residuals.residual_rows import ResidualRows
 from loopcal.estimate import Huber, identify
 from loopcal.findings import Severity
 from loopcal.serialization import to_json

@@ -13,8 +13,8 @@ from loopcal import geometry
 from loopcal.apply import pose_uncertainty
 from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.fit_checks.held_out_rows import Predictor
-from loopcal.diagnose.fit_checks.model_discrepancy import add_slow_errors, find_slow_errors
-from loopcal.diagnose.fit_checks.residual_patterns import LEVEL
+from loopcal.diagnose.residuals.model_discrepancy import add_slow_errors, find_slow_errors
+from loopcal.diagnose.residuals.residual_patterns import LEVEL
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty

@@ -9,9 +9,9 @@ from evidence.assumptions.cases import SETUPS, Case
 from evidence.assumptions.simulation import simulate_case
 from loopcal import load_robot
 from loopcal.diagnose import adjust_uncertainty
-from loopcal.diagnose.fit_checks.correlated_errors import RHO, SHARE, estimate_correlated_errors
-from loopcal.diagnose.fit_checks.residual_patterns import test_correlation as measure_correlation
-from loopcal.diagnose.fit_checks.residual_rows import collect_residual_rows
+from loopcal.diagnose.residuals.correlated_errors import RHO, SHARE, estimate_correlated_errors
+from loopcal.diagnose.residuals.residual_patterns import test_correlation as measure_correlation
+from loopcal.diagnose.residuals.residual_rows import collect_residual_rows
 from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.mechanism import forward

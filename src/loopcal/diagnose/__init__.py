@@ -13,9 +13,6 @@ from loopcal.diagnose.cross_validation import cross_validate as cross_validate
 from loopcal.diagnose.cross_validation import score_leave_one_out as score_leave_one_out
 from loopcal.diagnose.error_frames import ErrorFrame as ErrorFrame
 from loopcal.diagnose.error_frames import choose_error_frame as choose_error_frame
-from loopcal.diagnose.fit_checks.adjusted_uncertainty import (
-    adjust_uncertainty as adjust_uncertainty,
-)
 from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
 from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
 from loopcal.diagnose.fit_checks.blunders import Blunder as Blunder
@@ -28,8 +25,6 @@ from loopcal.diagnose.fit_checks.correlations import (
 from loopcal.diagnose.fit_checks.expected_errors import (
     estimate_calibration_gain as estimate_calibration_gain,
 )
-from loopcal.diagnose.fit_checks.heavy_tails import HeavyTails as HeavyTails
-from loopcal.diagnose.fit_checks.heavy_tails import check_heavy_tails as check_heavy_tails
 from loopcal.diagnose.fit_checks.held_out_rows import check_held_out_rows as check_held_out_rows
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck as OutlierCheck
 from loopcal.diagnose.fit_checks.outliers import find_outliers as find_outliers
@@ -63,6 +58,9 @@ from loopcal.diagnose.prediction_errors import PosePredictions as PosePrediction
 from loopcal.diagnose.prediction_errors import PredictionComparison as PredictionComparison
 from loopcal.diagnose.prediction_errors import compare_predictions as compare_predictions
 from loopcal.diagnose.prediction_errors import predict_poses as predict_poses
+from loopcal.diagnose.residuals.adjusted_uncertainty import adjust_uncertainty as adjust_uncertainty
+from loopcal.diagnose.residuals.heavy_tails import HeavyTails as HeavyTails
+from loopcal.diagnose.residuals.heavy_tails import check_heavy_tails as check_heavy_tails
 from loopcal.diagnose.row_errors import KindErrors as KindErrors
 from loopcal.diagnose.row_errors import NoiseFloor as NoiseFloor
 from loopcal.diagnose.row_errors import PoseErrors as PoseErrors

@@ -11,9 +11,9 @@ from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck, check_clusters
 from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_correlated_groups
 from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimate_calibration_gain
-from loopcal.diagnose.fit_checks.heavy_tails import HeavyTails, check_heavy_tails
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit, check_lack_of_fit
+from loopcal.diagnose.residuals.heavy_tails import HeavyTails, check_heavy_tails
 from loopcal.estimate.fit_input import check_fitted_data
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.diagnose.fit_checks.residual_effects import ORDER, TIME, Effect, list_effects
-from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, span_columns
+from loopcal.diagnose.residuals.residual_effects import ORDER, TIME, Effect, list_effects
+from loopcal.diagnose.residuals.residual_rows import ResidualRows, span_columns
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_f_tail

@@ -15,15 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.diagnose.error_frames import FITTED
-from loopcal.diagnose.fit_checks.correlated_errors import estimate_correlated_errors
-from loopcal.diagnose.fit_checks.model_discrepancy import add_slow_errors, find_slow_errors
-from loopcal.diagnose.fit_checks.residual_effects import READING, SESSION, TEMPERATURE, TIME
-from loopcal.diagnose.fit_checks.residual_patterns import (
+from loopcal.diagnose.residuals.correlated_errors import estimate_correlated_errors
+from loopcal.diagnose.residuals.model_discrepancy import add_slow_errors, find_slow_errors
+from loopcal.diagnose.residuals.residual_effects import READING, SESSION, TEMPERATURE, TIME
+from loopcal.diagnose.residuals.residual_patterns import (
     EffectSizes,
     ResidualPatterns,
     find_patterns,
 )
-from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
+from loopcal.diagnose.residuals.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit

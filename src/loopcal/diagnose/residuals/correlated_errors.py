@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.fit_checks.residual_rows import ResidualRows
+from loopcal.diagnose.residuals.residual_rows import ResidualRows
 from loopcal.typing import FloatArray, IntArray
 
 RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, collect_residual_rows
+from loopcal.diagnose.residuals.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.residual_test import choose_severity

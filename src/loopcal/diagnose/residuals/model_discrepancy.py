@@ -22,7 +22,7 @@ import numpy as np
 
 from loopcal.diagnose.fit_checks.repeated_poses import LEVEL as REPEATS_LEVEL
 from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
-from loopcal.diagnose.fit_checks.residual_patterns import LEVEL
+from loopcal.diagnose.residuals.residual_patterns import LEVEL
 from loopcal.diagnose.tool_errors import locate_measured_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.diagnose.fit_checks.residual_rows import ResidualRows, order_rows
+from loopcal.diagnose.residuals.residual_rows import ResidualRows, order_rows
 from loopcal.measure import Measurements, Observations
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.mechanism import Mechanism
