@@ -14,7 +14,7 @@ from evidence.assumptions.levels import STATED_LEVELS, name_group
 from evidence.assumptions.simulation import BrokenNoise, simulate_case
 from loopcal import load_robot
 from loopcal.diagnose import find_outliers
-from loopcal.diagnose.fit_checks import residual_patterns
+from loopcal.diagnose.residuals import residual_patterns
 from loopcal.estimate.inference import residual_test
 from loopcal.estimate.methods import prior_conflict
 
