@@ -12,15 +12,13 @@ The folder is written under a temporary name and renamed, so it is either whole 
 from __future__ import annotations
 
 import csv
-import os
-import shutil
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.text_file import report_write_errors
+from loopcal.io.core.outputs import replace_folder
 from loopcal.io.runs.run_folder import RESULT, refuse_used_folder
 
 if TYPE_CHECKING:
@@ -81,7 +79,10 @@ def write_folder(
     style = choose_styles(reproduction.figures)
     for figure in reproduction.figures:
         files[f"figures/{figure.name}.png"] = png(figure, style)
-    _write(path, files)
+    with replace_folder(path, check=lambda folder: refuse_used_folder(folder, force)) as folder:
+        for name, content in files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(content)
     return path
 
 
@@ -92,23 +93,3 @@ def csv_text(table: Table) -> str:
     writer.writerow(table.columns)
     writer.writerows(["" if cell is None else cell for cell in row] for row in table.rows)
     return stream.getvalue()
-
-
-def _write(path: Path, files: Mapping[str, bytes]) -> None:
-    """Write files by relative name into a new folder, which then takes the place of `path`."""
-    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
-    with report_write_errors(path):
-        try:
-            for name, content in files.items():
-                target = temporary / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(content)
-            if path.is_dir():
-                path.rename(old)
-            temporary.rename(path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-            if path.exists():
-                shutil.rmtree(old, ignore_errors=True)
-            elif old.exists():
-                old.rename(path)

@@ -7,14 +7,14 @@ Files and folders are written whole or not at all, and never over something else
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.text_file import report_write_errors, resolve_target
+from loopcal.io.core.replacement import create_temporary, place_folder
+from loopcal.io.core.text_file import check_readable, report_write_errors, resolve_target
 
 
 def refuse_outputs(
@@ -104,30 +104,29 @@ def refuse_folder_in_use(path: Path, content: str, marker: str, force: bool) -> 
 
 
 @contextmanager
-def replace_folder(path: Path) -> Iterator[Path]:
+def replace_folder(
+    path: Path,
+    read_back: Callable[[Path], object] | None = None,
+    check: Callable[[Path], None] | None = None,
+) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 
-    An older folder is removed only when the new one is in place.
+    At every moment, `path` is the old or the new folder, complete. A symbolic link to a folder
+    stays a link.
+
+    Parameters
+    ----------
+    read_back : reads the complete temporary folder; see `write_text`.
+    check : raises FileError where a folder that is in use must not be replaced.
 
     Raises
     ------
-    FileError : in place of every OSError.
+    FileError : in place of every OSError; or `files.written-unreadable`.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
     with report_write_errors(path):
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.mkdir()
+        target = path.resolve()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with create_temporary(target, is_folder=True) as (temporary, _):
             yield temporary
-            if path.is_dir():
-                path.rename(old)
-            try:
-                temporary.rename(path)
-            except OSError:
-                with suppress(OSError):
-                    old.rename(path)
-                raise
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+            check_readable(path, temporary, read_back)
+            place_folder(temporary, target, path, check)

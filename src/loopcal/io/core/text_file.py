@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from loopcal.errors import ArgumentTypeError, FileError, LoopcalError
+from loopcal.findings import report_finding
+from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers
 
 
 def as_path(path: Any, what: str) -> Path:
@@ -102,26 +105,63 @@ def resolve_target(path: str | Path) -> Path:
         raise FileError("this symbolic link has no target; choose another name", path) from None
 
 
-def write_text(path: str | Path, text: str) -> None:
-    """Write a UTF-8 file whole or not at all: to a temporary name beside it, then renamed.
+def write_text(
+    path: str | Path, text: str, read_back: Callable[[Path], object] | None = None
+) -> None:
+    """Write a UTF-8 file whole or not at all; see `write_bytes`."""
+    write_bytes(path, text.encode("utf-8"), read_back)
 
-    A symbolic link stays a link; its target is written.
+
+def write_bytes(
+    path: str | Path, content: bytes, read_back: Callable[[Path], object] | None = None
+) -> None:
+    """Write a file whole or not at all: to a temporary name beside it, then renamed.
+
+    A symbolic link stays a link; its target is written. An old file keeps its permissions.
+
+    Parameters
+    ----------
+    read_back : reads the complete temporary file, whose name ends in that of the target. The target
+        is replaced only if this succeeds.
 
     Raises
     ------
-    FileError : see `resolve_target`; or the folder does not exist, no permission, or a full disk.
+    FileError : see `resolve_target`; the folder does not exist, no permission, or a full disk; or
+        `files.written-unreadable`, where `read_back` raises.
     """
     target = resolve_target(path)
     with report_write_errors(path):
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-        try:
-            with temporary.open("w", encoding="utf-8", newline="\n") as stream:
-                stream.write(text)
+        remove_leftovers(target, Path.is_file)
+        with create_temporary(target) as (temporary, descriptor):
+            assert descriptor is not None  # a file has one
+            with suppress(OSError):
+                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+            with os.fdopen(os.dup(descriptor), "wb") as stream:
+                stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
+            check_readable(path, temporary, read_back)
+            place_file(temporary, target, Path(path))
+
+
+def check_readable(
+    path: str | Path, temporary: Path, read_back: Callable[[Path], object] | None
+) -> None:
+    """Read a file or folder before it takes the name `path`.
+
+    Raises
+    ------
+    FileError : `read_back` raises, which is a defect of loopcal.
+    """
+    if read_back is None:
+        return
+    try:
+        read_back(temporary)
+    except MemoryError:
+        raise
+    except Exception as error:
+        reason = str(error).replace(str(temporary), str(path)) or type(error).__name__
+        raise FileError(report_finding("files.written-unreadable", reason=reason), path) from error
 
 
 @contextmanager

@@ -151,7 +151,7 @@ def write_plan_folder(
     FileError : the folder is in use, or cannot be written.
     """
     refuse_plan_folder(path, force)
-    with replace_folder(path) as folder:
+    with replace_folder(path, check=lambda old: refuse_plan_folder(old, force)) as folder:
         for name, text in texts.items():
             (folder / name).write_bytes(text.encode())
         files = {name: sha256(folder / name) for name in texts}

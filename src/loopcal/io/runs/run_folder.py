@@ -119,7 +119,7 @@ def write_run_folder(
     path = as_path(path, "run folder")
     refuse_used_folder(path, force)
     text = to_json({"format": FORMAT, **result})
-    with replace_folder(path) as folder:
+    with replace_folder(path, check=lambda old: refuse_used_folder(old, force)) as folder:
         (folder / RESULT).write_text(text, encoding="utf-8")
         (folder / robot_name).write_text(robot_text, encoding="utf-8")
         with (folder / ARRAYS).open("wb") as stream:

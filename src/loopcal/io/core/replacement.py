@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files and folders that take a name only when they are complete.
+
+New content has a temporary name beside its target, such as `.loopcal-new-0123456789abcdef-run`. It
+is created exclusively, and locked as long as its writer lives. A folder and its successor exchange
+their names in one step where the operating system can (Linux: renameat2). Elsewhere, the old folder
+is first set aside as `.loopcal-old-0123456789abcdef-run`.
+
+What a killed writer leaves behind has such a name and no lock. The next write to the target returns
+a folder that was set aside to its name, and removes the rest if it is loopcal's.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from functools import cache
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows: no locks, so leftovers are never removed
+    fcntl = None
+
+NEW, OLD = "new", "old"
+"""States of a leftover: written beside its target, and set aside for its successor."""
+
+_LEFTOVER = re.compile(r"\.loopcal-(new|old)-[0-9a-f]{16}-(.+)", re.DOTALL)
+_NAME_BYTES = 200
+"""Of the target's name in a temporary name; file systems allow 255 in all."""
+
+_WRITTEN: ContextVar[list[tuple[Path, Path, tuple[int, int]]] | None] = ContextVar(
+    "written", default=None
+)
+"""Outputs of the command that runs: path, target, and identity of what was to take its place."""
+
+
+@contextmanager
+def record_outputs() -> Iterator[Callable[[], list[Path]]]:
+    """Yield a function that returns the files and folders that the body has put in place so far.
+
+    The answer is exact at every moment: it compares what has the name now with what was written.
+    """
+    record: list[tuple[Path, Path, tuple[int, int]]] = []
+    token = _WRITTEN.set(record)
+    try:
+        yield lambda: [path for path, target, identity in record if _identify(target) == identity]
+    finally:
+        _WRITTEN.reset(token)
+
+
+@contextmanager
+def create_temporary(target: Path, is_folder: bool = False) -> Iterator[tuple[Path, int | None]]:
+    """Yield a new, locked, empty file or folder beside `target`, and remove what is left of it.
+
+    Yields
+    ------
+    path : of the file or folder. descriptor : of the file; None for a folder.
+    """
+    path, descriptor = _create_locked(target, is_folder)
+    try:
+        yield path, None if is_folder else descriptor
+    finally:
+        _remove(path)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
+    """Create a file or folder of a new name, and lock it.
+
+    Another writer may find it before it is locked and take it for a leftover; then it is created
+    again.
+    """
+    while True:
+        path = _name_beside(target, NEW)
+        if is_folder:
+            path.mkdir()
+            descriptor = _open_folder(path)
+        else:
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
+            descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
+        if descriptor is None:
+            return path, None
+        if lock(descriptor) is not False and _identify(path) == _identify(descriptor):
+            return path, descriptor
+        os.close(descriptor)
+
+
+def place_file(temporary: Path, target: Path, path: Path) -> None:
+    """Give a complete, synchronized file its name; `path` is how the user calls it."""
+    _record(path, target, temporary)
+    temporary.replace(target)
+    sync_folder(target.parent)
+
+
+def place_folder(
+    temporary: Path, target: Path, path: Path, check: Callable[[Path], None] | None = None
+) -> None:
+    """Give a complete folder its name; then `temporary` names the folder that had it, if any.
+
+    Parameters
+    ----------
+    check : is called with a folder that is to be replaced, and raises where it must stay. It is
+        called again with what was replaced, which another program may have changed.
+    """
+    sync_tree(temporary)
+    _record(path, target, temporary)
+    while True:
+        try:
+            temporary.rename(target)
+            break
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.EACCES):
+                raise
+            if not target.is_dir():
+                raise
+        if check is not None:
+            check(target)
+        try:
+            _exchange(temporary, target)
+        except FileNotFoundError:  # another program has removed the old folder
+            if temporary.is_dir():
+                continue
+            raise
+        if check is not None:
+            _check_replaced(temporary, target, check)
+        break
+    sync_folder(target.parent)
+
+
+def _check_replaced(old: Path, target: Path, check: Callable[[Path], None]) -> None:
+    """Return a folder to its name where it was changed in the last moment, and raise."""
+    try:
+        check(old)
+    except BaseException:
+        _exchange(old, target)
+        check(target)  # names the folder as the user does
+        raise
+
+
+def _exchange(new: Path, old: Path) -> None:
+    """Exchange the names of two folders; in one step where the operating system can."""
+    if _exchange_names(new, old):
+        return
+    aside = _name_beside(old, OLD)
+    descriptor = _open_folder(old)
+    try:
+        if descriptor is not None:
+            lock(descriptor)
+        old.rename(aside)
+        try:
+            new.rename(old)
+        except BaseException:
+            if not old.exists():
+                aside.rename(old)
+            raise
+        aside.rename(new)
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _exchange_names(first: Path, second: Path) -> bool:
+    """Exchange two names in one step; return False where that is not supported."""
+    function = _find_renameat2()
+    if function is None:
+        return False
+    at_cwd, exchange = -100, 2
+    if function(at_cwd, os.fsencode(first), at_cwd, os.fsencode(second), exchange) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM):
+        return False
+    raise OSError(number, os.strerror(number), str(second))
+
+
+@cache
+def _find_renameat2() -> Callable[[int, bytes, int, bytes, int], int] | None:
+    """Return renameat2 of the C library; None where it is missing."""
+    try:
+        function = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):
+        return None
+    function.argtypes = [
+        ctypes.c_int,
+        ctypes.c_char_p,
+        ctypes.c_int,
+        ctypes.c_char_p,
+        ctypes.c_uint,
+    ]
+    return function
+
+
+def sync_tree(folder: Path) -> None:
+    """Write all files of a folder, and their names, to the disk."""
+    for place, _, names in os.walk(folder):
+        for name in names:
+            descriptor = os.open(Path(place, name), os.O_RDWR | getattr(os, "O_BINARY", 0))
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        sync_folder(Path(place))
+
+
+def sync_folder(path: Path) -> None:
+    """Write the names in a folder to the disk, where the file system can."""
+    descriptor = _open_folder(path)
+    if descriptor is None:
+        return
+    try:
+        with suppress(OSError):  # the names are in place, even if not yet on the disk
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
+    """Return what killed writers have left of `target`, oldest first.
+
+    Parameters
+    ----------
+    state : NEW or OLD; both where None.
+    """
+    name = _shorten(target.name)
+    leftovers = []
+    with suppress(OSError), os.scandir(target.parent) as entries:
+        for entry in entries:
+            match = _LEFTOVER.fullmatch(entry.name)
+            if match and match[2] == name and state in (None, match[1]):
+                leftovers.append(Path(entry.path))
+    return sorted(leftovers, key=lambda path: (_read_time(path), path.name))
+
+
+def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
+    """Remove what killed writers have left of `target`, and return a folder set aside to its name.
+
+    Parameters
+    ----------
+    is_own : whether loopcal made the file or folder; others stay.
+    """
+    for path in reversed(list_leftovers(target, OLD)):
+        with _lock_leftover(path) as is_abandoned:
+            if is_abandoned and not os.path.lexists(target):
+                path.rename(target)
+    for path in list_leftovers(target):
+        with _lock_leftover(path) as is_abandoned:
+            if is_abandoned and is_own(path):
+                _remove(path)
+
+
+@contextmanager
+def _lock_leftover(path: Path) -> Iterator[bool]:
+    """Yield whether a leftover has no living writer; it is locked meanwhile."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except (OSError, AttributeError):
+        yield False
+        return
+    try:
+        yield lock(descriptor) is True and _identify(path) == _identify(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def lock(descriptor: int) -> bool | None:
+    """Lock a file or folder until it is closed; return whether it is locked.
+
+    False where another process has the lock, None where locks are not supported.
+    """
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _open_folder(path: Path) -> int | None:
+    """Return a descriptor of a folder; None where the system has none."""
+    try:
+        return os.open(path, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0))
+    except OSError:
+        return None
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder, but nothing that a link names."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def _record(path: Path, target: Path, temporary: Path) -> None:
+    """Note what is to take the name of `target`."""
+    record = _WRITTEN.get()
+    identity = _identify(temporary)
+    if record is not None and identity is not None:
+        record.append((path, target, identity))
+
+
+def _identify(file: Path | int) -> tuple[int, int] | None:
+    """Return device and number of a file, folder or descriptor; None where there is none."""
+    try:
+        status = file.lstat() if isinstance(file, Path) else os.fstat(file)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _name_beside(target: Path, state: str) -> Path:
+    """Return an unpredictable name in the folder of `target`."""
+    name = _shorten(target.name)
+    return target.with_name(f".loopcal-{state}-{secrets.token_hex(8)}-{name}")
+
+
+def _shorten(name: str) -> str:
+    """Return the end of a file name, which includes its suffix."""
+    return os.fsdecode(os.fsencode(name)[-_NAME_BYTES:])
+
+
+def _read_time(path: Path) -> int:
+    """Return when a file or folder was changed last."""
+    try:
+        return path.lstat().st_mtime_ns
+    except OSError:
+        return 0
