@@ -121,9 +121,10 @@ class Compensation:
 
     def __str__(self) -> str:
         """Return how many targets are reached, and the findings of those that are not."""
-        n, reached = len(self.labels), int(self.usable.sum())
+        usable = self.usable
+        n, reached = len(self.labels), int(usable.sum())
         lines = [f"{self.robot.name}: {reached} of {n} targets reached ({self.mode})"]
-        missed = [i for i in range(len(self.labels)) if not self.usable[i]]
+        missed = np.flatnonzero(~usable).tolist()
         lines += [f"target {self.labels[i]!r} {self.findings[i]}" for i in missed[:SHOWN]]
         if len(missed) > SHOWN:
             lines.append(f"and {len(missed) - SHOWN} more")

@@ -21,6 +21,7 @@ import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding
+from loopcal.io.core.decimal_columns import parse_decimals
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
@@ -90,13 +91,14 @@ class Table:
         FileError
             No unit or one of another dimension, a cell that is not a finite number, or is empty.
         """
-        factor, values = self.factor(name, dimension), []
-        for row, cell in enumerate(self.text(name)):
-            value = math.inf
+        factor, cells = self.factor(name, dimension), self.text(name)
+        values, is_plain = parse_decimals(cells, factor)
+        for row in np.flatnonzero(~is_plain).tolist():
+            cell, value = cells[row], math.inf
             if not infinite or cell != "inf":
                 value = self.number(name, row, cell, empty)
-            values.append(parse_exact(cell, factor) if math.isfinite(value) else value)
-        return np.array(values)
+            values[row] = parse_exact(cell, factor) if math.isfinite(value) else value
+        return values
 
     def factor(self, name: str, dimension: Dimension, symbol: str | None = None) -> float:
         """Return SI per unit of a column, or of `symbol`, a factor of its unit; see `numbers`."""
@@ -272,6 +274,8 @@ def _parse_row(path: Path, line: int, text: str, count: int) -> tuple[str, ...]:
 
 def _split_cells(path: Path, line: int, text: str) -> tuple[str, ...]:
     """Split one line at its commas."""
+    if '"' not in text and "\r" not in text and len(text) < csv.field_size_limit():
+        return tuple(map(str.strip, text.split(",")))  # as csv does without quotes
     try:
         return tuple(cell.strip() for cell in next(csv.reader([text], strict=True)))
     except csv.Error as error:

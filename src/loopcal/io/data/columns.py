@@ -21,6 +21,7 @@ import numpy as np
 
 from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import Table, quote_cell, suggest_header
+from loopcal.io.core.decimal_columns import parse_decimals
 from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -144,9 +145,11 @@ class ProductColumn(Column):
             table.factor(self.name, dimension, symbol.strip())
             for symbol, dimension in zip(symbols, self.dimensions, strict=True)
         )
-        cells = enumerate(table.text(self.name))
-        numbers = [table.number(self.name, i, cell, empty=False) for i, cell in cells]
-        return np.array(numbers) * (a * b)
+        cells = table.text(self.name)
+        numbers, is_plain = parse_decimals(cells, 1.0)
+        for row in np.flatnonzero(~is_plain).tolist():
+            numbers[row] = table.number(self.name, row, cells[row], empty=False)
+        return numbers * (a * b)
 
     def format(self, value: Any) -> str:
         """Return a covariance [SI] in the unit."""
@@ -182,12 +185,14 @@ class ContextColumn(Column):
             allowed = ", ".join(f"[{s}]" for s in self.units)
             raise table.header_error(f"column {self.name!r} has {stated}; write one of {allowed}")
         factor, offset = self.units[symbol]
-        values = np.full(len(cells), np.nan)
-        for row, cell in enumerate(cells):
-            if not math.isnan(table.number(self.name, row, cell)):
-                values[row] = parse_exact(cell, factor) + offset
-            if self.name != TIME and values[row] < ABSOLUTE_ZERO - ROUNDING:
-                sentence = f"column {self.name!r} is {cell} {symbol}, below absolute zero"
+        values, is_plain = parse_decimals(cells, factor)
+        values += offset
+        lowest = -math.inf if self.name == TIME else ABSOLUTE_ZERO - ROUNDING
+        for row in np.flatnonzero(~is_plain | (values < lowest)).tolist():
+            is_empty = math.isnan(table.number(self.name, row, cells[row]))
+            values[row] = math.nan if is_empty else parse_exact(cells[row], factor) + offset
+            if values[row] < lowest:
+                sentence = f"column {self.name!r} is {cells[row]} {symbol}, below absolute zero"
                 raise table.row_error(row, f"{sentence}; correct it, or leave the cell empty")
         return values
 

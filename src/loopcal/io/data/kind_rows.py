@@ -151,7 +151,7 @@ def read_observations(
             source=str(table.path),
             is_noise_assumed=entry.is_noise_assumed,
         )
-    return observations, tuple(table.place(int(row)) for row in rows)
+    return observations, tuple(map(table.place, rows.tolist()))
 
 
 def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
@@ -237,8 +237,10 @@ def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
         sentence = f"{name!r} names the {name} of all rows; write a name or a number"
         raise table.settings.error(sentence, (name,))
     usual = str(stated if stated is not None else "").strip()
+    if name not in table.units:
+        return np.full(len(rows), unicodedata.normalize("NFC", usual))
     cells = table.text(name)
-    texts = (unicodedata.normalize("NFC", cells[row] or usual) for row in rows)
+    texts = (unicodedata.normalize("NFC", cells[row] or usual) for row in rows.tolist())
     return np.array(list(texts), dtype=np.str_)
 
 

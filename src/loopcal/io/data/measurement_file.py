@@ -244,10 +244,11 @@ def load_pose_names(path: str | Path) -> tuple[str, ...]:
     """
     table = read_table(path)
     names = table.pose_names()
+    first: dict[str, int] = {}
     for i, name in enumerate(names):
-        if name in names[:i]:
-            first = names.index(name) + 1
-            sentence = f"pose {name!r} is also row {first}; give each pose a name of its own"
+        if first.setdefault(name, i) != i:
+            row = first[name] + 1
+            sentence = f"pose {name!r} is also row {row}; give each pose a name of its own"
             raise table.row_error(i, sentence)
     return names
 
@@ -289,6 +290,8 @@ def _collect_pose_context(
     """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
     of_poses: dict[str, FloatArray] = {}
     for table, of_file, of_rows, beside in zip(tables, kinds, members, context, strict=True):
+        if not beside:
+            continue
         measuring = {
             int(row)
             for entry in of_file

@@ -86,25 +86,34 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
     read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
     for i, file in enumerate(files):
+        states_readings = has_readings(file.table, robot)
+        repeated: dict[int, tuple[int, int]] = {}
         for name, row in file.first.items():
             if name in file.read or (name in file.unread and name not in read):
-                k, other_row = origin.setdefault(name, (i, row))
-                if (k, other_row) != (i, row):
-                    _refuse_contradiction(file, row, files[k], other_row)
-            elif name not in read and has_readings(file.table, robot):
+                place = origin.setdefault(name, (i, row))
+                if place != (i, row):
+                    repeated[row] = place
+            elif name not in read and states_readings:
                 sentence = f"pose {name!r} has no readings in any file; add them in one"
                 raise file.table.row_error(row, sentence)
+        _refuse_contradictions(file, files, repeated)
     if not origin:
         raise tables[0].row_error(0, "no row has readings; add a row with readings for each pose")
-    index = {name: i for i, name in enumerate(origin)}
+    alone = {name: (i,) for i, name in enumerate(origin)}
     members = tuple(
-        tuple(_find_members(file.table, row, cell, index) for row, cell in enumerate(file.names))
+        tuple(
+            alone.get(cell) or _find_members(file.table, row, cell, alone)
+            for row, cell in enumerate(file.names)
+        )
         for file in files
     )
-    readings = np.stack([files[i].readings[row] for i, row in origin.values()])
+    begin = np.cumsum([0, *(len(file.names) for file in files)])
+    file, row = np.array(tuple(origin.values())).T
+    places = begin[file] + row
+    readings = np.concatenate([file.readings for file in files])[places]
     sigma = None
     if any(states_reading_noise(table, robot) for table in tables):
-        stated = np.stack([files[i].sigma[row] for i, row in origin.values()])
+        stated = np.concatenate([file.sigma for file in files])[places]
         sigma = np.where(np.isnan(stated), robot.stated_sigma, stated)
     return PoseRows(tuple(origin), readings, sigma, _number_blocks(files, list(origin)), members)
 
@@ -130,25 +139,20 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     controller = _load_controller(table, robot)
     columns = _reading_columns(table, robot, controller)
     rows = np.column_stack([column.parse(table) for column in columns])
-    absent = np.isnan(rows)
     may_be_absent = controller is None and states_reading_noise(table, robot)
-    for row, name in enumerate(names):
-        begin = first.get(name)
-        if row == begin:
-            if absent[row].any() and not may_be_absent and not (several and absent[row].all()):
-                column = columns[int(np.argmax(absent[row]))].name
-                hint = f", or state '{READING_NOISE}', so that empty means not read"
-                act = f"write its value{'' if controller is not None else hint}"
-                raise table.row_error(row, f"column {column!r} is empty; {act}")
-        elif absent[row].all():
-            continue
-        elif begin is None:
-            sentence = f"the row of {name!r} compares poses and has no readings of its own"
-            raise table.row_error(row, f"{sentence}; leave these cells empty")
-        elif not np.array_equal(rows[row], rows[begin], equal_nan=True):
-            sentence = f"pose {name!r} has other readings in line {table.lines[begin]}"
-            raise table.row_error(row, f"{sentence}; correct them, or rename one of the two poses")
-    unread = frozenset(name for name, row in first.items() if absent[row].all())
+    hint = (
+        ""
+        if controller is not None
+        else f", or state '{READING_NOISE}', so that empty means not read"
+    )
+    begin = np.array([first.get(name, -1) for name in names])
+    if not may_be_absent:
+        _refuse_empty_cells(
+            table, columns, rows, begin, several, hint if controller is None else ""
+        )
+    _refuse_other_readings(table, names, rows, begin)
+    is_unread = np.isnan(rows).all(axis=1).tolist()
+    unread = frozenset(name for name, row in first.items() if is_unread[row])
     read = frozenset(first) - unread
     if controller is not None:
         chosen = [first[name] for name in first if name in read]
@@ -163,6 +167,46 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     )
 
 
+def _refuse_empty_cells(
+    table: Table,
+    columns: Sequence[NumberColumn],
+    rows: FloatArray,
+    begin: IntArray,
+    several: bool,
+    hint: str,
+) -> None:
+    """Raise FileError where the first row of a pose lacks readings (rows, a); with `several` files,
+    another one may state all of them.
+
+    Parameters
+    ----------
+    begin : (rows,) first row of the pose, -1 for rows of two poses. hint : what else helps.
+    """
+    absent = np.isnan(rows)
+    is_first = begin == np.arange(len(rows))
+    for row in np.flatnonzero(is_first & absent.any(axis=1) & ~(several & absent.all(axis=1))):
+        column = columns[int(np.argmax(absent[row]))].name
+        raise table.row_error(int(row), f"column {column!r} is empty; write its value{hint}")
+
+
+def _refuse_other_readings(
+    table: Table, names: tuple[str, ...], rows: FloatArray, begin: IntArray
+) -> None:
+    """Raise FileError where readings (rows, a) differ from those in the first row `begin` (rows,)
+    of their pose, or belong to a row of two poses, where `begin` is -1.
+    """
+    absent = np.isnan(rows)
+    is_same = (rows == rows[begin]) | (absent & absent[begin])
+    is_wrong = (begin < 0) | ~is_same.all(axis=1)
+    for row in np.flatnonzero(is_wrong & ~absent.all(axis=1)):
+        if begin[row] < 0:
+            sentence = f"the row of {names[row]!r} compares poses and has no readings of its own"
+            raise table.row_error(int(row), f"{sentence}; leave these cells empty")
+        line = table.lines[begin[row]]
+        sentence = f"pose {names[row]!r} has other readings in line {line}"
+        raise table.row_error(int(row), f"{sentence}; correct them, or rename one of the two poses")
+
+
 def _find_first_rows(table: Table, names: tuple[str, ...]) -> dict[str, int]:
     """Return pose -> its first row, in the order of the file."""
     first: dict[str, int] = {}
@@ -174,14 +218,16 @@ def _find_first_rows(table: Table, names: tuple[str, ...]) -> dict[str, int]:
     return first
 
 
-def _find_members(table: Table, row: int, cell: str, index: Mapping[str, int]) -> tuple[int, ...]:
-    """Return the poses of a row."""
+def _find_members(
+    table: Table, row: int, cell: str, alone: Mapping[str, tuple[int]]
+) -> tuple[int, ...]:
+    """Return the poses of a row; `alone` are those of a row that names one pose."""
     names = [part.strip() for part in cell.split(LINK)]
     for name in names:
-        if name not in index:
-            sentence = f"unknown pose {name!r}{suggest_names(name, index)}"
+        if name not in alone:
+            sentence = f"unknown pose {name!r}{suggest_names(name, alone)}"
             raise table.row_error(row, f"{sentence}; add a row with its readings")
-    return tuple(index[name] for name in names)
+    return tuple(pose for name in names for pose in alone[name])
 
 
 def _reading_columns(
@@ -275,16 +321,25 @@ def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
     return stated
 
 
-def _refuse_contradiction(file: _FilePoses, row: int, other: _FilePoses, other_row: int) -> None:
-    """Raise FileError where two files state different readings, or sigmas, of one pose."""
-    for what, a, b in (
-        ("readings", file.readings[row], other.readings[other_row]),
-        ("sigma", file.sigma[row], other.sigma[other_row]),
-    ):
+def _refuse_contradictions(
+    file: _FilePoses, files: Sequence[_FilePoses], repeated: Mapping[int, tuple[int, int]]
+) -> None:
+    """Raise FileError where two files state different readings, or sigmas, of one pose.
+
+    `repeated` : row of the file -> number of another file, and its row of the same pose.
+    """
+    if not repeated:
+        return
+    rows = np.array(tuple(repeated))
+    number, other = np.array(tuple(repeated.values())).T
+    begin = np.cumsum([0, *(len(each.names) for each in files)])
+    for what in ("readings", "sigma"):
+        a = getattr(file, what)[rows]
+        b = np.concatenate([getattr(each, what) for each in files])[begin[number] + other]
         same = np.isclose(a, b, rtol=RELATIVE_ROUNDING, atol=ABSOLUTE_ROUNDING, equal_nan=True)
         unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
-        if not (same | unstated).all():
-            place = other.table.place(other_row)
+        for i in np.flatnonzero(~(same | unstated).all(axis=1)):
+            row, place = int(rows[i]), files[number[i]].table.place(int(other[i]))
             sentence = f"pose {file.names[row]!r} has other {what} here than in {place}"
             act = "correct them, or rename the pose in one of the files"
             raise file.table.row_error(row, f"{sentence}; {act}")

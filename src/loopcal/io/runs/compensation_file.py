@@ -55,10 +55,12 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
             raise table.header_error(f"{sentence}; {act}")
     columns = [table.numbers(name, get_dimension(name), empty=False) for name in robot.controlled]
     labels = table.pose_names()
+    used: set[str] = set()
     for i, label in enumerate(labels):
-        if not label or label in labels[:i]:
+        if not label or label in used:
             problem = f"duplicate target {label!r}" if label else "this target has no name"
             raise table.row_error(i, f"{problem}; give each target a name of its own")
+        used.add(label)
     return np.column_stack(columns), labels
 
 
@@ -82,9 +84,10 @@ def format_compensation(result: Compensation) -> str:
     header = ["pose", *(f"{name} [{unit}]" for name, unit in columns)]
     header += [f"{NOTE} {title} {name} [{unit}]" for title in errors for name, unit in axes]
     write([*header, f"{NOTE} status"])
+    usable = result.usable
     for i, label in enumerate(result.labels):
         cells = [
-            format_scaled(float(v), unit.factor_to_si) if result.usable[i] else ""
+            format_scaled(float(v), unit.factor_to_si) if usable[i] else ""
             for v, (_, unit) in zip(values[i], columns, strict=True)
         ]
         cells += [
