@@ -12,7 +12,7 @@ from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.residuals.correlated_errors import RHO, SHARE, estimate_correlated_errors
 from loopcal.diagnose.residuals.residual_patterns import test_correlation as measure_correlation
 from loopcal.diagnose.residuals.residual_rows import collect_residual_rows
-from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify
+from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.mechanism import forward
 from tests.estimate.dense_delta import NOMINAL, TOLERANCE, fit_delta, locate_nozzle
@@ -71,6 +71,36 @@ def test_most_probable_factor_on_the_tolerances_maximizes_the_density_of_the_dat
         )
         at_one = minus_log_density(0.0) <= best.fun + 1e-9
         assert factor == pytest.approx(1.0 if at_one else np.exp(best.x), rel=2e-3)
+
+
+def test_inflated_tolerances_have_the_degrees_of_freedom_of_their_factor():
+    """Of the covariance B (A'A + I / factor^2) B the part of the tolerances has 1 / (2 spread^2)
+    degrees of freedom; the estimate moves by the error of the factor, too.
+    """
+    case = Case("", tolerance=3.0, is_coarse=True)
+    data = measure(case, 1).measurements[0]
+    options = FitOptions(method=MAP(InflatedTolerances(by="global")), sigma_uncertainty=0.0)
+    fit = identify(ROBOT, data, options=options)
+    factor = fit.prior_conflict.inflation
+    assert factor > 1.5
+    dense = fit_densely(data, COARSE, 1.0 / factor**2)
+    A, identity = dense.A, np.eye(9)
+    log_factor = np.linspace(0.0, np.log(30.0 * factor), 400)
+    score = [
+        stats.multivariate_normal(cov=np.eye(len(A)) + np.exp(2.0 * x) * A @ A.T).logpdf(dense.data)
+        for x in log_factor
+    ]
+    weight = np.exp(np.array(score) - max(score))
+    square = (weight * (log_factor - np.log(factor)) ** 2).sum() / weight.sum()
+    B = np.linalg.inv(A.T @ A + identity / factor**2)
+    by_noise = (B @ A.T) ** 2
+    by_tolerances = (B / factor) ** 2
+    z = (dense.estimate - NOMINAL) / TOLERANCE
+    moved = 2.0 * B @ z / factor**2 * np.sqrt(square)
+    variance = by_noise.sum(axis=1) + by_tolerances.sum(axis=1) + moved**2
+    degrees = variance**2 / (by_tolerances.sum(axis=1) ** 2 * 2.0 * square)
+    np.testing.assert_allclose(fit.standard_deviations, TOLERANCE * np.sqrt(variance), rtol=1e-3)
+    np.testing.assert_allclose(fit.degrees, np.maximum(degrees, 0.5 / square), rtol=0.01)
 
 
 @pytest.mark.parametrize("off", [0.0, 6.0])

@@ -57,7 +57,8 @@ collected again, what a plan chooses by them, and the added set of parameters.
 
 INFLATED = (
     "stated tolerances are inflated by the most probable factor wherever it is above 1, no longer "
-    "only beyond doubt, and the intervals contain the uncertainty of the factor"
+    "only beyond doubt, and the intervals contain the uncertainty of the factor, also by the "
+    "degrees of freedom of the variances that it determines"
 )
 FOUND_NOISE = (
     "distances of outliers are in units of the noise that the other poses show, no longer of the "

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_rows_of
-from loopcal.estimate.inference.covariance_parts import NOISE, CovariancePart
+from loopcal.estimate.inference.covariance_parts import NOISE, TOLERANCES, CovariancePart
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.poses.source_rows import fold_sources
@@ -33,7 +33,7 @@ from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
-TOLERANCES, EARLIER, REPEATABILITY = "tolerances", "earlier calibration", "repeatability"
+EARLIER, REPEATABILITY = "earlier calibration", "repeatability"
 """Kinds of sources; others are the codes of the findings with which a covariance was added."""
 
 
@@ -105,8 +105,7 @@ def split_covariance(
         sources.append(Source(kind, "", "B", np.inf))
         factors.append(rows)
     own, moved = _propagate(assumed, factors, U)
-    stated = "B" if not fit.free_parameters.assumed.any() else "B (assumed)"
-    sources.append(Source(TOLERANCES, "", stated, np.inf))
+    sources.append(Source(TOLERANCES, "", *_evaluate_tolerances(fit)))
     rest, of_setup = _separate_setup(own, moved, linear.linearization)
     if len(fit.nuisance):  # rows of stated setup parameters act by these alone
         sources.append(Source(SETUP, "", *evaluated))
@@ -116,7 +115,7 @@ def split_covariance(
     for source, root in zip(sources, rest, strict=True):
         key = setup if source.kind == SETUP and setup is not None else source
         merged.setdefault(key, []).append(root)
-    for part in (part for part in fit.posterior.parts if part.source != NOISE):
+    for part in (part for part in fit.posterior.parts if part.is_added):
         name = _name_discrepancy(fit, part) if part.source == DISCREPANCY else ""
         key = Source(part.source, name, "A", part.degrees)
         merged.setdefault(key, []).append(part.root / fit.tolerance[:, None])
@@ -164,11 +163,24 @@ def _read_penalty(fit: Identification, linear: FitLinearization) -> _Penalty:
 
 def _evaluate_noise(fit: Identification) -> tuple[str, float]:
     """Return how the noise of the rows was evaluated, and its degrees of freedom."""
-    degrees = next((part.degrees for part in fit.posterior.parts if part.source == NOISE), np.inf)
+    degrees = _find_degrees(fit, NOISE)
     test = fit.residual_test
     if test.noise == "estimated" or test.failed:
         return "A", degrees
     return ("A and B" if np.isfinite(degrees) else "B"), degrees
+
+
+def _evaluate_tolerances(fit: Identification) -> tuple[str, float]:
+    """Return how the size of the deviations was evaluated, and its degrees of freedom."""
+    degrees = _find_degrees(fit, TOLERANCES)
+    if np.isfinite(degrees):
+        return "A and B", degrees
+    return ("B (assumed)" if fit.free_parameters.assumed.any() else "B"), degrees
+
+
+def _find_degrees(fit: Identification, source: str) -> float:
+    """Return the degrees of freedom of what a source contributes; infinite where it is known."""
+    return next((part.degrees for part in fit.posterior.parts if part.source == source), np.inf)
 
 
 def _name_discrepancy(fit: Identification, part: CovariancePart) -> str:

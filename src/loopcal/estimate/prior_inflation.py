@@ -3,18 +3,23 @@
 tolerances, and the uncertainty of the factors by which they are inflated.
 
 A factor is estimated from the data that are fitted. Its error moves the estimate, by dz / d(log
-factor) times the error of its logarithm, and this is added to the covariance.
+factor) times the error of its logarithm, and this is added to the covariance. It also changes the
+variances that the tolerances cause: with the standard deviation s of its logarithm these have the
+relative standard deviation 2 s, which is that of 1 / (2 s^2) degrees of freedom.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.added_covariance import add_covariance
+from loopcal.estimate.inference.covariance_parts import TOLERANCES, CovariancePart
+from loopcal.estimate.inference.posterior import find_variance_sources
 from loopcal.estimate.methods.component_choice import (
     ComponentSearch,
     compute_evidence,
@@ -120,39 +125,70 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     factor = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     if factor <= 1.0 and not method.components:
         return result
-    changes = [_change_by_factor(fit, method)] if factor > 1.0 else []
-    changes += _change_by_components(fit, method, factor)
-    root = np.stack(changes, axis=1) * result.tolerance[:, None]
+    errors = [_estimate_factor_error(result, fit)] if factor > 1.0 else []
+    errors += _estimate_component_errors(fit, method, factor)
+    scale = result.tolerance[:, None]
     parts = tuple(component.to_row(result.names) for component in method.components)
     finding = report_finding("prior.inflation", factor=factor, parts=parts)
-    return add_covariance(result, root, np.inf, finding)
+    change = np.concatenate([error.change[:, None] for error in errors], axis=1)
+    inflated = add_covariance(result, scale * change, np.inf, finding)
+    uncertain = [CovariancePart(TOLERANCES, scale * e.caused, e.degrees) for e in errors]
+    posterior = inflated.posterior
+    return replace(inflated, posterior=replace(posterior, parts=(*posterior.parts, *uncertain)))
 
 
-def _change_by_factor(fit: Descent, method: MAP) -> FloatArray:
-    """Return the change (p,) of the estimate, in tolerances, by one standard deviation of the
-    logarithm of the factor on all tolerances.
+class _FactorError(NamedTuple):
+    """What an error of a factor does.
 
-    In the coordinates y of the decomposition it is 2 (1 - f_i) y_i.
+    Attributes
+    ----------
+    change : (p,) of the estimate, in tolerances, by one standard deviation of the log factor.
+    caused : (p, k) root of the covariance, in tolerances, that the inflated deviations cause.
+    spread : standard deviation of the log factor.
     """
+
+    change: FloatArray
+    caused: FloatArray
+    spread: float
+
+    @property
+    def degrees(self) -> float:
+        """Degrees of freedom of the variance that the deviations cause."""
+        return 0.5 / self.spread**2
+
+
+def _estimate_factor_error(result: Identification, fit: Descent) -> _FactorError:
+    """Return what the error of the factor on all tolerances does.
+
+    In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i.
+    """
+    method = result.method
+    assert isinstance(method, MAP)
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
-    spread = estimate_factor_spread(_divide(d, method), method.read_inflation(d, fit.penalty))
+    factor = method.read_inflation(d, fit.penalty)
+    spread = float(estimate_factor_spread(_divide(d, method), factor)[0])
     change = 2.0 * (1.0 - d.filter_factors(penalty)) * d.solution(fit.penalty)
     change = np.where(penalty > 0.0, change, 0.0)
-    return np.asarray(d.deviation(change * spread[:, None])[0])
+    test, free = result.residual_test, result.free_parameters
+    prior = find_variance_sources(d, fit.penalty, test, method, free).prior
+    caused = d.scale[:, None] * d.prior_roots(fit.penalty, prior)[0]
+    return _FactorError(d.deviation(change * spread)[0], caused, spread)
 
 
-def _change_by_components(fit: Descent, method: MAP, factor: float) -> list[FloatArray]:
-    """Return the change (p,) of the estimate, in tolerances, by one standard deviation of the
-    logarithm of the factor of each component.
+def _estimate_component_errors(fit: Descent, method: MAP, factor: float) -> list[_FactorError]:
+    """Return what the errors of the factors of the components do.
 
     With the covariance S of the prior z = S h, and a variance v of E changes it by dz / dv = (1 - S
-    Q) E E'h (`component_choice`), v = factor^2 - 1 of the component.
+    Q) E E'h (`component_choice`), v = factor^2 - 1 of the component. Its deviations E w cause the
+    error (1 - S Q) E w of the estimate.
     """
     rows, p = _divide(fit.decomposition, method), len(fit.deviation[0])
     data = predict(rows, np.array([factor]))
     Q, h = data.information[0], data.score[0]
     S = factor**2 * compute_prior_covariance(p, method.correlation, method.components)
-    changes = []
+    # parameters without a tolerance follow the others
+    penalized = are_penalized(rows)
+    errors = []
     for component in method.components:
         others = tuple(c for c in method.components if c is not component)
         stated = compute_prior_covariance(p, method.correlation, others)
@@ -160,12 +196,11 @@ def _change_by_components(fit: Descent, method: MAP, factor: float) -> list[Floa
         variance = factor**2 * component.variance
         spread = estimate_variance_spread(predict(alone, np.array([factor])), component, variance)
         E = component.columns(p)
-        slope = E @ (E.T @ h)
-        change = (slope - S @ (Q @ slope)) * 2.0 * (1.0 + variance) * spread
-        # parameters without a tolerance follow the others
-        y = np.where(are_penalized(rows), rows.coordinates(change[None]), 0.0)
-        changes.append(np.asarray(rows.deviation(y)[0]))
-    return changes
+        left = E - S @ (Q @ E)
+        left = rows.deviation(np.where(penalized, rows.coordinates(left.T), 0.0)).T
+        change = left @ (E.T @ h) * (2.0 * (1.0 + variance) * spread)
+        errors.append(_FactorError(change, left * np.sqrt(variance), spread))
+    return errors
 
 
 def _divide(decomposition: Decomposition, method: MAP) -> Decomposition:

@@ -32,7 +32,6 @@ from loopcal.diagnose.fit_checks.influence import TESTABLE
 from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.inference.covariance_parts import NOISE
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.problem import Problem
@@ -338,7 +337,7 @@ def _list_pose_effects(
 
 def _find_added_root(posterior: Posterior) -> FloatArray:
     """Return the root (p, k) [SI] of what was added to the covariance of a fit."""
-    roots = [part.root for part in posterior.parts if part.source != NOISE]
+    roots = [part.root for part in posterior.parts if part.is_added]
     return np.concatenate([np.zeros((len(posterior.unit), 0)), *roots], axis=1)
 
 

@@ -16,6 +16,9 @@ PREFIX = "posterior_"
 NOISE = "noise"
 """Source of the part of the covariance that the noise of the rows causes."""
 
+TOLERANCES = "tolerances"
+"""Source of the part that the deviations from nominal cause, where their size was estimated."""
+
 PARTS = ("source", "degrees", "root", "part")
 """Arrays of a run folder (after `PREFIX`) with the parts of the covariance: the source and the
 degrees of freedom of each, the roots beside each other, and the number of the part of each column.
@@ -27,7 +30,8 @@ class CovariancePart(NamedTuple):
 
     Attributes
     ----------
-    source : what causes it: "noise", or the code of the finding with which it was added.
+    source : what causes it: "noise", "tolerances", or the code of the finding with which it was
+        added.
     root : (p, k) [SI], the part is root root'.
     degrees : degrees of freedom of its estimated size; infinite where it is known.
     """
@@ -35,6 +39,11 @@ class CovariancePart(NamedTuple):
     source: str
     root: FloatArray
     degrees: float
+
+    @property
+    def is_added(self) -> bool:
+        """Whether it is beside what noise and tolerances cause."""
+        return self.source not in (NOISE, TOLERANCES)
 
 
 def combine_degrees(total: FloatArray, squares: Iterable[tuple[FloatArray, float]]) -> FloatArray:
