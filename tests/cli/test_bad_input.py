@@ -365,10 +365,14 @@ def test_invalid_command_line_is_refused(run_refused, case) -> None:
 
 
 def test_folder_with_other_files_is_refused_as_run_folder(run_refused) -> None:
-    assert "this folder is not empty" in run_refused(
-        "calibrate hexapod-42 data.csv -o .", data_csv=DATA
-    )
-    assert "something other than a run" in run_refused("calibrate hexapod-42 data.csv -o . --force")
+    Path("mine").mkdir()
+    Path("mine/thesis.tex").touch()
+    command = "calibrate hexapod-42 data.csv -o"
+    assert "this folder is not empty" in run_refused(f"{command} mine", data_csv=DATA)
+    assert "something other than a run" in run_refused(f"{command} mine --force")
+    for place in (".", "..", "mine/.."):
+        assert "this folder is the working folder" in run_refused(f"{command} {place}")
+    assert "this folder is a mount point" in run_refused(f"{command} /proc")
 
 
 def test_missing_controller_file_is_refused(run_refused) -> None:

@@ -243,16 +243,17 @@ def test_invalid_plan_options_are_refused_and_nothing_is_written(folder, capsys,
 
 
 def test_force_replaces_a_plan_but_no_other_folder(folder, capsys):
-    (folder / "plan").mkdir()
-    (folder / "plan" / "plan.json").write_text("{}")
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 0
+    (folder / "plan" / "plan.png").unlink()
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 1
     assert "--force" in capsys.readouterr().err
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--force"]) == 0
-    assert (folder / "plan" / "measurements.csv").exists()
+    assert (folder / "plan" / "plan.png").exists()
     (folder / "mine").mkdir()
-    (folder / "mine" / "thesis.txt").write_text("x")
-    assert main(["plan", "linear-delta", "-o", "mine", *SMALL, "--force"]) == 1
-    assert "something other than a plan" in capsys.readouterr().err
+    for name in ("thesis.txt", "plan.json"):
+        (folder / "mine" / name).write_text("{}")
+        assert main(["plan", "linear-delta", "-o", "mine", *SMALL, "--force"]) == 1
+        assert "something other than a plan" in capsys.readouterr().err
 
 
 def test_force_keeps_measured_values_and_files_of_the_user(folder, capsys):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run folders are written completely or not at all, and only over other run folders."""
 
+import hashlib
 import json
 import math
 
@@ -19,13 +20,17 @@ from loopcal.units import Dimension
 
 
 def write(folder, force: bool = False, value: float = 1.5):
-    return write_run_folder(folder, {"value": value}, {"a": np.arange(3.0)}, "name: h\n", force)
+    result = {"made_by": {}, "fit": {}, "value": value}
+    return write_run_folder(folder, result, {"a": np.arange(3.0)}, "name: h\n", force)
 
 
 def test_run_folder_is_read_as_written(tmp_path) -> None:
     folder = write(tmp_path / "deep" / "run")
     result, arrays = read_run_folder(folder)
-    assert result == {"format": 1, "value": 1.5}
+    files = result.pop("files")
+    assert result == {"format": 1, "made_by": {}, "fit": {}, "value": 1.5}
+    assert list(files) == ["arrays.npz", "robot.yaml", "result.json"]
+    assert files["robot.yaml"] == hashlib.sha256(b"name: h\n").hexdigest()
     assert arrays["a"].tolist() == [0.0, 1.0, 2.0]
     assert (folder / "robot.yaml").read_text() == "name: h\n"
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["run"]

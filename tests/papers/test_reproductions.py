@@ -138,9 +138,12 @@ def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> No
         ]
     with pytest.raises(FileError, match="not empty"):
         write_folder(folder, build_reproduction(), MADE_BY)
-    (folder / "old").touch()
+    (folder / "figures" / "curve.png").unlink()
     write_folder(folder, build_reproduction(), MADE_BY, force=True)
-    assert not (folder / "old").exists()
+    assert (folder / "figures" / "curve.png").exists()
+    (folder / "figures" / "mine.png").touch()
+    with pytest.raises(FileError, match=r"contains figures/mine\.png, which does not belong"):
+        write_folder(folder, build_reproduction(), MADE_BY, force=True)
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
 
 
@@ -217,6 +220,7 @@ def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     document = json.loads(out, parse_constant=pytest.fail)
     written = json.loads((folder / "result.json").read_text("utf-8"))
     assert written.pop("made_by")["seeds"] == {"seed": 0}
+    assert "figures/figure_4.png" in written.pop("files")
     assert written == document
     assert (folder / "figures" / "figure_4.png").is_file()
     assert main(["reproduce", "hexapod-42", "--trials", "2"]) == 0

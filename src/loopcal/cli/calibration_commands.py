@@ -143,7 +143,7 @@ def calibrate(
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},
     )
-    refuse_run_folder(output, list(inputs.values()), force)
+    refuse_run_folder(output, force, list(inputs.values()))
     accepted = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
     measurements = read_measurements(data, machine, **accepted)
     with terminal.ProgressBar() as progress:

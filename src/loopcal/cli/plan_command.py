@@ -152,7 +152,8 @@ def plan(
     from loopcal.io import load_robot
     from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
 
-    refuse_plan_folder(output, force)
+    inputs = _list_inputs(robot, like, allowed, measured)
+    refuse_plan_folder(output, force, list(inputs.values()))
     machine = load_robot(robot)
     if options["measure"] == PLANE_LINE:
         _refuse_beside_plane_line()
@@ -170,7 +171,6 @@ def plan(
         with terminal.ProgressBar() as progress:
             result = plan_poses(machine, instrument, options=plan_options, progress=progress)
         document = {"format": FORMAT, **result.to_dict()}
-    inputs = _list_inputs(robot, like, allowed, measured)
     files = _write_plan(output, result, inputs, seed, force)
     if as_json:
         terminal.print_json(document)

@@ -79,9 +79,9 @@ def reproduce(
         return
     chosen = PAPERS[paper] if paper in PAPERS else find_paper(paper)
     if output is not None:
-        from loopcal.io.runs.run_folder import refuse_used_folder
+        from loopcal.papers.writing import refuse_study_folder
 
-        refuse_used_folder(output, force)
+        refuse_study_folder(output, force)
     result = chosen.run(seed, TRIALS if trials is None else trials, _print_step)
     if output is not None:
         from loopcal.io.runs.run_folder import collect_provenance

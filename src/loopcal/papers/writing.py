@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A reproduction as a folder: a page to read, every table as CSV and JSON, every figure as PNG.
 
-    page.md        what agrees, what does not and why, with all tables and figures
-    result.json    the same for programs, and under `made_by` where it comes from
-    tables/        NAME.csv and NAME.json, one row for each number
-    figures/       NAME.png
+page.md        what agrees, what does not and why, with all tables and figures
+result.json    the same for programs, and under `made_by` where it comes from
+tables/        NAME.csv and NAME.json, one row for each number
+figures/       NAME.png
 
-The folder is written under a temporary name and renamed, so it is either whole or absent.
 """
 
 from __future__ import annotations
@@ -18,14 +17,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.outputs import replace_folder
-from loopcal.io.runs.run_folder import RESULT, refuse_used_folder
+from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 
 if TYPE_CHECKING:
     from loopcal.papers.printed import Table
     from loopcal.papers.reproduction import Reproduction
 
 TEMPLATE = "page.md.j2"
+STUDY = FolderKind(
+    "study",
+    "result.json",
+    ("made_by", "paper"),
+    ("page.md", "tables/*.csv", "tables/*.json", "figures/*.png"),
+)
+
+
+def refuse_study_folder(path: Path, force: bool) -> None:
+    """Raise FileError where a study must not be written; see `refuse_folder`."""
+    refuse_folder(path, STUDY, force)
 
 
 def page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
@@ -58,17 +67,12 @@ def write_folder(
 
     Raises
     ------
-    FileError
-        The folder is in use, or cannot be written.
+    FileError : see `write_result_folder`.
     """
     from loopcal.papers.drawing import choose_styles, png
 
     path = Path(path)
-    refuse_used_folder(path, force)
-    files: dict[str, bytes] = {
-        "page.md": page(reproduction, made_by).encode(),
-        RESULT: to_json({"made_by": made_by, **reproduction.to_dict()}).encode(),
-    }
+    files = {"page.md": page(reproduction, made_by).encode("utf-8", "backslashreplace")}
     for table in (
         reproduction.summary(),
         *(c.table() for c in reproduction.comparisons),
@@ -79,10 +83,8 @@ def write_folder(
     style = choose_styles(reproduction.figures)
     for figure in reproduction.figures:
         files[f"figures/{figure.name}.png"] = png(figure, style)
-    with replace_folder(path, check=lambda folder: refuse_used_folder(folder, force)) as folder:
-        for name, content in files.items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_bytes(content)
+    document = {"made_by": made_by, **reproduction.to_dict()}
+    write_result_folder(path, STUDY, document, files, force)
     return path
 
 

@@ -4,10 +4,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from loopcal import serialization
+
+_SURROGATE = re.compile("[\ud800-\udfff]")
+"""Half a character: part of a file name that is not UTF-8."""
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -26,4 +30,5 @@ def to_json(document: Mapping[str, Any]) -> str:
     content = serialization.to_json(document, nulls)
     if nulls:
         content["nulls"] = nulls
-    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    return _SURROGATE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)

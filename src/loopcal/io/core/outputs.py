@@ -84,23 +84,17 @@ def _is_same_file(path: Path, other: Path) -> bool:
     return path.resolve() == other.resolve()
 
 
-def refuse_folder_in_use(path: Path, content: str, marker: str, force: bool) -> None:
-    """Raise FileError where a folder would replace something it must not.
+def resolve_folder(path: Path) -> Path:
+    """Return the folder that a write to `path` makes or replaces, without links and dots.
 
-    Parameters
-    ----------
-    path : of the folder to write. content : "run" or "plan", for messages.
-    marker : the file by which such a folder is recognized.
-    force : an older folder of the same sort may be replaced.
+    Raises
+    ------
+    FileError : the path is a circular link.
     """
-    if path.exists() and not path.is_dir():
-        raise FileError(f"this is a file, but the {content} is a folder; choose another name", path)
-    if not path.is_dir() or not any(path.iterdir()):
-        return
-    if not force:
-        raise FileError(report_finding("files.folder-in-use", content=content), path)
-    if not (path / marker).exists():
-        raise FileError(report_finding("files.folder-of-others", content=content), path)
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):
+        raise FileError("this symbolic link has no target; choose another name", path) from None
 
 
 @contextmanager
@@ -124,7 +118,7 @@ def replace_folder(
     FileError : in place of every OSError; or `files.written-unreadable`.
     """
     with report_write_errors(path):
-        target = path.resolve()
+        target = resolve_folder(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         with create_temporary(target, is_folder=True) as (temporary, _):
             yield temporary

@@ -104,7 +104,7 @@ def place_file(temporary: Path, target: Path, path: Path) -> None:
 def place_folder(
     temporary: Path, target: Path, path: Path, check: Callable[[Path], None] | None = None
 ) -> None:
-    """Give a complete folder its name; then `temporary` names the folder that had it, if any.
+    """Give a complete folder its name, and remove the folder that had it.
 
     Parameters
     ----------
@@ -113,27 +113,48 @@ def place_folder(
     """
     sync_tree(temporary)
     _record(path, target, temporary)
-    while True:
-        try:
-            temporary.rename(target)
-            break
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.EACCES):
-                raise
-            if not target.is_dir():
-                raise
+    while not _take_free_name(temporary, target):
         if check is not None:
             check(target)
-        try:
-            _exchange(temporary, target)
-        except FileNotFoundError:  # another program has removed the old folder
-            if temporary.is_dir():
-                continue
-            raise
-        if check is not None:
-            _check_replaced(temporary, target, check)
-        break
+        with _hold_folder(target):
+            try:
+                _exchange(temporary, target)
+            except FileNotFoundError:  # another program has removed the old folder
+                if temporary.is_dir():
+                    continue
+                raise
+            if check is not None:
+                _check_replaced(temporary, target, check)
+            sync_folder(target.parent)
+            _remove(temporary)
+            return
     sync_folder(target.parent)
+
+
+def _take_free_name(temporary: Path, target: Path) -> bool:
+    """Rename a folder where the name is free or that of an empty folder; return whether it was."""
+    if os.name == "nt" and target.is_dir() and not any(target.iterdir()):
+        target.rmdir()
+    try:
+        temporary.rename(target)
+    except OSError as error:
+        if target.is_dir() and error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.EACCES):
+            return False
+        raise
+    return True
+
+
+@contextmanager
+def _hold_folder(path: Path) -> Iterator[None]:
+    """Lock a folder that the body replaces, so that no other command takes it for a leftover."""
+    descriptor = _open_folder(path)
+    try:
+        if descriptor is not None:
+            lock(descriptor)
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def _check_replaced(old: Path, target: Path, check: Callable[[Path], None]) -> None:
@@ -151,21 +172,14 @@ def _exchange(new: Path, old: Path) -> None:
     if _exchange_names(new, old):
         return
     aside = _name_beside(old, OLD)
-    descriptor = _open_folder(old)
+    old.rename(aside)
     try:
-        if descriptor is not None:
-            lock(descriptor)
-        old.rename(aside)
-        try:
-            new.rename(old)
-        except BaseException:
-            if not old.exists():
-                aside.rename(old)
-            raise
-        aside.rename(new)
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
+        new.rename(old)
+    except BaseException:
+        if not old.exists():
+            aside.rename(old)
+        raise
+    aside.rename(new)
 
 
 def _exchange_names(first: Path, second: Path) -> bool:

@@ -14,7 +14,6 @@ measured.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,10 +23,8 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import quote_cell
-from loopcal.io.core.json_text import to_json
 from loopcal.io.core.numbers import parse_exact
-from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
-from loopcal.io.core.text_file import sha256
+from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
 from loopcal.mechanism import POSITION, Mechanism
@@ -39,8 +36,13 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
-OWN_FILES = (SHEET, DATA, RESULT, "plan.png", "curve.png")
-"""All files of a plan's folder."""
+PLAN = FolderKind(
+    "plan",
+    RESULT,
+    ("robot", "made_by"),
+    (SHEET, DATA, "plan.png", "curve.png"),
+    filled_in=(SHEET, DATA),
+)
 VIA = "via"
 DIGITS = 12
 """Significant digits of a number: more than it was rounded to, fewer than a double has."""
@@ -94,26 +96,9 @@ def format_plan_data(plan: Plan) -> str:
     return format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
 
 
-def refuse_plan_folder(path: Path, force: bool) -> None:
-    """Refuse a folder that a plan must not replace; filled-in or hand-written files are never lost.
-
-    Raises
-    ------
-    FileError
-        A file, a used folder without `force`, or a folder with other or changed files.
-    """
-    refuse_folder_in_use(path, "plan", RESULT, force)
-    if not path.is_dir() or not any(path.iterdir()):
-        return
-    for file in sorted(path.iterdir()):
-        if file.name not in OWN_FILES or not file.is_file():
-            sentence = "this file does not belong to a plan and is never removed"
-            raise FileError(f"{sentence}; move it, or choose another folder", file)
-    written = _read_digests(path / RESULT)
-    for file in (path / DATA, path / SHEET):
-        if file.exists() and sha256(file) != written.get(file.name):
-            sentence = "this file was filled in or changed since the plan was written"
-            raise FileError(f"{sentence}; move it, or choose another folder", file)
+def refuse_plan_folder(path: Path, force: bool, inputs: Sequence[Path] = ()) -> None:
+    """Raise FileError where a plan must not be written; see `refuse_folder`."""
+    refuse_folder(path, PLAN, force, inputs)
 
 
 def find_plan_sheet(data: Path) -> Path:
@@ -143,22 +128,15 @@ def write_plan_folder(
     Parameters
     ----------
     path : the folder to make. texts : name -> text of a file.
-    document : content of plan.json; `format`, and `files` with the sha256 of each text, are added.
+    document : content of plan.json; `format` and `files` are added.
     pictures : name -> function that writes it. force : replace an older, unchanged plan.
 
     Raises
     ------
-    FileError : the folder is in use, or cannot be written.
+    FileError : see `write_result_folder`.
     """
-    refuse_plan_folder(path, force)
-    with replace_folder(path, check=lambda old: refuse_plan_folder(old, force)) as folder:
-        for name, text in texts.items():
-            (folder / name).write_bytes(text.encode())
-        files = {name: sha256(folder / name) for name in texts}
-        text = to_json({"format": FORMAT, **document, "files": files})
-        (folder / RESULT).write_text(text, encoding="utf-8")
-        for name, save in pictures.items():
-            save(folder / name)
+    files = {name: text.encode() for name, text in texts.items()} | dict(pictures)
+    write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, force)
 
 
 def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:
@@ -180,15 +158,6 @@ def _list_path_coordinates(robot: Mechanism) -> str:
 def _format(value: float, factor: float) -> str:
     """Return a number [SI] in its unit, as short as it was rounded."""
     return f"{value / factor + 0.0:.{DIGITS}g}"
-
-
-def _read_digests(path: Path) -> Mapping[str, str]:
-    """Return name -> sha256 of the written texts of a plan; nothing where plan.json lacks them."""
-    try:
-        files = json.loads(path.read_bytes())["files"]
-        return {str(name): str(digest) for name, digest in files.items()}
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return {}
 
 
 def format_surface_sheet(plan: SurfacePlan) -> str:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +24,12 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.json_text import to_json
-from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
+from loopcal.io.core.result_folder import (
+    FolderKind,
+    describe_leftover,
+    refuse_folder,
+    write_result_folder,
+)
 from loopcal.io.core.text_file import as_path, read_text, sha256
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
@@ -45,6 +50,7 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 RESULT, ARRAYS = "result.json", "arrays.npz"
+RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))
 
 MADE_BY: Mapping[str, str] = {
     "command": "the command line, as a list of words",
@@ -82,18 +88,9 @@ def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
     return dict(result.get("made_by", {}).get("inputs", {}))
 
 
-def refuse_used_folder(path: str | Path, force: bool) -> None:
-    """Raise FileError where a run folder would replace something else, or a run without `force`."""
-    refuse_folder_in_use(as_path(path, "run folder"), "run", RESULT, force)
-
-
-def refuse_run_folder(folder: Path, inputs: Sequence[Path], force: bool) -> None:
-    """Raise FileError as `refuse_used_folder`, or where the folder contains an input."""
-    refuse_used_folder(folder, force)
-    for path in inputs:
-        if path.exists() and path.resolve().is_relative_to(folder.resolve()):
-            sentence = f"this folder contains the input {path} and cannot be replaced"
-            raise FileError(f"{sentence}; choose another name", folder)
+def refuse_run_folder(path: str | Path, force: bool, inputs: Sequence[Path] = ()) -> None:
+    """Raise FileError where a run must not be written; see `refuse_folder`."""
+    refuse_folder(as_path(path, "run folder"), RUN, force, inputs)
 
 
 def write_run_folder(
@@ -108,22 +105,19 @@ def write_run_folder(
 
     Parameters
     ----------
-    path : the folder to make. result : content of result.json; `format` is added.
+    path : the folder to make. result : content of result.json; `format` and `files` are added.
     arrays : name -> array, SI. robot_text : of the corrected robot file.
     force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
 
     Raises
     ------
-    FileError : the folder is in use, or cannot be written.
+    FileError : see `write_result_folder`.
     """
     path = as_path(path, "run folder")
-    refuse_used_folder(path, force)
-    text = to_json({"format": FORMAT, **result})
-    with replace_folder(path, check=lambda old: refuse_used_folder(old, force)) as folder:
-        (folder / RESULT).write_text(text, encoding="utf-8")
-        (folder / robot_name).write_text(robot_text, encoding="utf-8")
-        with (folder / ARRAYS).open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
+    stream = BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
+    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force)
     return path
 
 
@@ -138,7 +132,9 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     if not (path / RESULT).is_file():
         is_folder = f"is not a run folder (it has no {RESULT})"
         sentence = f"this {is_folder if path.exists() else 'run folder does not exist'}"
-        raise FileError(f"{sentence}; name a folder that a calibration wrote", path)
+        leftover = "" if path.exists() else describe_leftover(path, RESULT)
+        advice = leftover or "name a folder that a calibration wrote"
+        raise FileError(f"{sentence}; {advice}", path)
     try:
         result = json.loads(read_text(path / RESULT, "run result"))
     except ValueError as error:
