@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import textwrap
 from collections.abc import Mapping
@@ -11,20 +10,15 @@ from collections.abc import Mapping
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.io.core import file_reference
 from loopcal.io.core.yaml_file import read_yaml
-from loopcal.io.robot.identified_table import format_table
-from loopcal.io.robot.robot_file import get_source, list_shipped_robots
+from loopcal.io.core.yaml_text import add_key, quote_scalar, remove_key
+from loopcal.io.robot.identified_table import add_table
+from loopcal.io.robot.robot_file import format_robot, get_source, list_shipped_robots
 from loopcal.mechanism import FAMILIES, Mechanism
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar"}
 """The shipped robot of a family that does not have the name of the family."""
 
 WIDTH = 120
-
-FIXED = re.compile(r"^fixed:.*\n(?:(?:[ \t]+.*|-.*)\n)*", re.MULTILINE)
-"""The list in a file, in one line or in several."""
-
-PLAIN = re.compile(r"(?!(?:true|false|null)$)[A-Za-z][\w.-]*$")
-"""Names that YAML reads as text without quotes."""
 
 
 def format_new_robot(family: str, name: str) -> str:
@@ -48,7 +42,7 @@ def format_new_robot(family: str, name: str) -> str:
         raise MechanismError(f"{sentence}; allowed: {', '.join(known)}")
     text = shipped[example].read_text("utf-8")
     record = str(read_yaml(shipped[example], "robot file").content["family"])
-    new = {"name": _quote(name)}
+    new = {"name": quote_scalar(name)}
     new["source"] = "where these numbers come from"
     for key, value in new.items():
         line = f"{key}: {value}"
@@ -84,18 +78,12 @@ def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
     source = get_source(robot)
     entries = dict.fromkeys(source.record.fixed, "") | dict(dropped)
     if not entries:
-        return source.text + format_table(robot)
-    names = {name: _quote(name) for name in entries}
+        return format_robot(robot)
+    names = {name: quote_scalar(name) for name in entries}
     width = max(len(text) for text in names.values())
     lines = [
         f"  - {names[name]:<{width}}  # {comment}" if comment else f"  - {names[name]}"
         for name, comment in entries.items()
     ]
-    text = FIXED.sub("", source.text)
-    text = text if text.endswith("\n") else text + "\n"
-    return text + "\n".join(["fixed:", *lines]) + "\n" + format_table(robot)
-
-
-def _quote(name: str) -> str:
-    """Return a name as YAML, in quotes where it needs them."""
-    return name if PLAIN.match(name) else json.dumps(name)
+    file = add_key(remove_key(source.nominal_file, "fixed"), "\n".join(["fixed:", *lines]) + "\n")
+    return add_table(file, robot).text

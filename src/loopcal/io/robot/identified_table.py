@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
+from loopcal.io.core.yaml_text import add_key, quote_scalar
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import find_unit
@@ -40,10 +40,15 @@ def format_table(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
             value = format_scaled(float(robot.values[i]), shown.factor_to_si)
             half = math.nan if plus_minus is None else float(plus_minus[i]) / shown.factor_to_si
             text = f"{half:.2g}" if math.isfinite(half) else "null"
-            symbol = json.dumps(shown.symbol) if shown.symbol[0].isdigit() else shown.symbol
-            head = f"  - {{name: {parameter.name}, value: {value}"
-            rows.append(f"{head}, {PLUS_MINUS}: {text}, unit: {symbol}}}\n")
+            head = f"  - {{name: {quote_scalar(parameter.name)}, value: {value}"
+            rows.append(f"{head}, {PLUS_MINUS}: {text}, unit: {quote_scalar(shown.symbol)}}}\n")
     return "".join(rows)
+
+
+def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
+    """Return a robot file without a table with that of `format_table`."""
+    table = format_table(robot, plus_minus)
+    return add_key(file, table) if table else file
 
 
 def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
@@ -89,15 +94,3 @@ def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
             raise file.error(f"the unit of {name!r}: {error}", place) from None
         values[name] = value * factor
     return values
-
-
-def remove_table(file: YamlFile) -> str:
-    """Return the text of a robot file without its table: up to the next key at the left margin."""
-    if TABLE not in file.content:
-        return file.text
-    lines = file.text.split("\n")
-    start = file.line((TABLE,)) - file.first_line
-    end = start + 1
-    while end < len(lines) and (not lines[end] or lines[end][0] in " \t-}]"):
-        end += 1
-    return "\n".join(lines[:start] + lines[end:]).rstrip("\n") + "\n"

@@ -23,12 +23,8 @@ from loopcal.errors import ArgumentTypeError, FileError, MechanismError, suggest
 from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
-from loopcal.io.robot.identified_table import (
-    TABLE,
-    format_table,
-    read_identified_values,
-    remove_table,
-)
+from loopcal.io.core.yaml_text import remove_key
+from loopcal.io.robot.identified_table import TABLE, read_identified_values
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,
@@ -50,13 +46,26 @@ class RobotSource:
 
     Parameters
     ----------
-    path : the file. text : of the nominal file, without the `identified:` table.
-    record : the family's record, in SI.
+    file : the robot file. record : the family's record, in SI.
     """
 
-    path: Path
-    text: str
+    file: YamlFile
     record: Any
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.file.path
+
+    @property
+    def nominal_file(self) -> YamlFile:
+        """The file without the `identified:` table."""
+        return remove_key(self.file, TABLE)
+
+    @property
+    def text(self) -> str:
+        """Text of the nominal file."""
+        return self.nominal_file.text
 
 
 def load_robot(source: str | Path) -> Mechanism:
@@ -84,7 +93,7 @@ def build_robot(file: YamlFile) -> Mechanism:
     with name_files(file.path):
         record = read_record(file, content, family, units)
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
-        origin = RobotSource(file.path, remove_table(file), record)
+        origin = RobotSource(file, record)
         robot = build(_assemble(record, file), symbols, origin)
     if TABLE not in file.content:
         return robot
@@ -108,7 +117,7 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
 
 def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
     """Return the text that `save_robot` writes."""
-    return get_source(robot).text + format_table(robot, plus_minus)
+    return add_table(get_source(robot).nominal_file, robot, plus_minus).text
 
 
 def get_source(robot: Mechanism) -> RobotSource:
