@@ -61,8 +61,8 @@ def test_filled_in_template_of_two_kinds_is_accepted(tmp_path, capsys) -> None:
     words = "new gough -o robot.yaml --measurements data.csv --kind position,inclination --sigma-position 5um"  # noqa: E501
     assert main(words.split()) == 0
     text = (tmp_path / "data.csv").read_text()
-    assert "#   'position': {kind: position, noise: {x: 5 um" in text
-    assert "#   'inclination': {kind: inclination" in text
+    assert "#   position: {kind: position, noise: {x: 5 um" in text
+    assert "#   inclination: {kind: inclination" in text
     assert "pose,kind,q1 [mm]" in text
     rows = [f"p{i},position" + f",{i}" * 6 + f",{0.1 * i},{0.2 * i},{300 + i},," for i in range(4)]
     rows += [f"p{i},inclination,,,,,,,,,,{0.01 * i},{0.02 * i}" for i in range(4)]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.io import load_robot
-from loopcal.io.core.csv_table import read_table
+from loopcal.io.core.csv_table import format_row, read_table
 from loopcal.io.data.columns import TextColumn, find_open_column, is_context, list_columns
 from loopcal.measure import Component, Pose
 
@@ -20,8 +20,9 @@ def test_column_reads_the_values_that_it_writes(tmp_path, name) -> None:
     assert column is not None
     is_text = isinstance(column, TextColumn)
     values = (column.choices or ("a", 'b,"c"')) if is_text else (0.1, 1 / 3)
-    rows = "\n".join(f"p{i},{column.format(value)}" for i, value in enumerate(values))
-    (tmp_path / "data.csv").write_text(f"first,{column.header}\n{rows}\n")
+    rows = [format_row([f"p{i}", column.format(value)]) for i, value in enumerate(values)]
+    lines = [format_row(["first", column.header]), *rows]
+    (tmp_path / "data.csv").write_text("\n".join(lines) + "\n")
     read = column.parse(read_table(tmp_path / "data.csv"))
     if is_text:
         assert read == values

@@ -194,8 +194,12 @@ def suggest_header(header: str, symbol: str | None, known: Iterable[str]) -> str
     return f" (did you mean {name if written is None else f'{name} [{written}]'!r}?)"
 
 
-def quote_cell(text: str) -> str:
-    """Return text as a cell, in quotes where it contains a comma, a quote or a number sign."""
+def format_row(cells: Iterable[str]) -> str:
+    """Return a line of cells, in quotes where one contains a comma, a quote or a number sign."""
+    return ",".join(map(_quote_cell, cells))
+
+
+def _quote_cell(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"#') else text
 
 

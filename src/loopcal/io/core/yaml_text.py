@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from loopcal.errors import FileError
 from loopcal.io.core.yaml_file import YamlFile, make_round_trip_yaml, parse_yaml
 
-PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)\Z)[a-z][\w.-]*", re.IGNORECASE)
+PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
 """Text that every version of YAML reads as the same text without quotes."""
 
 Span = tuple[int, int]
@@ -26,6 +26,11 @@ Span = tuple[int, int]
 def quote_scalar(text: str) -> str:
     """Return text as a YAML scalar in one line, in double quotes where it needs them."""
     return text if PLAIN.fullmatch(text) else _escape(json.dumps(text, ensure_ascii=False))
+
+
+def format_flow_mapping(texts: Mapping[str, str]) -> str:
+    """Return a mapping in one line, from names and the YAML texts of their values."""
+    return f"{{{', '.join(f'{quote_scalar(name)}: {text}' for name, text in texts.items())}}}"
 
 
 def add_key(file: YamlFile, entry: str) -> YamlFile:
@@ -95,8 +100,8 @@ def _list_removals(text: str, key: str) -> Iterator[str]:
                 yield text[:start] + text[behind.end() :].lstrip(" ")
             yield re.sub(r",\s*\Z", "", text[:start]) + text[stop:]
         else:
-            after = text.find("\n", stop)
-            yield text[: _find_line(text, start)] + (text[after + 1 :] if after >= 0 else "")
+            after = text.find("\n", stop - 1) + 1 or len(text)  # the value may end with a break
+            yield text[: _find_line(text, start)] + text[after:]
 
 
 def _list_ends(node: Any) -> Iterator[int]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.io.core.csv_table import Table, quote_cell, suggest_header
+from loopcal.io.core.csv_table import Table, suggest_header
 from loopcal.io.core.decimal_columns import parse_decimals
 from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
 from loopcal.mechanism import Mechanism
@@ -85,8 +85,8 @@ class TextColumn(Column):
         return tuple(unicodedata.normalize("NFC", cell) for cell in cells)
 
     def format(self, value: Any) -> str:
-        """Return the text, quoted where necessary."""
-        return quote_cell(str(value))
+        """Return the text."""
+        return str(value)
 
 
 @dataclass(frozen=True)

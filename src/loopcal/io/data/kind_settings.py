@@ -30,6 +30,7 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
+from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
 from loopcal.mechanism import PoseRecord
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, EXAMPLES, SI_SYMBOLS, Dimension
@@ -154,8 +155,8 @@ def format_kind(
     if noise:
         units = {column.name: NOISE_UNITS[column.dimension] for column in kind.noise_columns}
         # nine digits: more would be rounding
-        sigmas = (f"{n}: {s / units[n][1]:.9g} {units[n][0]}" for n, s in noise.items())
-        texts["noise"] = f"{{{', '.join(sigmas)}}}"
+        sigmas = {name: f"{s / units[name][1]:.9g} {units[name][0]}" for name, s in noise.items()}
+        texts["noise"] = format_flow_mapping(sigmas)
     return {**texts, "noise_source": ASSUMED} if is_noise_assumed else texts
 
 
@@ -201,7 +202,7 @@ def _format_setting(key: str, value: Any) -> str:
     if key.startswith("T_"):
         return _format_frame(value)
     if isinstance(value, str):
-        return value
+        return quote_scalar(value)
     if isinstance(value, float):
         return repr(value) if key in DIRECTIONS else format_quantity(value, Dimension.LENGTH)
     items = value if isinstance(value, list | tuple) else value.tolist()
@@ -214,6 +215,6 @@ def _format_frame(T: FloatArray) -> str:
     """Return a pose (4, 4) as text of a `PoseRecord`."""
     lengths = zip("xyz", T[:3, 3], strict=True)
     turns = zip(("roll", "pitch", "yaw"), geometry.matrix_to_euler(T[:3, :3], "xyz"), strict=True)
-    texts = [f"{k}: {format_quantity(float(v) + 0.0, Dimension.LENGTH)}" for k, v in lengths]
-    texts += [f"{k}: {format_quantity(float(v) + 0.0, Dimension.ANGLE)}" for k, v in turns]
-    return f"{{{', '.join(texts)}}}"
+    texts = {k: format_quantity(float(v) + 0.0, Dimension.LENGTH) for k, v in lengths}
+    texts |= {k: format_quantity(float(v) + 0.0, Dimension.ANGLE) for k, v in turns}
+    return format_flow_mapping(texts)

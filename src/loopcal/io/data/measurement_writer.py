@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
+from loopcal.io.core.csv_table import format_row
 from loopcal.io.core.text_file import write_text
+from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
 from loopcal.io.data.columns import (
     FIT,
     HELD_OUT,
@@ -103,7 +105,7 @@ def format_measurements(
     names += [name for rows in data.observations for name in rows.context]
     names += [name for _, table in tables for name in table]
     columns: list[Column] = [known.get(n, ContextColumn(n)) for n in dict.fromkeys(names)]
-    lines.append(",".join(column.header for column in columns))
+    lines.append(format_row(column.header for column in columns))
 
     body: list[tuple[list[int], dict[str, Any]]] = []
     for label, rows, (_, table) in zip(labels, data.observations, tables, strict=True):
@@ -120,7 +122,8 @@ def format_measurements(
             cells[USE_COLUMN.name] = HELD_OUT if data.is_held_out[poses[0]] else FIT
             cells |= {name: values[poses[0]] for name, values in of_poses.items()}
             cells["block"] = data.block[poses[0]]
-        lines.append(",".join(c.format(cells[c.name]) if c.name in cells else "" for c in columns))
+        texts = (c.format(cells[c.name]) if c.name in cells else "" for c in columns)
+        lines.append(format_row(texts))
     return "\n".join(lines) + "\n"
 
 
@@ -139,7 +142,7 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
     names = ["pose", *(["kind"] if len(kinds) > 1 else []), *(a.name for a in robot.actuators)]
     names += [name_measured(column.name, robot) for kind in kinds for column in kind.columns]
-    header = ",".join(known[name].header for name in dict.fromkeys(names))
+    header = format_row(known[name].header for name in dict.fromkeys(names))
     compared = [
         COMPARED.format(label)
         for label, kind in zip(labels, kinds, strict=True)
@@ -230,16 +233,15 @@ def _tabulate_poses(data: Measurements, robot: Mechanism) -> tuple[str, dict[str
     columns = {a.name: data.readings[:, i] for i, a in enumerate(robot.actuators)}
     if data.reading_sigma is None:
         return "", columns
-    stated = []
+    stated: dict[str, str] = {}
     for i, actuator in enumerate(robot.actuators):
         sigma = np.where(np.isnan(data.readings[:, i]), np.nan, data.reading_sigma[:, i])
         values = np.unique(sigma[~np.isnan(sigma)])
         if len(values) == 1 and np.isfinite(values[0]):
-            text = format_quantity(float(values[0]), actuator.dimension)
-            stated.append(f"{actuator.name}: {text}")
+            stated[actuator.name] = format_quantity(float(values[0]), actuator.dimension)
         elif len(values):
             columns[SIGMA + actuator.name] = sigma
-    return f"{{{', '.join(stated)}}}", columns
+    return format_flow_mapping(stated), columns
 
 
 def _tabulate_rows(
@@ -273,10 +275,8 @@ def _format_settings(
 ) -> list[str]:
     """Return the front matter, from the label and the settings of each kind."""
     lines = [f"## {' '.join(remark.split())}"] if remark else []
-    lines += [f"# format: {FORMAT}", f"# robot: {robot.name}"]
+    lines += [f"# format: {FORMAT}", f"# robot: {quote_scalar(robot.name)}"]
     if len(settings) == 1:
         return lines + [f"# {key}: {text}" for key, text in settings[0][1].items()]
-    lines.append("# kinds:")
-    for label, texts in settings:
-        lines.append(f"#   '{label}': {{{', '.join(f'{k}: {t}' for k, t in texts.items())}}}")
-    return lines
+    labeled = (f"#   {quote_scalar(label)}: {format_flow_mapping(of)}" for label, of in settings)
+    return [*lines, "# kinds:", *labeled]

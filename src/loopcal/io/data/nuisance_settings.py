@@ -13,7 +13,6 @@ session in front, a name denotes the parameter of every session. The last matchi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
 from fnmatch import fnmatchcase
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from loopcal.errors import suggest_names
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile
+from loopcal.io.core.yaml_text import format_flow_mapping
 from loopcal.io.data.kind_settings import format_quantity
 from loopcal.units import Angle, Dimension, Length, Ratio
 
@@ -97,7 +97,7 @@ def read_stated_values(
 def format_stated_values(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
     """Return the setting `unknowns` as text, for the parameters among `entries`."""
     dimensions = {entry.name: entry.dimension for entry in entries}
-    texts = []
+    texts: dict[str, str] = {}
     for value in known:
         if value.name not in dimensions:
             continue
@@ -108,8 +108,8 @@ def format_stated_values(known: Sequence[StatedValue], entries: Sequence[Paramet
         if value.nominal is not None:
             start = f"start: {format_quantity(value.nominal, dimension)}"
             text = f"{{{start}, {text[1:]}" if value.sd else f"{{{start}, {FIXED}: true}}"
-        texts.append(f"{json.dumps(value.name, ensure_ascii=False)}: {text}")
-    return f"{{{', '.join(texts)}}}" if texts else ""
+        texts[value.name] = text
+    return format_flow_mapping(texts) if texts else ""
 
 
 def _match(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[Parameter]:

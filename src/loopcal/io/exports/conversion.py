@@ -26,7 +26,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import quote_cell
+from loopcal.io.core.csv_table import format_row
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.text_file import as_path
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
@@ -328,13 +328,13 @@ def _format_file(
     settings = {"format": FORMAT, **profile.record.settings}
     lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
     headers = (f"{n} [{symbol}]" if symbol is not None else n for n, symbol in columns.items())
-    lines.append(",".join(headers))
+    lines.append(format_row(headers))
     for i, row in enumerate(rows, 1):
         cells = {"pose": str(i), **row}
         # a target without a line has no covariance
         absent = ("0" if name.startswith(COVARIANCE) else "" for name in columns)
         pairs = zip(columns, absent, strict=True)
-        lines.append(",".join(quote_cell(cells.get(name, usual)) for name, usual in pairs))
+        lines.append(format_row(cells.get(name, usual) for name, usual in pairs))
     return "\n".join(lines) + "\n"
 
 

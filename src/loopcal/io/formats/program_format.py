@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.numbers import parse_finite
+from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
@@ -164,8 +164,8 @@ def format_head(
             *(f"# {line}" for line in textwrap.wrap(f"Read from {origin}. {remark}", 98)),
             "format: 1",
             f"family: {family}",
-            f"name: {json.dumps(name)}",
-            f"source: {json.dumps(origin)}",
+            f"name: {quote_scalar(name)}",
+            f"source: {quote_scalar(origin)}",
             f"units: {{length: {units[0]}, angle: {units[1]}}}\n\n",
         ]
     )

@@ -10,7 +10,6 @@ the text stays as it is.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.io.formats import urdf_tree
 from loopcal.io.formats.program_format import (
     Exported,
@@ -102,7 +102,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
     turns = any(name.startswith("r") for name in paths.freedoms)
     home = graph.places[platform] @ T_body_frame
     coordinates = choose_coordinates(graph.twists(platform, home[:3, 3]) @ motion)
-    drives = (f"  {json.dumps(name)}: {_format_drive(urdf, name)}" for name in graph.motors)
+    drives = (f"  {quote_scalar(name)}: {_format_drive(urdf, name)}" for name in graph.motors)
     what = f"a URDF with loop closures in {closures.name}"
     head = format_head(path, what, "limbs", options.name, ("m", "rad"), REMARK)
     text = head + ROBOT.format(
@@ -225,7 +225,7 @@ def _format_limb(
         else:
             chain.append(_format_joint(graph, joint, place, axis))
         if forward:
-            name = f"tip, name: {json.dumps(joint.name)}" if is_tip else json.dumps(joint.name)
+            name = f"tip, name: {quote_scalar(joint.name)}" if is_tip else quote_scalar(joint.name)
             errors.append(f"      - {{of: {name}, shift: [{_list_across(axis)}]}}")
         pending = geometry.invert_pose(joint.T_b if forward else joint.T_a)
         body = get_other_body(joint, body)
@@ -233,12 +233,12 @@ def _format_limb(
     attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
     if last.is_pin:
         # the far end of the pin, a joint of its own in the URDF
-        far = f"of: platform, name: {json.dumps(last.far)}"
+        far = f"of: platform, name: {quote_scalar(last.far)}"
         errors.append(f"      - {{{far}, shift: [{_list_across(last.axis)}]}}")
     elif turns:
         tip, attach = pending @ T_body_frame, np.eye(4)
     return LIMB.format(
-        name=json.dumps(limb[0].name),
+        name=quote_scalar(limb[0].name),
         chain="\n".join(chain),
         ending="rigid" if turns else "ball",
         tip=_format_pose(tip),
@@ -250,8 +250,8 @@ def _format_limb(
 def _format_joint(graph: JointGraph, joint: GraphJoint, place: FloatArray, axis: FloatArray) -> str:
     """Return one joint of a limb."""
     start = float(graph.get_pin_angle(joint) if joint.is_pin else graph.values[joint.name])
-    motor = f", actuated: {json.dumps(joint.name)}" if joint.name in graph.motors else ""
-    head = f"joint: {joint.kind}, name: {json.dumps(joint.name)}"
+    motor = f", actuated: {quote_scalar(joint.name)}" if joint.name in graph.motors else ""
+    head = f"joint: {joint.kind}, name: {quote_scalar(joint.name)}"
     where = f"at: {_format_pose(place)}, axis: {_format_list(axis)}"
     return f"      - {{{head}, {where}, start: {start!r}{motor}}}"
 

@@ -24,7 +24,7 @@ from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.core.yaml_text import remove_key
-from loopcal.io.robot.identified_table import TABLE, read_identified_values
+from loopcal.io.robot.identified_table import TABLE, add_table, read_identified_values
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,

@@ -9,8 +9,6 @@ so that the file is the start of a measurement file
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.io.core.csv_table import read_table, require_columns
+from loopcal.io.core.csv_table import format_row, read_table, require_columns
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
 from loopcal.mechanism import Mechanism
@@ -79,11 +77,9 @@ def format_compensation(result: Compensation) -> str:
         errors["U"] = result.uncertainty.expanded
     dimensions = (Dimension.LENGTH if name in "xyz" else Dimension.ANGLE for name in NAMES)
     axes = [(n, robot.get_unit(d)) for n, d in zip(NAMES, dimensions, strict=True)]
-    text = io.StringIO()
-    write = csv.writer(text, lineterminator="\n").writerow
     header = ["pose", *(f"{name} [{unit}]" for name, unit in columns)]
     header += [f"{NOTE} {title} {name} [{unit}]" for title in errors for name, unit in axes]
-    write([*header, f"{NOTE} status"])
+    lines = [format_row([*header, f"{NOTE} status"])]
     usable = result.usable
     for i, label in enumerate(result.labels):
         cells = [
@@ -95,8 +91,8 @@ def format_compensation(result: Compensation) -> str:
             for error in errors.values()
             for v, (_, unit) in zip(error[i], axes, strict=True)
         ]
-        write([label, *cells, str(result.findings[i])])
-    return text.getvalue()
+        lines.append(format_row([label, *cells, str(result.findings[i])]))
+    return "\n".join(lines) + "\n"
 
 
 def _format_error(value: float) -> str:

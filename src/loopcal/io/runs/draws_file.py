@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 
+from loopcal.io.core.csv_table import format_row
 from loopcal.io.core.numbers import format_scaled
 from loopcal.typing import FloatArray
 
@@ -28,11 +27,10 @@ def format_draws(
     names, units, factors : (p,) names, symbols of units, and their factors to SI.
     weight : (T,), optional.
     """
-    text = io.StringIO()
-    write = csv.writer(text, lineterminator="\n").writerow
     header = [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
-    write([*([] if weight is None else [WEIGHT]), *header])
+    lines = [format_row([*([] if weight is None else [WEIGHT]), *header])]
     for i, row in enumerate(draws):
         own = [] if weight is None else [repr(float(weight[i]))]
-        write([*own, *(format_scaled(float(v), f) for v, f in zip(row, factors, strict=True))])
-    return text.getvalue()
+        numbers = (format_scaled(float(v), f) for v, f in zip(row, factors, strict=True))
+        lines.append(format_row([*own, *numbers]))
+    return "\n".join(lines) + "\n"

@@ -14,6 +14,7 @@ measured.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import quote_cell
+from loopcal.io.core.csv_table import format_row
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
@@ -71,12 +72,12 @@ def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
         f"## Poses of {robot.name} to measure in this order, starting from home.",
         f"## Between two poses move straight in {path}. Measure {FIT} and",
         f"## {HELD_OUT} poses alike; only pass through {VIA} poses.",
-        ",".join(["step", "pose", USE_COLUMN.name, *headers]),
+        format_row(["step", "pose", USE_COLUMN.name, *headers]),
     ]
     for step, stop in enumerate(stops, 1):
         use = VIA if stop.is_via else HELD_OUT if stop.is_held_out else FIT
         numbers = map(_format, (*stop.coordinates, *stop.readings), factors)
-        lines.append(",".join([str(step), quote_cell(stop.label), use, *numbers]))
+        lines.append(format_row([str(step), stop.label, use, *numbers]))
     return "\n".join(lines) + "\n"
 
 
@@ -167,7 +168,7 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
     columns, factors = _list_columns(robot)
     headers = ["step", "pose", "group", "role", "hold", f"tolerance [{length.symbol}]"]
     headers += [*(f"hold.{name} [{length.symbol}]" for name in POSITION), *columns]
-    lines, poses = [INSTRUCTIONS.format(robot=robot.name), ",".join(headers)], plan.poses
+    lines, poses = [INSTRUCTIONS.format(robot=robot.name), format_row(headers)], plan.poses
     for g, members in enumerate(poses.groups):
         for i, (role, row) in enumerate(zip(plan.list_roles(), members, strict=True)):
             hold = plan.list_fixed_coordinates(g, i)
@@ -180,7 +181,7 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
                 for name, position in zip(POSITION, plan.positions[g, 0], strict=True)
             ]
             cells += map(_format, (*poses.coordinates[row], *poses.readings[row]), factors)
-            lines.append(",".join(quote_cell(cell) for cell in cells))
+            lines.append(format_row(cells))
     return "\n".join(lines) + "\n"
 
 
@@ -202,8 +203,9 @@ def format_surface_data(plan: SurfacePlan) -> str:
     lines = format_measurements(data, robot).splitlines()
     first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     names = _list_columns(robot)[0][-len(robot.actuators) :]
-    is_reading = [name in names for name in lines[first].split(",")]
+    header, *rows = csv.reader(lines[first:])
+    is_reading = [name in names for name in header]
     order = {label: i for i, label in enumerate(poses.labels)}
-    rows = sorted((line.split(",") for line in lines[first + 1 :]), key=lambda row: order[row[0]])
+    rows = sorted(rows, key=lambda row: order[row[0]])
     empty = [["" if is_reading[i] else cell for i, cell in enumerate(row)] for row in rows]
-    return "\n".join([*lines[: first + 1], *(",".join(row) for row in empty)]) + "\n"
+    return "\n".join([*lines[:first], *map(format_row, [header, *empty])]) + "\n"
