@@ -138,7 +138,7 @@ def test_local_minimum_far_from_home_is_left_or_marked():
         np.array([0, 0, 0.2, 0, 0, 0]) + np.random.default_rng(0).uniform(-1, 1, (600, 6)) * reach
     )
     result = inverse(robot, asked)
-    result = result.take(result.converged)
+    result = result.take(result.closed)
     again = forward(robot, result.q)
     # the readings are consistent, so a residual belongs to a local minimum beside the true pose
     assert again.residual[again.converged].max() < 1e-2 * robot.size

@@ -59,7 +59,7 @@ def test_allowed_paths_satisfy_the_constraints_at_finer_steps(hexapod):
         inside, margin, sign = _check_path_finely(hexapod, edge[a], edge[b], 150)
         assert inside.all()
         assert margin.min() > 0.3 - 1e-3
-        assert (sign == hexapod.checker.closure_sign).all()
+        assert (sign == hexapod.checker.robot.home_state.closure_sign).all()
 
 
 def test_path_that_leaves_the_strokes_is_refused_with_the_reason(hexapod):

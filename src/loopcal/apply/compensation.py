@@ -55,6 +55,7 @@ class Reach(Enum):
     REACHED = "reached"
     IN_PART = "reached in part"
     OUTSIDE = "outside the limits"
+    OTHER_MODE = "in another mode"
     UNREACHABLE = "unreachable"
     NOT_CONVERGED = "not converged"
 
@@ -63,6 +64,7 @@ CODES = {
     "compensation.reached": Reach.REACHED,
     "compensation.reached-in-part": Reach.IN_PART,
     "compensation.outside-limits": Reach.OUTSIDE,
+    "compensation.other-mode": Reach.OTHER_MODE,
     "compensation.unreachable": Reach.UNREACHABLE,
     "compensation.not-converged": Reach.NOT_CONVERGED,
 }
@@ -198,8 +200,7 @@ def compensate(
     count.begin(TASK)
     best = inverse(robot, targets)
     count.begin(TASK)
-    start = _forward_start(robot, best)
-    before = geometry.pose_difference(forward(robot, uncorrected.q, start).T, wanted)
+    before = geometry.pose_difference(forward(robot, uncorrected.q).T, wanted)
     if mode == "readings":
         result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
     else:
@@ -271,11 +272,6 @@ class _Iteration:
     distances: FloatArray
 
 
-def _forward_start(robot: Mechanism, best: Solution) -> Solution | None:
-    """Return the start of forward solutions: the best poses where all converged, else home."""
-    return best if best.converged.all() and robot.program.sigma is None else None
-
-
 def _shift_commands(
     robot: Mechanism,
     controller: Mechanism,
@@ -288,17 +284,16 @@ def _shift_commands(
 
     The shift is a twist, so no choice of angles is singular. `count` receives the steps.
     """
-    start = _forward_start(robot, best)
     solution = uncorrected
     commands = read_coordinates(solution.T, controller.controlled)
-    final = forward(robot, solution.q, start)
+    final = forward(robot, solution.q)
     distances = [geometry.pose_difference(final.T, best.T)]
     for _ in range(steps):
         count.begin(TASK)
         moved = geometry.apply_twist(solution.T, -distances[-1])
         commands = read_coordinates(moved, controller.controlled)
         solution = inverse(controller, commands, solution if solution.converged.all() else None)
-        final = forward(robot, solution.q, start)
+        final = forward(robot, solution.q)
         distances.append(geometry.pose_difference(final.T, best.T))
     return _Iteration(final, commands, np.stack(distances))
 
@@ -320,7 +315,9 @@ def _report_targets(
     findings = []
     for i in range(len(not_compensable)):
         failed = next((s for s in (best, uncorrected, final) if not s.converged[i]), None)
-        if failed is not None:
+        if failed is best and best.closed[i]:
+            findings.append(report_finding("compensation.other-mode"))
+        elif failed is not None:
             whose = "the controller's geometry: " if failed is uncorrected else ""
             reason = whose + str(failed.explain(i))
             findings.append(report_finding("compensation.unreachable", reason=reason))

@@ -76,8 +76,8 @@ def forward_trials(
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
-    begin = _clear_sign(robot, start or robot.home_state)
-    state = _clear_sign(robot, engine.solve(robot.program, e, joints, begin))
+    begin = clear_sign(robot, start or robot.home_state)
+    state = clear_sign(robot, engine.solve(robot.program, e, joints, begin))
     wrong = _find_wrong_rows(robot, state, begin)
     if not wrong.any():
         return state
@@ -159,7 +159,7 @@ def _is_square(robot: Mechanism) -> bool:
     return count_equations(robot.program, free=False) == len(robot.freedoms)
 
 
-def _clear_sign(robot: Mechanism, state: State) -> State:
+def clear_sign(robot: Mechanism, state: State) -> State:
     """Return the state with sign 0 if closure is not square: the sign means nothing there."""
     if _is_square(robot):
         return state
@@ -232,14 +232,14 @@ def _take_steps(
         solved = engine.solve(
             robot.program, e[moving], q, select_rows(current, (len(target), 1), moving, zero)
         )
-        current = replace_rows(current, moving, zero, _clear_sign(robot, solved))
+        current = replace_rows(current, moving, zero, clear_sign(robot, solved))
         if leave and step < count:
             failed = moving[current.status[moving, 0] != Status.CONVERGED]
             if len(failed):
                 zero = np.zeros(len(failed), int)
                 state = select_rows(current, (len(target), 1), failed, zero)
                 solved = engine.solve(robot.program, e[failed], target[failed], state)
-                current = replace_rows(current, failed, zero, _clear_sign(robot, solved))
+                current = replace_rows(current, failed, zero, clear_sign(robot, solved))
                 moving = np.setdiff1d(moving, failed)
                 if not len(moving):
                     break

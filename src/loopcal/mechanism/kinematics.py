@@ -32,7 +32,8 @@ from loopcal.mechanism.sensitivity import (
     name_passive_joints,
     stack_platform_rows,
 )
-from loopcal.mechanism.states import Status, select_poses
+from loopcal.mechanism.solution_modes import solve_in_mode
+from loopcal.mechanism.states import Status, is_closed, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
 
@@ -83,6 +84,11 @@ class Solution:
     def converged(self) -> BoolArray:
         """Rows (n,) that are closed in the mode of the start."""
         return self.status == Status.CONVERGED
+
+    @property
+    def closed(self) -> BoolArray:
+        """Rows (n,) that are closed in whatever mode."""
+        return is_closed(self.status)
 
     def take(self, rows: NDArray[Any]) -> Solution:
         """Return these rows, by position or by a mask (n,)."""
@@ -150,7 +156,8 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
 
     Returns
     -------
-    Solution; rows that fail are marked in `status`, never raised.
+    Solution; rows that fail are marked in `status`, never raised. A row is marked `OTHER_MODE`
+    where the loops close at the target, but the readings lead from the start to another pose.
 
     Raises
     ------
@@ -167,9 +174,16 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
-        state = find_nearest_reachable(robot, values, T[None], begin)
+        state = solve_in_mode(
+            robot, lambda T, start: find_nearest_reachable(robot, values, T[None], start), T, begin
+        )
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
-        state = inverse_trials(robot, values, np.atleast_2d(wanted)[None], begin)
+        state = solve_in_mode(
+            robot,
+            lambda x, start: inverse_trials(robot, values, x[None], start),
+            np.atleast_2d(wanted),
+            begin,
+        )
     else:
         raise DataError(f"a target of shape {wanted.shape} was given; allowed are {shapes}")
     return make_solution(robot, state, compute_readings(robot, values, state)[0])

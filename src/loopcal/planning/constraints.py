@@ -21,7 +21,6 @@ from loopcal.mechanism import (
     Mechanism,
     Solution,
     analyze_singularity,
-    compute_closure_sign,
     compute_median_margins,
     evaluate_limits,
 )
@@ -172,17 +171,15 @@ class ConstraintChecker:
     Attributes
     ----------
     medians : of margin and drive margin over the workspace.
-    closure_sign : of the determinant at home; another sign is beyond a singularity.
     """
 
     robot: Mechanism
     constraints: Constraints
     medians: tuple[float, float]
-    closure_sign: int
 
     def check_poses(self, solution: Solution, at_pose: bool = True) -> ConstraintCheck:
         """Check poses; `at_pose` False omits the line of sight, which only measuring needs."""
-        allowed = np.array(solution.converged)
+        allowed = np.array(solution.closed)
         violations = np.full(len(allowed), None, dtype=object)
         violations[~allowed] = Violation("loops-open")
         for violation, violated in self._find_violations(solution, at_pose):
@@ -203,7 +200,7 @@ class ConstraintChecker:
                 ~(limit.margin[0] >= -slack),
             )
         near = analyze_singularity(robot, solution, self.medians)
-        yield Violation("beyond-singularity"), near.closure_sign != self.closure_sign
+        yield Violation("other-mode"), ~solution.converged
         margin = required.min_margin
         yield (
             Violation("near-singularity", (("min_margin", margin),)),
@@ -224,10 +221,7 @@ class ConstraintChecker:
 
 def build_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
     """Return the checker of a robot's poses; None stands for the default constraints."""
-    closure_sign = int(compute_closure_sign(robot, robot.values[None], robot.home_state)[0, 0])
-    return ConstraintChecker(
-        robot, constraints or Constraints(), compute_median_margins(robot), closure_sign
-    )
+    return ConstraintChecker(robot, constraints or Constraints(), compute_median_margins(robot))
 
 
 def list_reasons(counts: Mapping[Violation, int]) -> tuple[dict[str, Any], ...]:

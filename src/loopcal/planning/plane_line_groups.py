@@ -33,7 +33,6 @@ from loopcal.findings import report_finding
 from loopcal.mechanism import (
     POSITION,
     Mechanism,
-    compute_closure_sign,
     differentiate_pose,
     evaluate_limits,
     inverse,
@@ -257,8 +256,7 @@ class PlaneLineGroups:
         robot, free, values = self.robot, self.free, self.robot.values[None]
         solution = inverse(robot, x)
         state, q = solution.state, solution.q[None]
-        home_sign = compute_closure_sign(robot, values, robot.home_state)
-        reached = solution.converged & (state.closure_sign == home_sign)[0]
+        reached = solution.converged
         for limit in evaluate_limits(robot, values, q, state):
             reached = reached & (limit.margin[0] >= 0.0)
         if checker is not None:

@@ -156,7 +156,7 @@ def _is_on_other_branch(robot: Mechanism, poses: EstimatedPoses, chosen: BoolArr
         turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
         size = np.where(turning, 1.0, robot.size)
         gap = np.abs(np.where(turning, wrap_angle(gap), gap)) / size
-        other[chosen] = home.converged[:, None] & (gap > SAME_READING)
+        other[chosen] = home.closed[:, None] & (gap > SAME_READING)
     return other
 
 

@@ -69,7 +69,7 @@ def _begin_at_measured(
 ) -> PoseStates:
     """Return starts with poses (trials, poses) at T (k, 4, 4), missing readings as there."""
     solution = inverse(robot, T)
-    good = solution.converged
+    good = solution.closed
     chosen = (where[0][good], where[1][good])
     q = np.where(missing[chosen], solution.q[good], begin.q[chosen])
     state = map_arrays(lambda array: array[0, good], solution.state)

@@ -69,7 +69,7 @@ TRIED: Mapping[str, str] = {
 CONSTRAINTS = {
     "loops-open": "the loops cannot be closed",
     "limit-exceeded": "{limit} exceeded",
-    "beyond-singularity": "beyond a singularity",
+    "other-mode": "in another mode than home",
     "near-singularity": "near a singularity (margin below {min_margin} of the median)",
     "tilt-exceeded": "tilt above {max_tilt_deg:.4g} deg",
     "distance-out-of-range": "instrument too near or too far",

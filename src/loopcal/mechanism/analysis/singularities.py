@@ -30,7 +30,7 @@ from loopcal.mechanism.kinematics import Solution, forward, inverse, make_soluti
 from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
-from loopcal.mechanism.states import driven_values, is_closed, join_states
+from loopcal.mechanism.states import driven_values, join_states
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -152,7 +152,7 @@ def analyze_singularity(
     """
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
     margin, direction, drive_margin, drive = _compute_margins(robot, solution.state)
-    closed = is_closed(solution.status)
+    closed = solution.closed
     sign = compute_closure_sign(robot, robot.values[None], solution.state)[0]
     return Singularity(
         np.where(closed, sign, 0).astype(np.int8),
@@ -198,7 +198,7 @@ def trace_singularity(
     for point in np.atleast_2d(np.asarray(points, dtype=float)):
         step = solve(robot, point[None], start=last)
         steps.append(step)
-        last = step if is_closed(step.status)[0] else last
+        last = step if step.closed[0] else last
     state = join_states(*(step.state for step in steps))
     path = make_solution(robot, state, np.concatenate([step.q for step in steps]))
     result = analyze_singularity(robot, path, medians)

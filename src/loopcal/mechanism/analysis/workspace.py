@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism.batch_kinematics import compute_closure_sign
 from loopcal.mechanism.kinematics import Solution, check_arguments, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import compute_limb_frames
@@ -141,7 +140,8 @@ def sample_workspace(
 
     Coordinates are uniform in their ranges; phi and theta are uniform over the area of the sphere
     that they enclose. Positions are rejected if the loops cannot be closed, if a stroke, a joint
-    limit or a cone is exceeded, and beyond a singularity, seen from home.
+    limit or a cone is exceeded, and where the readings lead from home to another pose (see
+    `inverse`).
 
     Parameters
     ----------
@@ -233,13 +233,11 @@ def draw_coordinates(
 def _find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]) -> BoolArray:
     """Return which rows the machine reaches (n,); count the reasons of the others."""
     values, solution = robot.values[None], inverse(robot, coordinates)
-    good = np.array(solution.converged)
+    good = np.array(solution.closed)
     rejected["the loops cannot be closed"] += int((~good).sum())
     for limit in evaluate_limits(robot, values, solution.q[None], solution.state):
         outside = good & ~(limit.margin[0] >= 0)
         rejected[f"{limit.name} is exceeded"] += int(outside.sum())
         good &= ~outside
-    sign = compute_closure_sign(robot, values, solution.state)[0]
-    beyond = good & (sign != compute_closure_sign(robot, values, robot.home_state)[0, 0])
-    rejected["beyond a singularity, seen from home"] += int(beyond.sum())
-    return good & ~beyond
+    rejected["in another mode than home"] += int((good & ~solution.converged).sum())
+    return good & solution.converged

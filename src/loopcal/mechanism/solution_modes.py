@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inverse solutions in the mode of their start: those whose readings lead from there to the target.
+
+Loops that close at a target do not say that the machine gets there: the same readings may close the
+loops elsewhere, and the same pose may have several readings. A solution is in the mode of its start
+if its closure sign is the start's and forward kinematics from the start returns its pose. A
+solution in another mode is solved again along the straight path of poses from the start. Source:
+docs/theory/kinematics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.engine import State
+from loopcal.mechanism.batch_kinematics import (
+    clear_sign,
+    compute_readings,
+    forward_trials,
+    inverse_trials,
+)
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.states import Status, replace_rows, reshape_rows, select_poses
+from loopcal.numerics.trial_batch import map_arrays
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+SAME_POSE = 1e-7
+"""Largest difference of equal poses: lengths relative to the robot's size, angles in radians.
+
+Rounding grows close to a singularity, up to the square root of the machine precision.
+"""
+STEPS = 8
+"""Steps of the path from the start's pose to a target."""
+
+Solver = Callable[[FloatArray, State | None], State]
+"""Solves inverse kinematics for targets (n, ..) from a start: (1, n) states."""
+
+
+def solve_in_mode(
+    robot: Mechanism, solve: Solver, target: FloatArray, start: State | None
+) -> State:
+    """Return inverse solutions (1, n) for targets (n, ..) in the mode of `start` (default: home).
+
+    A row whose loops close in another mode only is marked `OTHER_MODE`.
+    """
+    state = solve(target, start)
+    begin = _repeat_poses(start or robot.home_state, state.T.shape[1])
+    is_other = find_other_modes(robot, state, begin)
+    rows = np.flatnonzero(is_other)
+    if not len(rows):
+        return state
+    state = replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
+    first = select_poses(begin, rows)
+    near, arrived = _follow_poses(robot, first, state.T[0, rows])
+    if not len(arrived):
+        return state
+    again = solve(target[rows[arrived]], near)
+    closed = again.status[0] == Status.CONVERGED
+    good = closed & ~find_other_modes(robot, again, select_poses(first, arrived))
+    rows, new = rows[arrived[good]], select_poses(again, good)
+    return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+
+
+def find_other_modes(robot: Mechanism, state: State, begin: State) -> BoolArray:
+    """Return the closed rows (n,) of a state (1, n) whose readings lead elsewhere from `begin`.
+
+    Forward kinematics accepts no solution of another sign, so rows of another sign are not solved.
+    """
+    begin, closed = clear_sign(robot, begin), state.status[0] == Status.CONVERGED
+    is_other = closed & (clear_sign(robot, state).closure_sign[0] != begin.closure_sign[0])
+    rows = np.flatnonzero(closed & ~is_other)
+    values, chosen = robot.values[None], select_poses(state, rows)
+    q = compute_readings(robot, values, chosen)
+    back = forward_trials(robot, values, q, select_poses(begin, rows))
+    gap = np.abs(geometry.pose_difference(back.T[0], chosen.T[0]) * robot.twist_scale).max(axis=1)
+    returned = (back.status[0] == Status.CONVERGED) & (gap <= SAME_POSE * robot.size)
+    is_other[rows] = ~returned
+    return is_other
+
+
+def _repeat_poses(state: State, n: int) -> State:
+    """Return a state (1, 1) or (1, n) as (1, n)."""
+    return map_arrays(lambda a: np.broadcast_to(a, (1, n, *a.shape[2:])), state)
+
+
+def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
+    """Return solutions (1, k) close to poses T (n, 4, 4), and which of these rows arrived (k,).
+
+    They are reached from the start `first` (1, n) in equal steps.
+    """
+    values, alive, current = robot.values[None], np.arange(len(T)), first
+    twist = geometry.pose_difference(T, first.T[0])
+    for i in range(1, STEPS + 1):
+        via = geometry.apply_twist(first.T[0, alive], (i / STEPS) * twist[alive])
+        target = read_coordinates(via, robot.controlled)
+        current = inverse_trials(robot, values, target[None], current)
+        closed = current.status[0] == Status.CONVERGED
+        current, alive = select_poses(current, closed), alive[closed]
+        if not len(alive):
+            break
+    return current, alive

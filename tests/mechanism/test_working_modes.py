@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A target counts as reached only if forward kinematics from the start returns it: every shipped
+robot, in its workspace and far beyond it.
+
+A new file in src/loopcal/robots is included automatically.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from loopcal import geometry
+from loopcal.apply.compensation import Reach, compensate
+from loopcal.errors import DataError
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure import solve_commanded_poses
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    Status,
+    check_limits,
+    draw_coordinates,
+    forward,
+    inverse,
+    read_coordinates,
+    sample_workspace,
+    workspace_ranges,
+)
+from loopcal.mechanism.analysis.modes import find_working_modes
+from loopcal.mechanism.analysis.singularities import trace_singularity
+
+Array = NDArray[np.float64]
+ROBOTS = tuple(list_shipped_robots())
+ROWS = 40
+WIDE = (1.0, 2.5, 6.0)  # times the ranges of the workspace
+ROUNDING = 1e-9  # of the size, or in radians
+
+
+@cache
+def load_cached_robot(name: str) -> Mechanism:
+    return load_robot(name)
+
+
+def draw_targets(robot: Mechanism, wide: float, n: int = ROWS) -> Array:
+    """Draw coordinates (n, c) from ranges of the workspace widened about their middle."""
+    ranges = {}
+    for name, (low, high) in workspace_ranges(robot).items():
+        middle, half = (low + high) / 2, wide * (high - low) / 2
+        ranges[name] = (middle - half, middle + half)
+    if "theta" in ranges:
+        ranges["theta"] = (0.0, min(ranges["theta"][1], 3.0))
+    return draw_coordinates(np.random.default_rng(5), robot.controlled, ranges, n)
+
+
+def measure_gap(robot: Mechanism, solution: Solution, wanted: Array) -> Array:
+    """Return how far (n,) forward solutions are from poses, per size; infinite where they fail."""
+    gap = np.abs(geometry.pose_difference(solution.T, wanted) * robot.twist_scale).max(axis=1)
+    return np.where(solution.converged, gap / robot.size, np.inf)
+
+
+@pytest.mark.parametrize("wide", WIDE)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide: float) -> None:
+    robot = load_cached_robot(name)
+    result = inverse(robot, draw_targets(robot, wide))
+    gap = measure_gap(robot, forward(robot, result.q), result.T)
+    assert gap[result.converged].max(initial=0.0) < ROUNDING
+    other = result.status == Status.OTHER_MODE
+    # Close to a singularity the two solutions of a row lie close together.
+    assert gap[other].min(initial=np.inf) > 1e-6
+    for row in np.flatnonzero(other)[:3]:
+        assert "in another mode than the start" in str(result.explain(int(row)))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_no_target_called_reached_differs_from_the_pose_of_its_readings(name: str) -> None:
+    robot = load_cached_robot(name)
+    spread = np.nan_to_num(robot.parameters.tolerance, nan=1e-4)
+    noise = np.random.default_rng(1).standard_normal(len(spread))
+    true = robot.with_values(robot.values + spread * noise)
+    result = compensate(true, draw_targets(robot, 2.5, 15))
+    back = forward(true, result.readings[result.usable])
+    assert result.usable.any()
+    assert measure_gap(robot, back, result.reached[result.usable]).max() < ROUNDING
+    reached = np.array([reach is Reach.REACHED for reach in result.reach])[result.usable]
+    wanted = result.wanted[result.usable]
+    assert measure_gap(robot, back, wanted)[reached].max(initial=0.0) < 2 * ROUNDING
+    q = result.readings[result.usable]
+    allowed, _ = check_limits(true, true.values[None], q[None], back.state)
+    assert allowed.all()
+
+
+@pytest.mark.parametrize("name", ["five-bar", "hexapod-42", "linear-delta"])
+def test_shifted_commands_called_reached_lead_to_their_targets(name: str) -> None:
+    robot = load_cached_robot(name)
+    true = robot.with_values(robot.values + 1e-5)
+    result = compensate(true, draw_targets(robot, 1.5, 15), "commands", steps=5)
+    back = forward(true, inverse(robot, result.commands[result.usable]).q)
+    assert result.usable.sum() > 3
+    assert measure_gap(robot, back, result.reached[result.usable]).max() < ROUNDING
+
+
+def test_linear_delta_above_its_carriages_exceeds_its_strokes() -> None:
+    robot = load_cached_robot("linear-delta")
+    targets = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.36]])
+    solution = inverse(robot, targets)
+    # The solution with the carriages below the platform, which home does not lead to, is not taken.
+    assert solution.converged.all()
+    assert forward(robot, solution.q).T[1, 2, 3] == pytest.approx(0.36, abs=1e-12)
+    result = compensate(robot, targets)
+    assert result.reach == (Reach.REACHED, Reach.OUTSIDE)
+    assert "stroke of q1" in str(result.findings[1])
+
+
+def test_target_in_another_mode_is_refused_with_the_reason() -> None:
+    robot = load_cached_robot("3-prs")
+    targets = draw_targets(robot, 6.0)
+    solution = inverse(robot, targets)
+    other = np.flatnonzero(solution.status == Status.OTHER_MODE)[:3]
+    result = compensate(robot, targets[other])
+    assert set(result.reach) == {Reach.OTHER_MODE}
+    assert not result.usable.any()
+    assert "from home its readings lead to another pose" in str(result)
+    with pytest.raises(DataError, match=r"'far' .* in another mode than the start"):
+        solve_commanded_poses(robot, targets[other[:1]], ("far",))
+
+
+def test_two_turns_of_the_cranks_reach_what_the_first_solution_does_not() -> None:
+    robot = load_cached_robot("five-bar")
+    targets = draw_targets(robot, 6.0)
+    result = inverse(robot, targets)
+    assert not (result.status == Status.OTHER_MODE).any()
+    assert result.converged.sum() > 10
+
+
+@pytest.mark.parametrize("name", ["five-bar", "3-rrr", "linear-delta"])
+def test_a_start_selects_the_mode_and_stays_in_it(name: str) -> None:
+    robot = load_cached_robot(name)
+    target = sample_workspace(robot, 1, seed=3).coordinates
+    modes = find_working_modes(robot, target[0], patience=2048)
+    assert len(modes) > 1
+    for k in range(len(modes)):
+        start = modes.solution.take(np.arange(k, k + 1))
+        near = inverse(robot, target + 1e-3 * robot.size, start)
+        assert near.converged.all()
+        assert measure_gap(robot, forward(robot, near.q, start), near.T).max() < ROUNDING
+
+
+def test_paths_are_followed_beyond_a_singularity() -> None:
+    robot = load_cached_robot("3-prs")
+    targets = draw_targets(robot, 6.0)
+    far = targets[inverse(robot, targets).status == Status.OTHER_MODE][0]
+    home = read_coordinates(robot.home, robot.controlled)
+    steps = home + np.linspace(0.0, 1.0, 30)[:, None] * (far - home)
+    path = trace_singularity(robot, coordinates=steps)
+    crossings = [step for step, finding in path.warnings if finding.code.endswith("crosses")]
+    assert crossings
+    assert path.solution.closed.all()
+    np.testing.assert_array_equal(
+        np.flatnonzero(path.solution.status == Status.OTHER_MODE), crossings
+    )
+
+
+def test_one_start_for_each_row_is_compared_row_by_row() -> None:
+    robot = load_cached_robot("linear-delta")
+    targets = draw_targets(robot, 2.5)
+    first = inverse(robot, targets)
+    again = inverse(robot, targets + 1e-4 * robot.size, first)
+    near = again.closed & first.closed
+    assert near.sum() > 15
+    # A small step does not leave the mode of its own start, whatever that is.
+    assert again.converged[near].mean() > 0.95
