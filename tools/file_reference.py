@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from loopcal.io.core import file_reference
+from loopcal.io.core.limits import LIMITS
 from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
@@ -165,6 +166,12 @@ def format_provenance() -> str:
     return format_table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
 
 
+def format_limits() -> str:
+    """Return what a file may contain at most."""
+    rows = [(limit.of, str(limit), limit.meaning) for limit in LIMITS]
+    return format_table(("limit", "at most", "applies to"), rows)
+
+
 def format_profile() -> str:
     """Return the keys of a profile of exports."""
     return format_record(ProfileRecord)
@@ -187,6 +194,7 @@ BLOCKS = {
     "settings": format_settings,
     "columns": format_columns,
     "made-by": format_provenance,
+    "limits": format_limits,
 }
 EXPORT_BLOCKS = {"profile": format_profile, "profile-columns": format_profile_columns} | {
     name: format_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")

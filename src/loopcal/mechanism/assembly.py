@@ -25,6 +25,9 @@ AXES = ("rx", "ry", "rz", "x", "y", "z")
 ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
 """Endings of a limb, with the number of their closure equations."""
 
+MOST_LIMBS, MOST_JOINTS, MOST_ACTUATORS, MOST_PARAMETERS = 100, 50, 200, 2000
+"""Largest numbers of limbs, joints of one limb, actuators and parameters."""
+
 
 @dataclass(frozen=True)
 class Link:
@@ -225,11 +228,27 @@ class Assembly:
 
 def check_assembly(assembly: Assembly) -> None:
     """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError."""
+    _check_size(assembly)
     _check_names(assembly)
     for limb in assembly.limbs:
         _check_limb(limb)
     _check_freedoms(assembly)
     _check_ranges(assembly)
+
+
+def _check_size(assembly: Assembly) -> None:
+    """Refuse more limbs, joints, actuators or parameters than a mechanism may have."""
+    refuse_more(MOST_LIMBS, len(assembly.limbs), f"{assembly.name} has", "limbs")
+    for limb in assembly.limbs:
+        refuse_more(MOST_JOINTS, len(limb.joints), f"limb {limb.name!r} has", "joints")
+    refuse_more(MOST_ACTUATORS, len(assembly.actuators), f"{assembly.name} has", "actuators")
+    refuse_more(MOST_PARAMETERS, len(assembly.parameters), f"{assembly.name} has", "parameters")
+
+
+def refuse_more(most: int, count: int, subject: str, noun: str) -> None:
+    """Raise MechanismError where `count` is above `most`: `subject count noun`."""
+    if count > most:
+        raise MechanismError(f"{subject} {count} {noun}, but at most {most} are allowed; use fewer")
 
 
 def _check_names(assembly: Assembly) -> None:

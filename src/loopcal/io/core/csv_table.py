@@ -22,6 +22,7 @@ import numpy as np
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding
 from loopcal.io.core.decimal_columns import parse_decimals
+from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_ROWS, TABLE_SIZE
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
@@ -159,6 +160,7 @@ def read_table(path: str | Path) -> Table:
         for i, line in enumerate(lines)
         if i >= first and line.strip() and not line.startswith("#")
     ]
+    _check_size(path, numbered)
     if not numbered:
         raise FileError("this file has no header; its first line names columns and units", path)
     header_line, header = numbered[0]
@@ -172,6 +174,15 @@ def read_table(path: str | Path) -> Table:
         sentence = "this file has a header but no rows; add one row for each pose"
         raise FileError(sentence, path, header_line)
     return Table(path, settings, header_line, units, rows, tuple(line for line, _ in numbered[1:]))
+
+
+def _check_size(path: Path, numbered: Sequence[tuple[int, str]]) -> None:
+    """Raise FileError for too many rows or columns, or a line that is too long."""
+    TABLE_ROWS.check(len(numbered) - 1, WHAT, path)
+    for number, line in numbered:
+        LINE_LENGTH.check(len(line), WHAT, path, number)
+    for number, line in numbered[:1]:
+        TABLE_COLUMNS.check(line.count(",") + 1, WHAT, path, number)
 
 
 def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
@@ -210,7 +221,8 @@ def read_robot_name(path: str | Path) -> str | None:
 
 
 def _read_lines(path: str | Path) -> list[str]:
-    return [line.rstrip("\r") for line in read_text(path, WHAT, CONVERT_HINT).split("\n")]
+    text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
+    return [line.rstrip("\r") for line in text.split("\n")]
 
 
 def _read_settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:

@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON text without NaN: numbers that are not finite become null, with the reason under `nulls`."""
+"""JSON text without NaN: numbers that are not finite become null, with the reason under `nulls`.
+
+Reading has one function, which turns every fault of the text into one sentence.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from loopcal import serialization
+from loopcal.errors import FileError
+from loopcal.io.core.limits import JSON_DEPTH, PROGRAM_SIZE, FileLimit
+from loopcal.io.core.text_file import read_text
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
 """Half a character: part of a file name that is not UTF-8."""
@@ -32,3 +39,38 @@ def to_json(document: Mapping[str, Any]) -> str:
         content["nulls"] = nulls
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     return _SURROGATE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
+def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGRAM_SIZE) -> Any:
+    """Return the content of a JSON file.
+
+    Parameters
+    ----------
+    path : the file. what : it should be, for messages. action : what to do about text that is not
+        JSON. limit : of its size.
+
+    Raises
+    ------
+    FileError : see `read_text`; or not JSON, or nested too deeply.
+    """
+    text = read_text(path, what, limit=limit)
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        sentence = f"not valid JSON ({error.msg}); {action}"
+        raise FileError(sentence, path, error.lineno) from None
+    except ValueError as error:  # a whole number of thousands of digits
+        raise FileError(f"not valid JSON ({error}); {action}", path) from None
+    except RecursionError:
+        raise JSON_DEPTH.make_error(what, path) from None
+    JSON_DEPTH.check(_measure_depth(content), what, path)
+    return content
+
+
+def _measure_depth(content: Any) -> int:
+    """Return how many lists and mappings are inside each other."""
+    depth, layer = 0, [content]
+    while layer := [node for node in layer if isinstance(node, list | dict)]:
+        depth += 1
+        layer = [c for n in layer for c in (n.values() if isinstance(n, dict) else n)]
+    return depth

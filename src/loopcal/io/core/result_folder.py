@@ -9,7 +9,6 @@ others, all unchanged. Folders of versions before this list may contain files of
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,8 @@ from typing import Any
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.json_text import to_json
+from loopcal.io.core.json_text import read_json, to_json
+from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import replace_folder, resolve_folder
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
@@ -224,8 +224,8 @@ def _list_entries(path: Path, prefix: str = "") -> Iterator[str]:
 def _read_document(path: Path) -> dict[str, Any] | None:
     """Return the document of a folder; None where it is missing or damaged."""
     try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        content = read_json(path, "result", "repeat the command", TABLE_SIZE)
+    except FileError:
         return None
     return content if isinstance(content, dict) else None
 

@@ -9,11 +9,15 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from loopcal.errors import ArgumentTypeError, FileError, LoopcalError
 from loopcal.findings import report_finding
+from loopcal.io.core.limits import PROGRAM_SIZE, FileLimit
 from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers
+
+OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""To open a file without waiting; not every system has all of these flags."""
 
 
 def as_path(path: Any, what: str) -> Path:
@@ -29,20 +33,20 @@ def as_path(path: Any, what: str) -> Path:
     return Path(path)
 
 
-def read_text(path: str | Path, what: str, hint: str = "") -> str:
+def read_text(path: str | Path, what: str, hint: str = "", limit: FileLimit = PROGRAM_SIZE) -> str:
     """Return the text of a UTF-8 file without a byte order mark.
 
     Parameters
     ----------
     path : the file. what : what it should be, for messages, such as "robot file".
     hint : what else helps, besides saving the file as UTF-8; closes that message.
+    limit : of its size.
 
     Raises
     ------
-    FileError
-        The file does not exist, is a folder, is not readable, is not UTF-8, or is empty.
+    FileError : see `read_bytes`; or the file is not UTF-8, or is empty.
     """
-    raw = read_bytes(path, what)
+    raw = read_bytes(path, what, limit)
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -59,18 +63,30 @@ def read_text(path: str | Path, what: str, hint: str = "") -> str:
     return text
 
 
-def read_bytes(path: str | Path, what: str) -> bytes:
-    """Return the content of a file; `what` it should be is for messages.
+def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> bytes:
+    """Return the content of an ordinary file; `what` it should be is for messages.
 
     Raises
     ------
-    FileError : the file does not exist, is a folder, or is not readable.
+    FileError
+        The file does not exist, is a folder, a device or a pipe, is not readable, or is larger than
+        the limit.
     """
+    with open_bytes(path, what) as stream:
+        limit.check(os.fstat(stream.fileno()).st_size, what, path)
+        raw = stream.read(limit.count + 1)
+    if len(raw) > limit.count:  # the file grew, or the system does not state its size
+        raise limit.make_error(what, path)
+    return raw
+
+
+@contextmanager
+def open_bytes(path: str | Path, what: str) -> Iterator[BinaryIO]:
+    """Open an ordinary file to read it; raise FileError as `read_bytes` but for the size."""
     path = as_path(path, what)
-    if path.is_dir():
-        raise FileError(f"this is a folder, but a {what} is needed; name a file in it", path)
     try:
-        return path.read_bytes()
+        with os.fdopen(_open_ordinary_file(path, what), "rb") as stream:
+            yield stream
     except FileNotFoundError:
         raise FileError(
             f"this {what} does not exist; check the name and the folder", path
@@ -80,9 +96,26 @@ def read_bytes(path: str | Path, what: str) -> bytes:
         raise FileError(sentence, path) from error
 
 
+def _open_ordinary_file(path: Path, what: str) -> int:
+    """Return the descriptor of a file; raise FileError for a folder, a device or a pipe.
+
+    Opening does not wait, as it would for a pipe. What was opened is examined rather than the name,
+    which may denote another file a moment later.
+    """
+    if path.is_dir():  # not every system opens a folder
+        raise FileError(f"this is a folder, but a {what} is needed; name a file in it", path)
+    descriptor = os.open(path, OPEN_FLAGS)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return descriptor
+    os.close(descriptor)
+    sentence = f"this is a device or a pipe, but a {what} is needed; save it as an ordinary file"
+    raise FileError(f"{sentence} and name that", path)
+
+
 def sha256(path: str | Path) -> str:
-    """Return the SHA-256 digest of a file as hexadecimal text; raise FileError as `read_bytes`."""
-    return hashlib.sha256(read_bytes(path, "file")).hexdigest()
+    """Return the SHA-256 digest of a file as hexadecimal text; raise FileError as `open_bytes`."""
+    with open_bytes(path, "file") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def resolve_target(path: str | Path) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError, UnitError, suggest_names
+from loopcal.io.core.limits import YAML_SIZE
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.units import Dimension, parse_quantity
 
@@ -69,9 +70,9 @@ def read_yaml(path: str | Path, what: str) -> YamlFile:
     ------
     FileError
         Unreadable file, YAML syntax, duplicate key, a key that is not text, a number that is not
-        finite, or a YAML tag.
+        finite, a YAML tag, or more than the limits of `loopcal.io.core.limits` allow.
     """
-    return parse_yaml(read_text(path, what), path, what)
+    return parse_yaml(read_text(path, what, limit=YAML_SIZE), path, what)
 
 
 def parse_yaml(text: str, path: str | Path, what: str, first_line: int = 1) -> YamlFile:
@@ -79,13 +80,19 @@ def parse_yaml(text: str, path: str | Path, what: str, first_line: int = 1) -> Y
     from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+    from loopcal.io.core.bounded_yaml import LimitError
+
     path = as_path(path, what)
+    YAML_SIZE.check(len(text), what, path)
     try:
         tree = make_round_trip_yaml().load(text)
     except DuplicateKeyError as error:
         key = str(error.problem).split('"')[1] if '"' in str(error.problem) else "?"
         line = error.problem_mark.line + first_line if error.problem_mark else None
         raise FileError(f"duplicate key {key!r}; remove one", path, line) from None
+    except LimitError as error:
+        line = error.problem_mark.line + first_line
+        raise error.limit.make_error(what, path, line=line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = " ".join(str(error.problem or error.context or "not YAML").split())
@@ -105,7 +112,10 @@ def make_round_trip_yaml() -> Any:
     """Return ruamel.yaml's round-trip reader and writer with the settings of this project."""
     from ruamel.yaml import YAML
 
+    from loopcal.io.core.bounded_yaml import BoundedComposer
+
     yaml = YAML(typ="rt", pure=True)
+    yaml.Composer = BoundedComposer
     yaml.preserve_quotes = True
     yaml.width = 120
     return yaml

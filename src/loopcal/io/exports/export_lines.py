@@ -16,6 +16,7 @@ from typing import NoReturn
 
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import report_finding
+from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.text_file import read_bytes
 from loopcal.io.exports.profile import Profile, normalize_name
 
@@ -148,7 +149,7 @@ def _count_cells(count: int) -> str:
 
 def _decode(path: Path, profile: Profile) -> str:
     """Return the text of the export."""
-    raw = read_bytes(path, "export")
+    raw = read_bytes(path, "export", TABLE_SIZE)
     act = "state its 'encoding' in the profile"
     try:
         text = raw.decode(profile.encoding)

@@ -16,7 +16,6 @@ the program auto-calibration-simulation-for-hangprinter.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -27,7 +26,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.io.core.text_file import read_text
+from loopcal.io.core.json_text import read_json
 from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
 from loopcal.typing import BoolArray, FloatArray
 
@@ -150,11 +149,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
 
 def parse(path: Path) -> Samples:
     """Read and check the file; FileError as `read`."""
-    try:
-        content = json.loads(read_text(path, "file of samples"))
-    except json.JSONDecodeError as error:
-        sentence = f"not valid JSON ({error.msg}); correct it, or choose another format"
-        raise FileError(sentence, path, error.lineno) from None
+    content = read_json(path, "file of samples", "correct it, or choose another format")
     if not isinstance(content, dict) or SAMPLES not in content:
         raise FileError(f"no key {SAMPLES!r}: these are not samples of a hanging printer", path)
     motors = _parse_numbers(content, SAMPLES, path, 2)

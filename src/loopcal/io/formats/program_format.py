@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.numbers import parse_finite
+from loopcal.io.core.text_file import read_bytes
 from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.mechanism import Mechanism
 
@@ -187,4 +188,4 @@ def report_changes(changes: Sequence[Finding]) -> tuple[Finding, ...]:
 
 def get_byte_order_mark(path: Path) -> str:
     """Return the byte order mark of a file that has one, to keep it in the corrected file."""
-    return "\ufeff" if path.read_bytes().startswith(b"\xef\xbb\xbf") else ""
+    return "\ufeff" if read_bytes(path, "file").startswith(b"\xef\xbb\xbf") else ""

@@ -13,7 +13,6 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -24,15 +23,18 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
+from loopcal.io.core.json_text import read_json
+from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.result_folder import (
     FolderKind,
     describe_leftover,
     refuse_folder,
     write_result_folder,
 )
-from loopcal.io.core.text_file import as_path, read_text, sha256
+from loopcal.io.core.text_file import as_path, sha256
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
+from loopcal.io.runs.arrays_file import read_arrays
 from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
     ROBOT,
@@ -135,11 +137,8 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         leftover = "" if path.exists() else describe_leftover(path, RESULT)
         advice = leftover or "name a folder that a calibration wrote"
         raise FileError(f"{sentence}; {advice}", path)
-    try:
-        result = json.loads(read_text(path / RESULT, "run result"))
-    except ValueError as error:
-        sentence = f"this run folder is damaged: {RESULT} is not valid JSON ({error})"
-        raise FileError(f"{sentence}; repeat the calibration", path) from error
+    action = "this run folder is damaged; restore it, or repeat the calibration"
+    result = read_json(path / RESULT, "run result", action, TABLE_SIZE)
     if not isinstance(result, dict) or result.get("format", 0) > FORMAT:
         sentence = f"this run has a newer format than {FORMAT}"
         raise FileError(f"{sentence}; use a newer loopcal, or repeat the run", path)
@@ -148,9 +147,8 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         sentence = f"this run folder is damaged: {' and '.join(missing)} missing"
         raise FileError(f"{sentence}; restore it, or repeat the calibration", path)
     try:
-        with np.load(path / ARRAYS, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError) as error:
+        arrays = read_arrays(path / ARRAYS)
+    except ValueError as error:
         sentence = f"this run folder is damaged: {ARRAYS} cannot be read ({error})"
         raise FileError(f"{sentence}; repeat the calibration", path) from error
     return result, arrays

@@ -14,7 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, Joint, LinearMap
+from loopcal.mechanism.assembly import (
+    AXES,
+    MOST_LIMBS,
+    Address,
+    Assembly,
+    Cone,
+    Joint,
+    LinearMap,
+    refuse_more,
+)
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
@@ -44,6 +53,7 @@ from loopcal.mechanism.families.limb_placement import (
     rotate_about,
 )
 from loopcal.mechanism.families.limb_records import (
+    MOST_COPIES,
     AngleDrive,
     Cylindrical,
     Drive,
@@ -91,6 +101,7 @@ class Limbs(LimbsFile, RobotRecord):
         names = tuple(limb.name for limb in self.limbs)
         for limb in self.limbs:
             refuse_branch(limb, names)
+        _refuse_many(self)
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
         copies = [member for group in members.values() for member in group]
         # a drive that several limbs name is one drive
@@ -182,13 +193,20 @@ Drives = Mapping[str, tuple[Drive, bool]]
 """Drives by name, with whether their joints are rotary."""
 
 
+def _refuse_many(robot: Limbs) -> None:
+    """Refuse too many copies, and too many limbs, before they are made."""
+    counts = [1 if limb.copies is None else limb.copies.count for limb in robot.limbs]
+    for limb, count in zip(robot.limbs, counts, strict=True):
+        if not 1 <= count <= MOST_COPIES:
+            raise MechanismError(f"limb {limb.name!r} has {count} copies; give 1 to {MOST_COPIES}")
+    refuse_more(MOST_LIMBS, sum(counts), f"{robot.name} has", "limbs")
+
+
 def _copies(limb: LimbRecord) -> Iterator[_Member]:
     """Yield the copies of a limb."""
     if limb.copies is None:
         yield _Member(limb, _place_copy(limb, "", np.eye(4)), "")
         return
-    if limb.copies.count < 1:
-        raise MechanismError(f"limb {limb.name!r} has {limb.copies.count} copies; give one or more")
     step = limb.copies.step if limb.copies.step is not None else 2 * np.pi / limb.copies.count
     for i in range(limb.copies.count):
         turn, suffix = rotate_about(limb.copies.about, limb.copies.start + i * step), str(i + 1)

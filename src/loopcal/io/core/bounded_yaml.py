@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A composer of YAML that refuses deep documents, and those whose aliases stand for too much.
+
+A document of a kilobyte can stand for a terabyte: each line lists ten aliases of the line before.
+The composer keeps an alias as a reference, but whoever reads the values meets all of them. So the
+values that an alias stands for count each time that it is used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ruamel.yaml.composer import Composer
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import AliasEvent
+
+from loopcal.io.core.limits import YAML_DEPTH, YAML_NODES, FileLimit
+
+
+class LimitError(MarkedYAMLError):
+    """A document beyond `limit`, at `problem_mark`."""
+
+    def __init__(self, limit: FileLimit, mark: Any) -> None:
+        super().__init__(problem=limit.of, problem_mark=mark)
+        self.limit = limit
+
+
+class BoundedComposer(Composer):
+    """A composer that counts; it raises LimitError as soon as a limit is exceeded."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self._level = self._count = 0
+        self._sizes: dict[str, int] = {}
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Return the next node; count its values."""
+        event = self.parser.peek_event()
+        if isinstance(event, AliasEvent):
+            if event.anchor in self.anchors and event.anchor not in self._sizes:
+                problem = f"alias {event.anchor!r} stands for a value that contains the alias"
+                raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+            self._add(self._sizes.get(event.anchor, 1), event)
+            return super().compose_node(parent, index)
+        before = self._count
+        self._add(1, event)
+        self._level += 1
+        if self._level > YAML_DEPTH.count:
+            raise LimitError(YAML_DEPTH, event.start_mark)
+        self._sizes.pop(event.anchor, None)
+        node = super().compose_node(parent, index)
+        self._level -= 1
+        if event.anchor is not None:
+            self._sizes[event.anchor] = self._count - before
+        return node
+
+    def _add(self, values: int, event: Any) -> None:
+        """Count values; raise LimitError where they are too many."""
+        self._count += values
+        if self._count > YAML_NODES.count:
+            raise LimitError(YAML_NODES, event.start_mark)

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every limit of what a file may contain, in one table.
+
+A limit lies far above what a machine needs, and low enough that a damaged or hostile file neither
+fills the memory nor takes minutes. It is checked before memory is taken for what it limits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from loopcal.errors import FileError
+from loopcal.findings import report_finding
+from loopcal.mechanism.assembly import MOST_ACTUATORS, MOST_JOINTS, MOST_LIMBS, MOST_PARAMETERS
+from loopcal.mechanism.families.limb_records import MOST_COPIES
+
+MEGABYTE = 10**6
+
+
+@dataclass(frozen=True)
+class FileLimit:
+    """The most that a file may contain of one thing.
+
+    Parameters
+    ----------
+    of : the thing, for documentation. most : the largest count that is allowed, in `scale` units.
+    unit : noun for messages, such as `rows`. meaning : where it applies.
+    action : what a user who meets it does. scale : counts in one unit.
+    """
+
+    of: str
+    most: float
+    unit: str
+    meaning: str
+    action: str = ""
+    scale: int = 1
+
+    def __str__(self) -> str:
+        return f"{_format(self.most)} {self.unit}"
+
+    @property
+    def count(self) -> int:
+        """The largest count that is allowed."""
+        return round(self.most * self.scale)
+
+    def make_error(
+        self, what: str, path: str | Path, count: float | None = None, line: int | None = None
+    ) -> FileError:
+        """Return the error for a file beyond this limit.
+
+        Parameters
+        ----------
+        what : kind of file, for the message. path : the file.
+        count : what it contains; None where it was not counted to the end. line : of the excess.
+        """
+        finding = report_finding(
+            "files.limit-exceeded",
+            what=what,
+            found=None if count is None else _format(math.ceil(100 * count / self.scale) / 100),
+            most=_format(self.most),
+            unit=self.unit,
+            action=self.action,
+        )
+        return FileError(finding, path, line)
+
+    def check(self, count: float, what: str, path: str | Path, line: int | None = None) -> None:
+        """Raise FileError where a count is above this limit; see `make_error`."""
+        if count > self.count:
+            raise self.make_error(what, path, count, line)
+
+
+def _format(value: float) -> str:
+    """Return a number with two decimals at most, and commas between thousands."""
+    text = f"{value:,.2f}"
+    return text.rstrip("0").rstrip(".")
+
+
+YAML_SIZE = FileLimit(
+    "size of YAML text",
+    1,
+    "MB",
+    "robot files, settings, profiles, lists of loop closures; front matter with its remarks",
+    "shorten its comments, or remove what does not belong there",
+    MEGABYTE,
+)
+YAML_NODES = FileLimit(
+    "values in YAML text",
+    50_000,
+    "values",
+    "keys, values and lists; an alias counts as all values that it stands for",
+    "write less, or use fewer aliases",
+)
+YAML_DEPTH = FileLimit(
+    "nesting of YAML text",
+    50,
+    "levels of nesting",
+    "lists and mappings inside each other",
+    "write it with fewer levels",
+)
+TABLE_SIZE = FileLimit(
+    "size of a measurement file",
+    500,
+    "MB",
+    "measurement files, exports of instruments, `result.json` of a run",
+    "divide it into several files",
+    MEGABYTE,
+)
+TABLE_ROWS = FileLimit(
+    "rows of a measurement file",
+    2_000_000,
+    "rows",
+    "rows below the header",
+    "divide it into several files, or average repeated measurements",
+)
+TABLE_COLUMNS = FileLimit(
+    "columns of a measurement file",
+    1_000,
+    "columns",
+    "columns of the header",
+    "leave out columns that loopcal does not read",
+)
+LINE_LENGTH = FileLimit(
+    "length of a line of a table",
+    100_000,
+    "characters in one line",
+    "lines of measurement files and exports",
+    "check that this is a table of text, one row in a line",
+)
+PROGRAM_SIZE = FileLimit(
+    "size of a file of another program",
+    10,
+    "MB",
+    "files that `loopcal import` and `loopcal export` read",
+    "check that this is the file that was meant, or remove what does not belong there",
+    MEGABYTE,
+)
+JSON_DEPTH = FileLimit(
+    "nesting of JSON text",
+    200,
+    "levels of nesting",
+    "lists and objects inside each other",
+    "simplify it",
+)
+XML_DEPTH = FileLimit(
+    "nesting of a URDF",
+    50,
+    "levels of nesting",
+    "elements inside each other",
+    "check that this is the file that was meant",
+)
+XML_ELEMENTS = FileLimit(
+    "elements of a URDF",
+    20_000,
+    "elements",
+    "elements of every kind",
+    "leave out what loopcal does not read, such as visuals",
+)
+ARRAYS_SIZE = FileLimit(
+    "size of `arrays.npz`",
+    4_000,
+    "MB",
+    "arrays of a run folder, as a file and in memory; they are never compressed",
+    "repeat the calibration with fewer poses",
+    MEGABYTE,
+)
+ARRAYS_COUNT = FileLimit(
+    "arrays of a run folder", 1_000, "arrays", "members of `arrays.npz`", "repeat the calibration"
+)
+PATTERN_LENGTH = FileLimit(
+    "length of a pattern of a profile",
+    1_000,
+    "characters",
+    "`match` and `ignore`",
+    "write a shorter pattern",
+)
+PATTERN_SECONDS = FileLimit(
+    "time of the patterns of a profile",
+    2,
+    "seconds",
+    "for one export, and 0.1 ms more for each of its lines",
+    "write a pattern without a repetition inside a repetition, such as `(a+)+`",
+)
+COPIES = FileLimit("copies of a limb", MOST_COPIES, "copies", "`copies: {count: ..}` of a limb")
+LIMBS = FileLimit("limbs of a robot", MOST_LIMBS, "limbs", "copies included")
+JOINTS = FileLimit("joints of a limb", MOST_JOINTS, "joints", "a universal joint counts as two")
+ACTUATORS = FileLimit("actuators of a robot", MOST_ACTUATORS, "actuators", "of all limbs together")
+PARAMETERS = FileLimit(
+    "parameters of a robot", MOST_PARAMETERS, "parameters", "those that are fixed included"
+)
+
+LIMITS: tuple[FileLimit, ...] = (
+    YAML_SIZE,
+    YAML_NODES,
+    YAML_DEPTH,
+    COPIES,
+    LIMBS,
+    JOINTS,
+    ACTUATORS,
+    PARAMETERS,
+    TABLE_SIZE,
+    TABLE_ROWS,
+    TABLE_COLUMNS,
+    LINE_LENGTH,
+    PATTERN_LENGTH,
+    PATTERN_SECONDS,
+    PROGRAM_SIZE,
+    JSON_DEPTH,
+    XML_ELEMENTS,
+    XML_DEPTH,
+    ARRAYS_SIZE,
+    ARRAYS_COUNT,
+)
+"""All limits, in the order of docs/files.md."""
