@@ -2,9 +2,9 @@
 """The command `loopcal`: its groups of commands, and the one place where an error becomes a
 sentence and an exit code.
 
-Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met, 3 a defect of loopcal.
-Nothing heavier than click is imported before a command runs, so that `loopcal --help` answers at
-once.
+Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met, 3 a defect of loopcal,
+4 the time limit was reached. Nothing heavier than click is imported before a command runs, so that
+`loopcal --help` answers at once.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.hints import find_hint, is_hint_useless
+from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
+from loopcal.cli.time_limit import TimeLimitError, add_time_limit
 from loopcal.errors import LoopcalError, suggest_names
 from loopcal.findings import Finding
 
@@ -73,7 +75,8 @@ class SectionedGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command; None where there is none of this name."""
-        return find_command(cmd_name)
+        command = find_command(cmd_name)
+        return None if command is None else add_time_limit(command)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -125,6 +128,7 @@ def commands() -> None:
       1  wrong use, or input that is refused
       2  a quality gate is not met (see calibrate, validate, compensate, import and export)
       3  a defect of loopcal; the message names a report to send to the developers
+      4  the time limit (--time-limit) was reached; no result was written
     """  # noqa: D301
 
 
@@ -152,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # complaining at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
+    except (Exception, KeyboardInterrupt, TimeLimitError) as error:  # noqa: BLE001 the one place for all of them
         return _report(error, command, words)
 
 
@@ -173,6 +177,9 @@ def _report(error: BaseException, command: click.Command | None, words: Sequence
             return _refuse(str(error), None if is_useless else find_hint(error.code, command))
         case KeyboardInterrupt() | click.exceptions.Abort():
             return _refuse("stopped before the end; no result was written.")
+        case TimeLimitError():
+            _refuse(f"{error}; no result was written.")
+            return TIME_LIMIT_CODE
         case OSError():
             place = f"{error.filename}: " if error.filename else ""
             reason = (error.strerror or str(error)).lower()

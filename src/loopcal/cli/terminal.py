@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
+from loopcal.cli.time_limit import TimeLimitError
+
 if TYPE_CHECKING:
     from loopcal.findings import Finding
     from loopcal.report.text_page import Block
@@ -98,6 +100,8 @@ class ProgressBar:
     ) -> None:
         self._timer.cancel()
         with self._lock:
+            if isinstance(error, TimeLimitError) and self._state is not None:
+                error.step = self._state[2]
             self._state = None
             if self._bar is not None:
                 self._bar.stop()
