@@ -191,7 +191,7 @@ def test_leftovers_of_loopcal_are_removed_and_others_stay(tmp_path) -> None:
 
 def test_folder_that_is_being_written_is_no_leftover(tmp_path) -> None:
     path = tmp_path / "a"
-    with replacement.create_temporary(path, is_folder=True) as (temporary, _):
+    with replacement.create_temporary(path, is_folder=True) as temporary:
         refuse_folder(path, RUN, force=True)
         assert list_leftovers(path) == [temporary]
     assert list_leftovers(path) == []

@@ -352,7 +352,7 @@ def compensate(
     if as_json:
         terminal.print_json(result.to_dict())
     elif output is None:
-        click.echo(text, nl=False)
+        terminal.print_text(text)
     else:
         terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
     missed = [

@@ -14,6 +14,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 import click
 
@@ -23,6 +24,7 @@ from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from loopcal.cli.time_limit import TimeLimitError, add_time_limit
 from loopcal.errors import LoopcalError, suggest_names
 from loopcal.findings import Finding
+from loopcal.output_record import record_outputs
 
 SECTIONS = {
     "Describe the robot": {
@@ -145,26 +147,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
+    terminal.prepare_streams()
     command = None
-    try:
-        command = find_command(words[0]) if words else None
-        code = commands.main(words, prog_name="loopcal", standalone_mode=False)
-        sys.stdout.flush()
-        return code if isinstance(code, int) else 0
-    except BrokenPipeError:
-        # The reader of our output stopped (`loopcal ... | head`). Keep the interpreter from
-        # complaining at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except (Exception, KeyboardInterrupt, TimeLimitError) as error:  # noqa: BLE001 the one place for all of them
-        return _report(error, command, words)
+    with record_outputs() as list_outputs:
+        try:
+            command = find_command(words[0]) if words else None
+            code = commands.main(words, prog_name="loopcal", standalone_mode=False)
+            terminal.flush_output()
+            return code if isinstance(code, int) else 0
+        except BrokenPipeError:  # the reader of our output stopped (`loopcal ... | head`)
+            terminal.silence_output()
+            return 1
+        except (Exception, KeyboardInterrupt, TimeLimitError) as error:  # noqa: BLE001 the one place for all of them
+            return _report(error, command, words, list_outputs())
 
 
-def _report(error: BaseException, command: click.Command | None, words: Sequence[str]) -> int:
-    """Print what an exception means for the user, and return the exit code."""
+def _report(
+    error: BaseException,
+    command: click.Command | None,
+    words: Sequence[str],
+    outputs: Sequence[Path],
+) -> int:
+    """Print what an exception means for the user, and return the exit code.
+
+    Parameters
+    ----------
+    command : that ran, if known. words : of the command line. outputs : that were written before.
+    """
+    if outputs:
+        names = " and ".join(str(path) for path in outputs)
+        terminal.print_message(f"loopcal: written completely before the following: {names}")
+    unwritten = "" if outputs else "; no result was written"
     match error:
         case click.exceptions.NoArgsIsHelpError():
-            click.echo(error.format_message(), err=True)
+            terminal.print_message(error.format_message())
             return 1
         case click.BadParameter() | click.NoSuchOption():
             path = "loopcal" if error.ctx is None else error.ctx.command_path
@@ -176,9 +192,9 @@ def _report(error: BaseException, command: click.Command | None, words: Sequence
             is_useless = isinstance(found, Finding) and is_hint_useless(found)
             return _refuse(str(error), None if is_useless else find_hint(error.code, command))
         case KeyboardInterrupt() | click.exceptions.Abort():
-            return _refuse("stopped before the end; no result was written.")
+            return _refuse(f"stopped before the end{unwritten}.")
         case TimeLimitError():
-            _refuse(f"{error}; no result was written.")
+            _refuse(f"{error}{unwritten}.")
             return TIME_LIMIT_CODE
         case OSError():
             place = f"{error.filename}: " if error.filename else ""

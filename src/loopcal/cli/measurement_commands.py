@@ -261,7 +261,7 @@ def simulate(
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """  # noqa: D301
     from loopcal.io import load_robot, save_robot
-    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
     from loopcal.io.data.measurement_file import load_pose_names, load_poses
     from loopcal.io.data.measurement_writer import format_measurements
@@ -285,9 +285,10 @@ def simulate(
         drawn = _name_drawn_poses(machine, draw, seed)
         source = drawn if poses is None else f"{poses.name}, seed {seed}"
         text = format_measurements(result.data, result.truth, f"simulated by loopcal: {source}")
-    write_text(output, text)
-    if truth is not None:
-        save_robot(result.truth, truth)
+    with restore_on_failure((output, truth)):
+        write_text(output, text)
+        if truth is not None:
+            save_robot(result.truth, truth)
     counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
     if as_json:
         terminal.print_json({"output": output, "truth": truth, **counts})

@@ -39,7 +39,7 @@ def new(
       loopcal new linear-delta -o printer.yaml --measurements heights.csv \\
           --kind component --components z
     """  # noqa: D301
-    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
     from loopcal.io.robot.derived_robots import format_new_robot
 
@@ -47,9 +47,10 @@ def new(
     refuse_outputs((output, measurements), (), force)
     robot_text = format_new_robot(family, output.stem)
     template = None if measurements is None else _format_template(robot_text, instrument)
-    write_text(output, robot_text)
-    if measurements is not None and template is not None:
-        write_text(measurements, template)
+    with restore_on_failure((output, measurements)):
+        write_text(output, robot_text)
+        if measurements is not None and template is not None:
+            write_text(measurements, template)
     if as_json:
         terminal.print_json({"robot": output, "measurements": measurements})
         return
@@ -99,6 +100,7 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import replace_file
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.workflow.robot_inspection import inspect_robot
 
@@ -107,7 +109,8 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     if plot is not None:
         from loopcal.report import save_picture
 
-        save_picture(plot, inspection.robot)
+        with replace_file(plot) as file:
+            save_picture(file, inspection.robot)
     if as_json:
         assembly = {"assembly": inspection.robot.assembly} if expand else {}
         terminal.print_json(inspection.to_dict() | assembly)

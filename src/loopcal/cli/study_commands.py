@@ -172,7 +172,7 @@ def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> lis
 def _print_step(text: str) -> None:
     """Print a step on standard error where it is a terminal."""
     if sys.stderr.isatty():
-        click.echo(text, err=True)
+        terminal.print_message(text)
 
 
 def _list_papers(as_json: bool) -> None:

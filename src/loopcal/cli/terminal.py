@@ -3,17 +3,22 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import textwrap
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import click
 
 from loopcal.cli.time_limit import TimeLimitError
+from loopcal.errors import FileError
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
@@ -35,21 +40,78 @@ def print_page(blocks: Iterable[Block]) -> None:
     """Print paragraphs and tables, wrapped to the terminal."""
     from loopcal.report.text_page import render_text
 
-    click.echo(render_text(blocks, width()))
+    print_text(render_text(blocks, width()) + "\n")
 
 
 def print_json(document: Any) -> None:
     """Print one JSON document."""
     from loopcal.io.core.json_text import to_json
 
-    click.echo(to_json(document), nl=False)
+    print_text(to_json(document))
+
+
+def print_text(text: str) -> None:
+    """Print text on standard output as it is.
+
+    Raises
+    ------
+    FileError : standard output cannot be written, such as a file on a full disk.
+    BrokenPipeError : its reader has stopped.
+    """
+    with _report_output_errors():
+        click.echo(text, nl=False)
+
+
+def flush_output() -> None:
+    """Write what is left of standard output; raise as `print_text`."""
+    with _report_output_errors():
+        sys.stdout.flush()
+
+
+@contextmanager
+def _report_output_errors() -> Iterator[None]:
+    """Raise FileError where standard output cannot be written, and keep Python from trying again
+    when it exits.
+    """
+    try:
+        yield
+    except OSError as error:
+        silence_output()
+        if isinstance(error, BrokenPipeError):
+            raise
+        reason = (error.strerror or str(error)).lower()
+        raise FileError(f"cannot be written ({reason})", "standard output") from error
+
+
+def silence_output() -> None:
+    """Discard what is left of standard output."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def prepare_streams() -> None:
+    """Replace standard streams that are closed, so that no output file takes their place, and
+    escape characters that standard output cannot express.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free descriptor, which is this one
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 until the end
+            setattr(sys, name, stream)
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def print_message(text: str) -> None:
     """Print a message on standard error: one line, which a terminal shows wrapped."""
     if sys.stderr.isatty():
         text = textwrap.fill(text, width(), break_long_words=False, break_on_hyphens=False)
-    click.echo(text, err=True)
+    with suppress(OSError):  # a message that cannot be shown must not end the work
+        click.echo(text, err=True)
 
 
 def print_note(text: str) -> None:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.replacement import create_temporary, place_folder
+from loopcal.io.core.replacement import create_temporary, place_folder, restore_file
 from loopcal.io.core.text_file import check_readable, report_write_errors, resolve_target
 
 
@@ -62,19 +62,11 @@ def refuse_outputs(
 @contextmanager
 def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Restore or remove these files where the body fails; None is skipped."""
-    before = {
-        path: path.read_bytes() if path.is_file() else None for path in outputs if path is not None
-    }
-    succeeded = False
-    try:
+    with ExitStack() as stack:
+        for path in outputs:
+            if path is not None:
+                stack.enter_context(restore_file(resolve_target(path)))
         yield
-        succeeded = True
-    finally:
-        for path, content in () if succeeded else before.items():
-            if content is not None:
-                path.write_bytes(content)
-            elif path.is_file():
-                resolve_target(path).unlink()
 
 
 def _is_same_file(path: Path, other: Path) -> bool:
@@ -120,7 +112,7 @@ def replace_folder(
     with report_write_errors(path):
         target = resolve_folder(path)
         target.parent.mkdir(parents=True, exist_ok=True)
-        with create_temporary(target, is_folder=True) as (temporary, _):
+        with create_temporary(target, is_folder=True) as temporary:
             yield temporary
             check_readable(path, temporary, read_back)
             place_folder(temporary, target, path, check)

@@ -20,9 +20,10 @@ import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
+
+from loopcal.output_record import identify, note_output
 
 try:
     import fcntl
@@ -36,37 +37,13 @@ _LEFTOVER = re.compile(r"\.loopcal-(new|old)-[0-9a-f]{16}-(.+)", re.DOTALL)
 _NAME_BYTES = 200
 """Of the target's name in a temporary name; file systems allow 255 in all."""
 
-_WRITTEN: ContextVar[list[tuple[Path, Path, tuple[int, int]]] | None] = ContextVar(
-    "written", default=None
-)
-"""Outputs of the command that runs: path, target, and identity of what was to take its place."""
-
 
 @contextmanager
-def record_outputs() -> Iterator[Callable[[], list[Path]]]:
-    """Yield a function that returns the files and folders that the body has put in place so far.
-
-    The answer is exact at every moment: it compares what has the name now with what was written.
-    """
-    record: list[tuple[Path, Path, tuple[int, int]]] = []
-    token = _WRITTEN.set(record)
-    try:
-        yield lambda: [path for path, target, identity in record if _identify(target) == identity]
-    finally:
-        _WRITTEN.reset(token)
-
-
-@contextmanager
-def create_temporary(target: Path, is_folder: bool = False) -> Iterator[tuple[Path, int | None]]:
-    """Yield a new, locked, empty file or folder beside `target`, and remove what is left of it.
-
-    Yields
-    ------
-    path : of the file or folder. descriptor : of the file; None for a folder.
-    """
+def create_temporary(target: Path, is_folder: bool = False) -> Iterator[Path]:
+    """Yield a new, locked, empty file or folder beside `target`, and remove what is left of it."""
     path, descriptor = _create_locked(target, is_folder)
     try:
-        yield path, None if is_folder else descriptor
+        yield path
     finally:
         _remove(path)
         if descriptor is not None:
@@ -89,14 +66,14 @@ def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
             descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
         if descriptor is None:
             return path, None
-        if lock(descriptor) is not False and _identify(path) == _identify(descriptor):
+        if lock(descriptor) is not False and _is_open(path, descriptor):
             return path, descriptor
         os.close(descriptor)
 
 
 def place_file(temporary: Path, target: Path, path: Path) -> None:
     """Give a complete, synchronized file its name; `path` is how the user calls it."""
-    _record(path, target, temporary)
+    note_output(path, target, temporary)
     temporary.replace(target)
     sync_folder(target.parent)
 
@@ -112,11 +89,11 @@ def place_folder(
         called again with what was replaced, which another program may have changed.
     """
     sync_tree(temporary)
-    _record(path, target, temporary)
+    note_output(path, target, temporary)
     while not _take_free_name(temporary, target):
         if check is not None:
             check(target)
-        with _hold_folder(target):
+        with _hold(target):
             try:
                 _exchange(temporary, target)
             except FileNotFoundError:  # another program has removed the old folder
@@ -145,9 +122,12 @@ def _take_free_name(temporary: Path, target: Path) -> bool:
 
 
 @contextmanager
-def _hold_folder(path: Path) -> Iterator[None]:
-    """Lock a folder that the body replaces, so that no other command takes it for a leftover."""
-    descriptor = _open_folder(path)
+def _hold(path: Path) -> Iterator[None]:
+    """Lock a file or folder, so that no other command takes it for a leftover."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        descriptor = None
     try:
         if descriptor is not None:
             lock(descriptor)
@@ -155,6 +135,34 @@ def _hold_folder(path: Path) -> Iterator[None]:
     finally:
         if descriptor is not None:
             os.close(descriptor)
+
+
+@contextmanager
+def restore_file(target: Path) -> Iterator[None]:
+    """Restore a file, or its absence, where the body fails."""
+    aside = _name_beside(target, OLD)
+    existed = target.exists()
+    if existed:
+        _copy_or_link(target, aside)
+    try:
+        with _hold(aside):
+            yield
+    except BaseException:
+        if existed:
+            aside.replace(target)
+        else:
+            target.unlink(missing_ok=True)
+        raise
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _copy_or_link(file: Path, name: Path) -> None:
+    """Give a file a second name; where the file system has none, copy it."""
+    try:
+        name.hardlink_to(file)
+    except OSError:
+        shutil.copy2(file, name)
 
 
 def _check_replaced(old: Path, target: Path, check: Callable[[Path], None]) -> None:
@@ -217,12 +225,17 @@ def sync_tree(folder: Path) -> None:
     """Write all files of a folder, and their names, to the disk."""
     for place, _, names in os.walk(folder):
         for name in names:
-            descriptor = os.open(Path(place, name), os.O_RDWR | getattr(os, "O_BINARY", 0))
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            sync_file(Path(place, name))
         sync_folder(Path(place))
+
+
+def sync_file(path: Path) -> None:
+    """Write the content of a file to the disk."""
+    descriptor = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def sync_folder(path: Path) -> None:
@@ -280,9 +293,15 @@ def _lock_leftover(path: Path) -> Iterator[bool]:
         yield False
         return
     try:
-        yield lock(descriptor) is True and _identify(path) == _identify(descriptor)
+        yield lock(descriptor) is True and _is_open(path, descriptor)
     finally:
         os.close(descriptor)
+
+
+def _is_open(path: Path, descriptor: int) -> bool:
+    """Return whether a path still names the file or folder that a descriptor belongs to."""
+    status = os.fstat(descriptor)
+    return identify(path) == (status.st_dev, status.st_ino)
 
 
 def lock(descriptor: int) -> bool | None:
@@ -316,23 +335,6 @@ def _remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink()
-
-
-def _record(path: Path, target: Path, temporary: Path) -> None:
-    """Note what is to take the name of `target`."""
-    record = _WRITTEN.get()
-    identity = _identify(temporary)
-    if record is not None and identity is not None:
-        record.append((path, target, identity))
-
-
-def _identify(file: Path | int) -> tuple[int, int] | None:
-    """Return device and number of a file, folder or descriptor; None where there is none."""
-    try:
-        status = file.lstat() if isinstance(file, Path) else os.fstat(file)
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
 
 
 def _name_beside(target: Path, state: str) -> Path:

@@ -7,14 +7,14 @@ import hashlib
 import os
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from loopcal.errors import ArgumentTypeError, FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import PROGRAM_SIZE, FileLimit
-from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers
+from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers, sync_file
 
 OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """To open a file without waiting; not every system has all of these flags."""
@@ -148,7 +148,16 @@ def write_text(
 def write_bytes(
     path: str | Path, content: bytes, read_back: Callable[[Path], object] | None = None
 ) -> None:
-    """Write a file whole or not at all: to a temporary name beside it, then renamed.
+    """Write a file whole or not at all; see `replace_file`."""
+    with replace_file(path, read_back) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def replace_file(
+    path: str | Path, read_back: Callable[[Path], object] | None = None
+) -> Iterator[Path]:
+    """Yield an empty temporary file that takes the place of `path` where the body succeeds.
 
     A symbolic link stays a link; its target is written. An old file keeps its permissions.
 
@@ -165,15 +174,12 @@ def write_bytes(
     target = resolve_target(path)
     with report_write_errors(path):
         remove_leftovers(target, Path.is_file)
-        with create_temporary(target) as (temporary, descriptor):
-            assert descriptor is not None  # a file has one
-            with suppress(OSError):
-                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
-            with os.fdopen(os.dup(descriptor), "wb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
+        with create_temporary(target) as temporary:
+            yield temporary
+            sync_file(temporary)
             check_readable(path, temporary, read_back)
+            if target.exists():
+                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
             place_file(temporary, target, Path(path))
 
 
