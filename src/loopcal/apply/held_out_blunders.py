@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,7 +45,8 @@ def report_blunders(
     ----------
     errors : of all poses. rest : without the blunders.
     """
-    findings = [blunder.report(**_find_largest(blunder, errors)) for blunder in blunders]
+    largest = _find_largest(blunders, errors)
+    findings = [b.report(**result) for b, result in zip(blunders, largest, strict=True)]
     if rest is None:
         return findings
     poses = tuple(label for blunder in blunders for label in blunder.poses)
@@ -64,21 +66,26 @@ def report_blunders(
     return findings
 
 
-def _find_largest(blunder: Blunder, errors: Validation) -> dict[str, Any]:
-    """Return quantity, target and error of the largest error of a blunder, compared with the noise;
-    empty where only actuator readings are compared.
+def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[str, Any]]:
+    """Return quantity, target and error of the largest error of each blunder, compared with the
+    noise; empty where only actuator readings are compared.
     """
-    named = set(blunder.poses)
-    worst, result = 0.0, {"quantity": "", "target": "", "error": ""}
+    owners: dict[str, list[int]] = {}
+    for i, blunder in enumerate(blunders):
+        for label in blunder.poses:
+            owners.setdefault(label, []).append(i)
+    of_row = [
+        {i for label in poses.split("/") for i in owners.get(label, ())} for poses in errors.poses
+    ]
+    nothing = {"quantity": "", "target": "", "error": ""}
+    worst, results = [0.0] * len(blunders), [nothing] * len(blunders)
     for quantity, of_rows in errors.after.quantities.items():
         floor, unit = errors.noise_floor.rms[quantity], errors.units[quantity]
-        for i, row in enumerate(of_rows.rows):
-            size = float(of_rows.size[i])
-            if named & set(errors.poses[row].split("/")) and size > worst * floor:
-                worst = size / floor
-                result = {
-                    "quantity": quantity,
-                    "target": of_rows.targets[i],
-                    "error": Quantity(size / unit.factor_to_si, unit.symbol),
-                }
-    return result
+        entries = zip(of_rows.rows.tolist(), of_rows.size.tolist(), of_rows.targets, strict=True)
+        for row, size, target in entries:
+            for i in of_row[row]:
+                if size > worst[i] * floor:
+                    worst[i] = size / floor
+                    error = Quantity(size / unit.factor_to_si, unit.symbol)
+                    results[i] = {"quantity": quantity, "target": target, "error": error}
+    return results

@@ -16,6 +16,11 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import Solution, differentiate_pose, forward
 from loopcal.typing import FloatArray
 
+MOST_POSES = 1000
+"""Measured poses, evenly chosen, by which two uncertainties are compared: ratios over more poses
+hardly differ.
+"""
+
 
 class ToolErrors(NamedTuple):
     """Twists (n, 6, ..) of the tool point in a frame: by the parameters in the units of the

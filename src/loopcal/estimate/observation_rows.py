@@ -139,6 +139,14 @@ def linked_blocks(data: Measurements) -> IntArray:
     return connected_groups(links, len(numbers))[member]
 
 
+def list_block_labels(labels: Sequence[str], member: IntArray) -> tuple[tuple[str, ...], ...]:
+    """Return the labels of the poses of each block; `member` (n,) numbers the blocks."""
+    blocks: list[list[str]] = [[] for _ in range(int(member.max(initial=-1)) + 1)]
+    for label, block in zip(labels, member.tolist(), strict=True):
+        blocks[block].append(label)
+    return tuple(map(tuple, blocks))
+
+
 def consecutive_pairs(poses: IntArray) -> IntArray:
     """Return pairs (r (l - 1), 2) of poses that rows (r, l) link."""
     return np.column_stack([poses[:, :-1].ravel(), poses[:, 1:].ravel()])

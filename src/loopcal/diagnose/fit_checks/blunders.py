@@ -29,6 +29,9 @@ MOST_PERMUTED = 4
 MOST_EXPLAINED = 10
 """Poses for which explanations are tried, the farthest first."""
 
+MOST_EXCHANGED = 50
+"""Other poses that do not fit, the farthest first, with which the values of one are exchanged."""
+
 UNUSED: dict[str, Any] = {
     "pairs": (),
     "other": "",
@@ -113,7 +116,7 @@ def _explain(check: HeldOutCheck, data: Measurements, block: int) -> Explanation
     """Return the first kind of explanation that fits, in the best of its forms."""
     poses = np.flatnonzero(check.blocks.member == block)
     alone = data.take(poses)
-    others = [int(i) for i in check.suspects if i != block]
+    others = [int(i) for i in check.suspects[:MOST_EXCHANGED] if i != block]
     tried = []
     for what, readings in (
         ("targets", _permute_targets(alone)),

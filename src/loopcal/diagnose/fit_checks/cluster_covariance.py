@@ -17,7 +17,7 @@ the stated covariance with which C_robust is compared. See docs/theory/uncertain
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from loopcal.diagnose.fit_checks.independent_units import (
     divide_into_clusters,
 )
 from loopcal.diagnose.fit_checks.influence import TESTABLE
-from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
+from loopcal.diagnose.tool_errors import MOST_POSES, linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.posterior import Posterior
@@ -58,6 +58,11 @@ directions that one cluster alone determines.
 FEWEST_DEGREES = 4.0
 """Degrees of freedom below which the distribution of a ratio is not known well (Tipton, 2015), and
 its own standard deviation exceeds 35 %.
+"""
+
+MOST_CLUSTERS = 10_000
+"""Clusters, evenly chosen, whose scores are compared: the degrees of freedom of more of them change
+no conclusion.
 """
 
 COMMON = 1e-9
@@ -158,6 +163,7 @@ class RobustSpread:
         no residual can judge the row.
     columns : (G, h, w) rows by everything that is estimated, in standard deviations: their products
         are the leverages.
+    times : number of all clusters for each of the G.
     """
 
     root: FloatArray
@@ -166,6 +172,7 @@ class RobustSpread:
     correction: FloatArray
     leverage: FloatArray
     columns: FloatArray
+    times: float = 1.0
 
     @property
     def is_tested(self) -> BoolArray:
@@ -188,7 +195,8 @@ class RobustSpread:
         mean, observed = float((parts**2).sum()), float(((self.scores @ E) ** 2).sum())
         if not mean > 0.0:
             return NO_RATIO
-        ratio = float(np.sqrt(max(total + observed - mean, 0.0) / (total + added)))
+        excess = self.times * (observed - mean)
+        ratio = float(np.sqrt(max(total + excess, 0.0) / (total + added)))
         degrees = self._degrees(parts, mean)
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
         return Ratio(ratio, degrees, mean / by_rows, p_value)
@@ -202,9 +210,9 @@ class RobustSpread:
         expected = np.zeros(len(own))
         for parts in self.parts * self.is_tested[:, None, :]:
             expected += ((self.root @ parts) ** 2).sum(axis=1)
-        square = np.divide(
-            own + observed - expected, own + added, out=np.full(len(own), np.nan), where=own > 0.0
-        )
+        robust = own + self.times * (observed - expected)
+        nothing = np.full(len(own), np.nan)
+        square = np.divide(robust, own + added, out=nothing, where=own > 0.0)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
     def _degrees(self, parts: FloatArray, mean: float) -> float:
@@ -233,8 +241,10 @@ def compute_robust_spread(
     Parameters
     ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses. clusters : the cluster of each pose.
+        excluded poses. clusters : the cluster of each pose; of more than `MOST_CLUSTERS`, an even
+        choice stands for all.
     """
+    clusters, times = choose_clusters(clusters)
     linear = linearize_fit(fit, data)
     problem, d, p = linear.problem, linear.decomposition, len(fit.names)
     used = linear.is_estimated
@@ -257,7 +267,20 @@ def compute_robust_spread(
     residual = correction * np.matmul(r[:, None, :], vectors)[:, 0]
     scores = np.matmul(parts, residual[..., None])[..., 0]
     columns = np.matmul(vectors.swapaxes(-1, -2), half)
-    return RobustSpread(V * sd, scores, parts, correction, leverage, columns)
+    return RobustSpread(V * sd, scores, parts, correction, leverage, columns, times)
+
+
+def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
+    """Return at most `MOST_CLUSTERS` clusters, evenly chosen, with member -1 for the poses of the
+    others; and the number of all clusters for each of these.
+    """
+    if clusters.count <= MOST_CLUSTERS:
+        return clusters, 1.0
+    number = np.full(clusters.count, -1)
+    chosen = np.linspace(0, clusters.count - 1, MOST_CLUSTERS).astype(np.int64)
+    number[chosen] = np.arange(MOST_CLUSTERS)
+    times = clusters.count / MOST_CLUSTERS
+    return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
 
 
 def _width(problem: Problem) -> int:
@@ -273,10 +296,11 @@ def _fold_clusters(
     factor = np.zeros((1, clusters.count, 0, width))
     for rows_of_block in problem.leverage_rows(linearization):
         for part in rows_of_block:
-            k, m, _ = part.rows.shape
-            if k and m:
-                places = np.repeat(clusters.member[part.poses], m)
-                factor = fold_at(factor, part.rows.reshape(1, k * m, width), places)
+            member = clusters.member[part.poses]
+            rows, m = part.rows[member >= 0], part.rows.shape[1]
+            if rows.size:
+                places = np.repeat(member[member >= 0], m)
+                factor = fold_at(factor, rows.reshape(1, -1, width), places)
     return factor[0]
 
 
@@ -321,7 +345,7 @@ def _list_pose_effects(
 ) -> tuple[_PoseEffects, _PoseEffects]:
     """Return the effects on orientation and on the tool's position, in a frame."""
     posterior = fit.posterior
-    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data), frame)
+    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data, MOST_POSES), frame)
     p = len(posterior.unit)
     by_part = errors.by_parameters @ (
         _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]

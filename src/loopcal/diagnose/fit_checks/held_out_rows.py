@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from loopcal.diagnose.fit_checks.outlier_search import BlockSearch, PartialFit, 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.fit_uncertainty import FitUncertainty
 from loopcal.estimate.minimization.robust_descent import estimate_scale_of
-from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
@@ -110,12 +111,17 @@ class HeldOutCheck:
     search: BlockSearch
     suspects: IntArray
 
+    @cached_property
+    def prediction(self) -> tuple[FloatArray, FloatArray]:
+        """Factor and solution of all blocks that do fit."""
+        return self.blocks.combine(self.search.end.excluded)
+
     def p_values(self, data: Measurements) -> FloatArray:
         """Return the probability of a larger distance, of each block (b,) of other values of some
         of these poses: against the prediction by all blocks that do fit.
         """
         end = self.search.end
-        triangle, y = self.blocks.combine(end.excluded)
+        triangle, y = self.prediction
         other = self.predictor.make_blocks(data)
         p_value = np.ones(len(other.poses))
         for numbers, H, residual, present in other.groups:
@@ -153,16 +159,15 @@ class Predictor:
         table = data.nuisance_parameters.table
         z = free.deviation(self.robot.values[None])
         values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)
-        labels = np.array(data.labels)
-        numbers, member = np.unique(linked_blocks(data), return_inverse=True)
-        total = problem.count_leverage_rows(member, len(numbers))
+        member = np.unique(linked_blocks(data), return_inverse=True)[1]
+        poses = list_block_labels(data.labels, member)
+        total = problem.count_leverage_rows(member, len(poses))
         by_y = self._predict(table.names, table.dimensions)
         noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
         groups = []
         for blocks, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
             present = np.any(columns != 0.0, axis=2) | (r != 0.0)
             groups.append((blocks, columns @ by_y / noise, r / noise, present))
-        poses = tuple(tuple(labels[member == i].tolist()) for i in range(len(numbers)))
         return HeldOutBlocks(poses, member, tuple(groups))
 
     def _predict(self, names: tuple[str, ...], dimensions: tuple[Dimension, ...]) -> FloatArray:
@@ -242,8 +247,10 @@ def compare_blocks(
     """Return the influence of blocks H (b, m, k) for the factor and solution of `inside` (b,) and
     other blocks.
     """
-    half = np.asarray(np.linalg.solve(triangle.T, np.swapaxes(H, -1, -2)), dtype=np.float64)
-    half = np.swapaxes(half, -1, -2)
+    from scipy.linalg import solve_triangular
+
+    k = len(triangle)
+    half = solve_triangular(triangle, H.reshape(-1, k).T, trans="T").T.reshape(H.shape)
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 

@@ -35,7 +35,7 @@ from loopcal.errors import LoopcalError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.identification import identify
 from loopcal.estimate.methods.losses import Tukey
-from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -177,13 +177,12 @@ def find_outliers(
     check_fitted_data(fit, data)
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
-    numbers, member = np.unique(linked_blocks(data), return_inverse=True)
-    names = np.array(data.labels)
-    labels = tuple(tuple(names[member == i].tolist()) for i in range(len(numbers)))
+    member = np.unique(linked_blocks(data), return_inverse=True)[1]
+    labels = list_block_labels(data.labels, member)
     reference = _refit_robustly(fit, data) if fit.residual_test.failed else fit
     z = fit.free_parameters.deviation(reference.robot.values[None])
     start = problem.linearize(z, problem.start(z)).next_start
-    low_weight = np.zeros(len(numbers), dtype=bool)
+    low_weight = np.zeros(len(labels), dtype=bool)
     low_weight[member] = reference.pose_weights < 0.5
 
     noise = fit.residual_test.noise

@@ -24,7 +24,7 @@ from loopcal.diagnose.residuals.residual_patterns import (
     find_patterns,
 )
 from loopcal.diagnose.residuals.residual_rows import ResidualRows, collect_residual_rows
-from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
+from loopcal.diagnose.tool_errors import MOST_POSES, linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.added_covariance import add_covariance
@@ -145,7 +145,7 @@ class ToolUncertainty:
 
 def state_tool_uncertainty(fit: Identification, data: Measurements) -> ToolUncertainty:
     """Return the uncertainty of the measured poses of a fit, frames fitted."""
-    posterior, solution = fit.posterior, locate_measured_poses(fit, data)
+    posterior, solution = fit.posterior, locate_measured_poses(fit, data, MOST_POSES)
     D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
     p = D.shape[-1]
     angle, position = D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)

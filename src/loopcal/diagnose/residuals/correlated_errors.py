@@ -112,6 +112,8 @@ def _evaluate(
     rows: ResidualRows, segments: list[IntArray], rho: float, share: float
 ) -> tuple[float, float, FloatArray]:
     """Return log |K| + log |X'K^-1 X|, the sum of squares S, and G'K G (k, k)."""
+    from scipy.linalg import solve_triangular
+
     q, k = rows.basis.shape[1], rows.gain.shape[1]
     columns = np.column_stack([rows.basis, rows.residual])
     log_det, white, spread = 0.0, [], np.zeros((k, k))
@@ -121,8 +123,10 @@ def _evaluate(
         K[np.diag_indices(n)] = 1.0
         L = np.linalg.cholesky(K)
         log_det += 2.0 * count * float(np.log(np.diag(L)).sum())
-        white.append(np.linalg.solve(L, columns[members]).reshape(count * n, q + 1))
-        part = np.matmul(L.T, rows.gain[members]).reshape(count * n, k)
+        # one system for all segments: the triangle is the same for each
+        stacked = columns[members.T].reshape(n, count * (q + 1))
+        white.append(solve_triangular(L, stacked, lower=True).reshape(n * count, q + 1))
+        part = (L.T @ rows.gain[members.T].reshape(n, count * k)).reshape(n * count, k)
         spread += part.T @ part
     R = np.asarray(np.linalg.qr(np.concatenate(white), mode="r"))
     log_det += 2.0 * float(np.log(np.abs(np.diag(R)[:q])).sum())

@@ -114,15 +114,13 @@ def check_heavy_tails(
     if rows is None:
         return nothing
     wrong = np.flatnonzero(_belong_to(rows, data, outliers))
-    if wrong.size:
-        rows = rows.with_effects(np.eye(len(rows.residual))[:, wrong])
-    kept = np.setdiff1d(np.arange(len(rows.residual)), wrong)
-    return assess_tails(rows, kept)
+    return assess_tails(rows.without(wrong) if wrong.size else rows)
 
 
-def assess_tails(rows: ResidualRows, kept: np.ndarray) -> HeavyTails:
-    """Return the test of residuals; `kept` (k,) are the numbers of those that count."""
-    kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), MOST_ROWS)).astype(int)]
+def assess_tails(rows: ResidualRows) -> HeavyTails:
+    """Return the test of residuals."""
+    n = len(rows.residual)
+    kept = np.linspace(0, n - 1, min(n, MOST_ROWS)).astype(int)
     basis = rows.basis[kept]
     left = 1.0 - (basis**2).sum(axis=1)
     testable = left > TESTABLE

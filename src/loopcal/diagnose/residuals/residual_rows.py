@@ -73,6 +73,23 @@ class ResidualRows:
         left = self.residual - new @ (new.T @ self.residual)
         return replace(self, basis=np.concatenate([self.basis, new], axis=1), residual=left)
 
+    def without(self, rows: IntArray) -> ResidualRows:
+        """Return the rows as if the fit had not used some of them (w,)."""
+        kept = np.ones(len(self.residual), dtype=bool)
+        kept[rows] = False
+        basis = span_columns(self.basis[kept])
+        left = self.residual[kept] - basis @ (basis.T @ self.residual[kept])
+        return replace(
+            self,
+            basis=basis,
+            residual=left,
+            gain=self.gain[kept],
+            kind=self.kind[kept],
+            row=self.row[kept],
+            column=self.column[kept],
+            series=self.series[kept],
+        )
+
 
 def span_columns(columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one."""
