@@ -249,8 +249,10 @@ def compare_blocks(
     """
     from scipy.linalg import solve_triangular
 
-    k = len(triangle)
-    half = solve_triangular(triangle, H.reshape(-1, k).T, trans="T").T.reshape(H.shape)
+    b, m, k = H.shape
+    half = H
+    if H.size:  # one system for all blocks
+        half = solve_triangular(triangle, H.reshape(b * m, k).T, trans="T").T.reshape(H.shape)
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 
