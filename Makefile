@@ -5,9 +5,12 @@
 BIN := .venv/bin
 ROBOT := src/loopcal/robots/hexapod-42.yaml
 DATA := examples/hexapod-42/measurements.csv
+N := 1000
+WORKERS := 1
+FUZZ := runs/fuzz.json
 export PYTHON
 
-.PHONY: help demo test quick evidence docs bench bench-update check format constraints clean
+.PHONY: help demo test quick evidence docs fuzz bench bench-update check format constraints clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -30,6 +33,10 @@ docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evid
 	$(BIN)/python -m tools.file_reference
 	$(BIN)/python -m tools.findings_reference
 	$(BIN)/python -m tools.api_reference
+
+fuzz: .venv/dev.stamp  ## run N more random inputs through the command line (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
+	@mkdir -p $(dir $(FUZZ))
+	$(BIN)/python -m tools.fuzz --count $(N) --workers $(WORKERS) --add $(FUZZ)
 
 bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse
 	$(BIN)/python -m benchmarks.run --gate

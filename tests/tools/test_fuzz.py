@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fuzzer: inputs follow from their seed alone, and every command and option has its turn."""
+
+from random import Random
+
+import pytest
+
+from tools.fuzz.campaign import join_ranges
+from tools.fuzz.cases import Case, Maker
+from tools.fuzz.commands import draw_options, list_commands
+from tools.fuzz.corpus import build_corpus
+from tools.fuzz.execution import Outcome
+from tools.fuzz.verdict import find_place, judge
+
+
+@pytest.fixture(scope="module")
+def maker() -> Maker:
+    return Maker(build_corpus())
+
+
+@pytest.mark.slow
+def test_input_follows_from_its_seed_alone(maker) -> None:
+    seeds = range(40)
+    first = [maker.make(seed) for seed in seeds]
+    again = [maker.make(seed) for seed in reversed(seeds)][::-1]
+    assert first == again
+    assert len({case.seed for case in first}) == len(seeds)
+
+
+@pytest.mark.slow
+def test_every_command_has_its_turn(maker) -> None:
+    lines = [line for machine in maker.machines for line in machine.lines]
+    assert {line.words[0] for line in lines} == set(list_commands())
+
+
+@pytest.mark.parametrize("name", list_commands())
+def test_every_option_of_a_command_is_drawn(name) -> None:
+    command = list_commands()[name]
+    drawn = {
+        word
+        for seed in range(400)
+        for word in draw_options(command, Random(seed), ["a"], ["a.csv"])
+    }
+    assert {opt for p in command.params for opt in p.opts if opt.startswith("-")} <= drawn
+
+
+def answer(code, out="", err="", before=(), after=()) -> Outcome:
+    return Outcome(code, out, err, before=dict(before), after=dict(after))
+
+
+@pytest.mark.parametrize(
+    ("outcome", "rules"),
+    [
+        (answer(1, err="loopcal: robot.yaml:3: no.\nHint: write 3\n"), []),
+        (answer(1, err="Warning: x\n"), ["message-form"]),
+        (answer(1, err="loopcal: \x1b[31mred\n"), ["control-character"]),
+        (answer(1), ["no-message"]),
+        (answer(3, err="loopcal: no\n"), ["exit-code"]),
+        (answer(1, err="loopcal: no\n", after={"out": b"1"}), ["left-output"]),
+        (answer(1, err="loopcal: no\n", before={"a": b"1"}), ["deleted-file"]),
+        (answer(1, err="loopcal: n\n", before={"a": b"1"}, after={"a": b"2"}), ["changed-file"]),
+        (answer(1, err="loopcal: <class 'float'>\n"), ["internal-words"]),
+        (answer(0, out="error: nan mm\n"), ["non-finite"]),
+        (answer(0, out="information\n"), []),
+        (answer(0, after={"a.csv": b"x\ninf\n"}), ["non-finite"]),
+        (answer(0, after={"a.json": b"{"}), ["unreadable"]),
+        (answer(0, after={"a.csv": b"\xff"}), ["unreadable"]),
+        (answer(0, after={"a.yaml": b"format: 1\nfamily: x\nunits: {}\n"}), ["unreadable"]),
+    ],
+)
+def test_answers_that_break_a_rule_are_finds(tmp_path, outcome, rules) -> None:
+    case = Case(1, "five-bar", ["check", "robot.yaml"], {})
+    assert [find.rule for find in judge(case, outcome, tmp_path)] == rules
+
+
+def test_traceback_is_known_by_its_innermost_function_of_loopcal(tmp_path) -> None:
+    text = (
+        'File "/a/src/loopcal/io/a.py", line 3, in f\nFile "/a/src/loopcal/io/b.py", line 4, in g\n'
+        'File "/a/numpy/c.py", line 5, in h\n'
+    )
+    assert find_place(text) == "loopcal/io/b.py:g"
+    outcome = Outcome(failures=[("ValueError", text)])
+    (find,) = judge(Case(1, "five-bar", ["check"], {}), outcome, tmp_path)
+    assert find.signature == "traceback: ValueError at loopcal/io/b.py:g"
+
+
+def test_ranges_of_seeds_are_joined() -> None:
+    assert join_ranges([[5, 6], [1, 2], [3, 4], [9, 9]]) == [[1, 6], [9, 9]]
