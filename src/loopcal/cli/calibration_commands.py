@@ -326,8 +326,11 @@ def compensate(
     from loopcal.apply import compensate as compensate_targets
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.core.text_file import write_text
-    from loopcal.io.runs.compensation_file import format_compensation, load_targets
+    from loopcal.io.runs.compensation_file import (
+        format_compensation,
+        load_targets,
+        save_compensation,
+    )
     from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
     from loopcal.mechanism import Mechanism
     from loopcal.report.calibration_view import with_hint
@@ -346,13 +349,12 @@ def compensate(
         result = compensate_targets(
             known, coordinates, mode, old, steps, labels, progress, frame=frame
         )
-    text = format_compensation(result)
     if output is not None:
-        write_text(output, text)
+        save_compensation(result, output)
     if as_json:
         terminal.print_json(result.to_dict())
     elif output is None:
-        terminal.print_text(text)
+        terminal.print_text(format_compensation(result))
     else:
         terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
     missed = [

@@ -201,11 +201,10 @@ def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
 
 def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
     """Write the robot file with the parameters fixed that are left out."""
-    from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.derived_robots import format_reduced_robot
+    from loopcal.io.robot.derived_robots import save_reduced_robot
 
     words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
-    write_text(output, format_reduced_robot(subset.robot, words))
+    save_reduced_robot(subset.robot, words, output)
 
 
 @click.command()
@@ -260,18 +259,16 @@ def simulate(
       loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """  # noqa: D301
-    from loopcal.io import load_robot, save_robot
+    from loopcal.io import load_robot, save_measurements, save_robot
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.core.text_file import write_text
     from loopcal.io.data.measurement_file import load_pose_names, load_poses
-    from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.workflow.simulated_measurements import simulate_measurements
 
     refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
     machine = load_robot(robot)
     if fill is not None:
-        result, text = _fill_in(machine, fill, draw_errors, seed)
+        result, remark = _fill_in(machine, fill, draw_errors, seed)
     else:
         result = simulate_measurements(
             machine,
@@ -284,9 +281,9 @@ def simulate(
         )
         drawn = _name_drawn_poses(machine, draw, seed)
         source = drawn if poses is None else f"{poses.name}, seed {seed}"
-        text = format_measurements(result.data, result.truth, f"simulated by loopcal: {source}")
+        remark = f"simulated by loopcal: {source}"
     with restore_on_failure((output, truth)):
-        write_text(output, text)
+        save_measurements(result.data, output, result.truth, remark)
         if truth is not None:
             save_robot(result.truth, truth)
     counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
@@ -301,14 +298,13 @@ def simulate(
 def _fill_in(
     robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
 ) -> tuple[SimulatedMeasurements, str]:
-    """Return the filled-in data file of a plan."""
+    """Return the filled-in data of a plan, and what they are."""
     from loopcal.io import load_measurements
     from loopcal.io.data.measurement_file import (
         has_empty_readings,
         load_contact_sheet,
         load_instrument,
     )
-    from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.io.runs.plan_folder import find_plan_sheet
     from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
@@ -322,5 +318,4 @@ def _fill_in(
         result = fill_in_contacts(robot, planned, instrument, **how)
     else:
         result = fill_in_measurements(robot, load_measurements(sheet, robot), instrument, **how)
-    title = f"simulated by loopcal: {sheet.name}, seed {seed}"
-    return result, format_measurements(result.data, result.truth, title)
+    return result, f"simulated by loopcal: {sheet.name}, seed {seed}"

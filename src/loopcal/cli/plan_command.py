@@ -272,6 +272,7 @@ def _write_plan(
     from loopcal.io.runs.plan_folder import (
         DATA,
         SHEET,
+        check_written_plan,
         format_plan_data,
         format_sheet,
         format_surface_data,
@@ -295,7 +296,8 @@ def _write_plan(
     pictures = {
         name: functools.partial(save_figure, figure=figure) for name, figure in figures.items()
     }
-    write_plan_folder(output, texts, document, pictures, force)
+    read_back = functools.partial(check_written_plan, plan=result)
+    write_plan_folder(output, texts, document, pictures, force, read_back)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files
 

@@ -3,18 +3,14 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from loopcal.cli import terminal
 from loopcal.cli.instrument_options import instrument_options, make_instrument
 from loopcal.cli.options import file_option, flag_option, force_option, json_option, robot_argument
-
-if TYPE_CHECKING:
-    from loopcal.measure import Instrument
 
 
 @click.command()
@@ -41,16 +37,21 @@ def new(
     """  # noqa: D301
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
+    from loopcal.io.core.yaml_file import parse_yaml
+    from loopcal.io.data.measurement_writer import format_template
+    from loopcal.io.data.written_measurements import check_written_template
     from loopcal.io.robot.derived_robots import format_new_robot
+    from loopcal.io.robot.robot_file import build_robot, write_robot
 
     instrument = make_instrument(options)
     refuse_outputs((output, measurements), (), force)
     robot_text = format_new_robot(family, output.stem)
-    template = None if measurements is None else _format_template(robot_text, instrument)
+    robot = build_robot(parse_yaml(robot_text, output, "robot file"))
+    template = format_template(robot, instrument)
     with restore_on_failure((output, measurements)):
-        write_text(output, robot_text)
-        if measurements is not None and template is not None:
-            write_text(measurements, template)
+        write_robot(output, robot_text, robot)
+        if measurements is not None:
+            write_text(measurements, template, lambda file: check_written_template(file, robot))
     if as_json:
         terminal.print_json({"robot": output, "measurements": measurements})
         return
@@ -64,17 +65,6 @@ def new(
             f"Next: loopcal calibrate {output} {measurements} -o run",
         ]
     terminal.print_page(page)
-
-
-def _format_template(robot_text: str, instrument: Instrument) -> str:
-    """Return a measurement file without rows, for a robot file that is not yet written."""
-    from loopcal.io import load_robot
-    from loopcal.io.data.measurement_writer import format_template
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "robot.yaml"
-        path.write_text(robot_text, encoding="utf-8")
-        return format_template(load_robot(path), instrument)
 
 
 @click.command()

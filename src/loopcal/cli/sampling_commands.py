@@ -237,13 +237,12 @@ def _write_draws(
     output: Path | None, fit: Identification, draws: FloatArray, weight: FloatArray | None = None
 ) -> None:
     """Write the draws, where a file is named."""
-    from loopcal.io.core.text_file import write_text
-    from loopcal.io.runs.draws_file import format_draws
+    from loopcal.io.runs.draws_file import save_draws
 
     if output is None:
         return
     factors, units = fit.free_parameters.display()
-    write_text(output, format_draws(fit.names, units, factors, draws, weight))
+    save_draws(output, fit.names, units, factors, draws, weight)
 
 
 def _written(output: Path | None) -> list[str]:

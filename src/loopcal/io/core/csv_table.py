@@ -152,6 +152,15 @@ def read_table(path: str | Path) -> Table:
     FileError
         Unreadable file, bad settings, no header, a bad header, no rows, rows of the wrong length.
     """
+    table = read_template(path)
+    if not table.rows:
+        sentence = "this file has a header but no rows; add one row for each pose"
+        raise FileError(sentence, table.path, table.header_line)
+    return table
+
+
+def read_template(path: str | Path) -> Table:
+    """Read a CSV table that may have no rows; raise as `read_table`."""
     path = as_path(path, WHAT)
     lines = _read_lines(path)
     settings, first = _read_settings(path, lines)
@@ -170,9 +179,6 @@ def read_table(path: str | Path) -> Table:
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
     rows = tuple(_parse_row(path, line, text, len(units)) for line, text in numbered[1:])
-    if not rows:
-        sentence = "this file has a header but no rows; add one row for each pose"
-        raise FileError(sentence, path, header_line)
     return Table(path, settings, header_line, units, rows, tuple(line for line, _ in numbered[1:]))
 
 

@@ -34,11 +34,10 @@ LINK = ";"
 """Separates the names of poses that one row compares."""
 
 COMMANDED, MEASURED, SIGMA, COVARIANCE = "commanded.", "measured.", "sigma.", "cov."
-TEMPERATURE, NOTE = "temperature", "note"
+TIME, TEMPERATURE, NOTE = "time", "temperature", "note"
 FIT, HELD_OUT = "fit", "held-out"
 """Cells of the column `use`."""
 
-TIME = "time"
 Scales = Mapping[str, tuple[float, float]]
 TIME_UNITS: Scales = {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)}
 TEMPERATURE_UNITS: Scales = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5 / 9, -160 / 9)}

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +14,13 @@ from loopcal.errors import DataError
 from loopcal.io.core.csv_table import format_row
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
+from loopcal.io.data.column_names import find_column_fault
 from loopcal.io.data.columns import (
+    COVARIANCE,
     FIT,
     HELD_OUT,
     LINK,
+    MEASURED,
     SIGMA,
     USE_COLUMN,
     Column,
@@ -29,6 +32,7 @@ from loopcal.io.data.columns import (
 from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_stated_values
+from loopcal.io.data.written_measurements import check_written_measurements
 from loopcal.io.robot.robot_file import require_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -68,7 +72,8 @@ def save_measurements(
     ------
     FileError : the file cannot be written. DataError : a name that a file cannot hold.
     """
-    write_text(path, format_measurements(data, robot, remark))
+    text = format_measurements(data, robot, remark)
+    write_text(path, text, lambda written: check_written_measurements(written, data, robot))
 
 
 def format_measurements(
@@ -104,6 +109,7 @@ def format_measurements(
     names += [*(["kind"] if len(kinds) > 1 else []), *of_poses]
     names += [name for rows in data.observations for name in rows.context]
     names += [name for _, table in tables for name in table]
+    _refuse_columns(name for _, table in tables for name in table)
     columns: list[Column] = [known.get(n, ContextColumn(n)) for n in dict.fromkeys(names)]
     lines.append(format_row(column.header for column in columns))
 
@@ -223,6 +229,15 @@ def _refuse_names(data: Measurements) -> None:
     if len(set(data.labels)) < len(data.labels):
         name = next(name for name in data.labels if data.labels.count(name) > 1)
         raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
+
+
+def _refuse_columns(names: Iterable[str]) -> None:
+    """Raise DataError for the name of a measured column that a file cannot have."""
+    for name in names:
+        prefixes = (SIGMA, MEASURED, COVARIANCE)
+        plain = next((name.removeprefix(p) for p in prefixes if name.startswith(p)), name)
+        if fault := find_column_fault(plain, "measured value"):
+            raise DataError(fault)
 
 
 def _tabulate_poses(data: Measurements, robot: Mechanism) -> tuple[str, dict[str, FloatArray]]:

@@ -6,13 +6,14 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.io.core import file_reference
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.core.yaml_text import add_key, quote_scalar, remove_key
 from loopcal.io.robot.identified_table import add_table
-from loopcal.io.robot.robot_file import format_robot, get_source, list_shipped_robots
+from loopcal.io.robot.robot_file import format_robot, get_source, list_shipped_robots, write_robot
 from loopcal.mechanism import FAMILIES, Mechanism
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar"}
@@ -61,6 +62,16 @@ def format_new_robot(family: str, name: str) -> str:
     body = text.split("\n")
     first = next(i for i, line in enumerate(body) if not line.startswith("#"))
     return "\n".join([*lines, "", *body[first:]])
+
+
+def save_reduced_robot(robot: Mechanism, dropped: Mapping[str, str], path: str | Path) -> None:
+    """Write a robot's file with further parameters fixed; arguments as `format_reduced_robot`.
+
+    Raises
+    ------
+    FileError : the file cannot be written. MechanismError : as `format_reduced_robot`.
+    """
+    write_robot(path, format_reduced_robot(robot, dropped), robot)
 
 
 def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:

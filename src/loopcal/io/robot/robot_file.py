@@ -19,11 +19,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from loopcal.errors import ArgumentTypeError, FileError, MechanismError, suggest_names
+from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.core.yaml_text import remove_key
+from loopcal.io.data.column_names import find_column_fault
 from loopcal.io.robot.identified_table import TABLE, add_table, read_identified_values
 from loopcal.mechanism import (
     FAMILIES,
@@ -95,6 +99,7 @@ def build_robot(file: YamlFile) -> Mechanism:
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
         robot = build(_assemble(record, file), symbols, origin)
+        _refuse_column_names(robot, file)
     if TABLE not in file.content:
         return robot
     return robot.with_values(read_identified_values(file, robot))
@@ -112,7 +117,23 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
     ------
     FileError : the file cannot be written. MechanismError : the robot was not loaded from a file.
     """
-    write_text(path, format_robot(robot, plus_minus))
+    write_robot(path, format_robot(robot, plus_minus), robot)
+
+
+def write_robot(path: str | Path, text: str, robot: Mechanism) -> None:
+    """Write the text of a robot file, which is read back as this robot; raise as `save_robot`."""
+    write_text(path, text, lambda written: check_same_robot(robot, load_robot(written)))
+
+
+def check_same_robot(robot: Mechanism, read: Mechanism) -> None:
+    """Raise DataError where a robot that was read from a file is not the one that was written.
+
+    Values may differ by the rounding of one number, because a file states them in its unit.
+    """
+    require_same("actuators", robot.actuators, read.actuators)
+    require_same("parameters", robot.parameters.names, read.parameters.names)
+    require_same_numbers("nominal values", robot.parameters.nominal, read.parameters.nominal)
+    require_same_numbers("identified values", robot.values, read.values, float(np.finfo(float).eps))
 
 
 def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
@@ -186,6 +207,17 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
         sentence = f"{family!r} is not a family of robots{suggest_names(str(family), known)}"
         raise file.error(f"{sentence}; allowed: {', '.join(known)}", ("family",))
     return str(family)
+
+
+def _refuse_column_names(robot: Mechanism, file: YamlFile) -> None:
+    """Raise FileError for an actuator or joint that measurement files cannot have as a column."""
+    for actuator in robot.actuators:
+        if fault := find_column_fault(actuator.name, "actuator"):
+            raise file.error(fault, ("actuators", actuator.name))
+    for i, limb in enumerate(robot.assembly.limbs):
+        for joint in limb.joints:
+            if fault := find_column_fault(f"{limb.name}.{joint.name}", "joint"):
+                raise file.error(fault, ("limbs", i))
 
 
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:

@@ -17,11 +17,13 @@ import numpy as np
 
 from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import format_row, read_table, require_columns
-from loopcal.io.core.numbers import format_scaled
+from loopcal.io.core.numbers import format_exact
+from loopcal.io.core.read_back import require_same, require_same_numbers
+from loopcal.io.core.text_file import write_text
 from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
+from loopcal.units import Dimension, Unit
 
 if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
@@ -62,16 +64,35 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
     return np.column_stack(columns), labels
 
 
+def save_compensation(result: Compensation, path: str | Path) -> None:
+    """Write the result as CSV; raise FileError where it cannot be written."""
+    write_text(path, format_compensation(result), lambda written: _check_written(written, result))
+
+
+def _check_written(path: Path, result: Compensation) -> None:
+    """Read a written result; raise LoopcalError where it does not state the same numbers."""
+    table = read_table(path)
+    require_same("names of targets", result.labels, table.pose_names())
+    columns, values = _list_columns(result)
+    numbers = [table.numbers(name, unit.dimension) for name, unit in columns]
+    wanted = np.where(result.usable[:, None], values, np.nan)
+    require_same_numbers("readings or commands", wanted, np.column_stack(numbers))
+
+
+def _list_columns(result: Compensation) -> tuple[list[tuple[str, Unit]], FloatArray]:
+    """Return name and unit of the columns to set, and their values (n, columns) [SI]."""
+    robot = result.robot
+    if result.commands is None:
+        return [(a.name, robot.get_unit(a.dimension)) for a in robot.actuators], result.readings
+    names = result.controller.controlled
+    columns = [(COMMANDED + name, robot.get_unit(get_dimension(name))) for name in names]
+    return columns, result.commands
+
+
 def format_compensation(result: Compensation) -> str:
     """Return the result as CSV text, units in the header."""
     robot = result.robot
-    if result.commands is None:
-        columns = [(a.name, robot.get_unit(a.dimension)) for a in robot.actuators]
-        values = result.readings
-    else:
-        coordinates = result.controller.controlled
-        columns = [(COMMANDED + n, robot.get_unit(get_dimension(n))) for n in coordinates]
-        values = result.commands
+    columns, values = _list_columns(result)
     errors = {"before": result.before, "remaining": result.remaining}
     if result.uncertainty is not None:
         errors["U"] = result.uncertainty.expanded
@@ -83,7 +104,7 @@ def format_compensation(result: Compensation) -> str:
     usable = result.usable
     for i, label in enumerate(result.labels):
         cells = [
-            format_scaled(float(v), unit.factor_to_si) if usable[i] else ""
+            format_exact(float(v), unit.factor_to_si) if usable[i] else ""
             for v, (_, unit) in zip(values[i], columns, strict=True)
         ]
         cells += [

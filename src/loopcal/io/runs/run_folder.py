@@ -13,8 +13,9 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.json_text import read_json
 from loopcal.io.core.limits import TABLE_SIZE
+from loopcal.io.core.read_back import require_same
 from loopcal.io.core.result_folder import (
     FolderKind,
     describe_leftover,
@@ -33,7 +35,12 @@ from loopcal.io.core.result_folder import (
 )
 from loopcal.io.core.text_file import as_path, sha256
 from loopcal.io.data.measurement_file import load_measurements
-from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import (
+    check_same_robot,
+    format_robot,
+    list_shipped_robots,
+    load_robot,
+)
 from loopcal.io.runs.arrays_file import read_arrays
 from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
@@ -102,6 +109,7 @@ def write_run_folder(
     robot_text: str,
     force: bool = False,
     robot_name: str = ROBOT,
+    read_back: Callable[[Path], object] | None = None,
 ) -> Path:
     """Write a run folder whole or not at all, and return it.
 
@@ -110,6 +118,7 @@ def write_run_folder(
     path : the folder to make. result : content of result.json; `format` and `files` are added.
     arrays : name -> array, SI. robot_text : of the corrected robot file.
     force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
+    read_back : see `write_result_folder`.
 
     Raises
     ------
@@ -119,7 +128,7 @@ def write_run_folder(
     stream = BytesIO()
     np.savez(stream, allow_pickle=False, **arrays)
     files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
-    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force)
+    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force, read_back)
     return path
 
 
@@ -301,7 +310,18 @@ def save_run(
     text = format_robot(report.robot, report.identification.plus_minus)
     name = name_robot_file(report, force)
     text = WARNING + text if name == FAILED_ROBOT else text
-    return write_run_folder(path, document, report.arrays(), text, force, name)
+    arrays = report.arrays()
+    check = partial(_check_written_run, arrays=arrays, robot=report.robot)
+    return write_run_folder(path, document, arrays, text, force, name, check)
+
+
+def _check_written_run(path: Path, arrays: Mapping[str, np.ndarray], robot: Mechanism) -> None:
+    """Read a run; raise LoopcalError where it does not hold these numbers."""
+    run = load_run(path)
+    check_same_robot(robot, run.robot)
+    require_same("arrays", sorted(arrays), sorted(run.arrays))
+    for name, array in arrays.items():
+        require_same(f"bytes of {name}", array.tobytes(), run.arrays[name].tobytes())
 
 
 def build_document(

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check of a written measurement file: it is read, and compared with what was written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from loopcal.io.core.csv_table import read_template, require_columns
+from loopcal.io.core.read_back import require_same, require_same_numbers
+from loopcal.io.data.kind_rows import read_kinds
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.mechanism import Mechanism
+from loopcal.typing import IntArray
+
+if TYPE_CHECKING:
+    from loopcal.measure import Measurements, Observations
+
+ROUNDING = 1e-7
+"""Change of a covariance, in those of its rows: a file states their roots with nine digits."""
+
+
+def check_written_measurements(path: Path, data: Measurements, robot: Mechanism) -> None:
+    """Read a measurement file; raise LoopcalError where it does not hold these measurements.
+
+    Poses may come in another order. Rows of weight 0 and weights are not written.
+    """
+    read = load_measurements(path, robot, allow_outside_stroke=True, allow_duplicates=True)
+    require_same("names of poses", sorted(data.labels), sorted(read.labels))
+    place = {label: i for i, label in enumerate(read.labels)}
+    order = np.array([place[label] for label in data.labels], dtype=int)
+    require_same_numbers("readings", data.readings, read.readings[order])
+    require_same("use of poses", data.is_held_out.tolist(), read.is_held_out[order].tolist())
+    blocks = dict(zip(data.block.tolist(), read.block[order].tolist(), strict=True))
+    require_same("blocks", [blocks[b] for b in data.block.tolist()], read.block[order].tolist())
+    require_same("blocks", len(blocks), len(set(read.block.tolist())))
+    written = [rows for rows in data.observations if rows.weight.any()]
+    require_same("kinds", [r.kind.name for r in written], [r.kind.name for r in read.observations])
+    for before, after in zip(written, read.observations, strict=True):
+        _check_rows(before, after, order)
+
+
+def check_written_template(path: Path, robot: Mechanism) -> None:
+    """Read a measurement file without rows; raise LoopcalError where its columns have no meaning or
+    are not complete.
+    """
+    table = read_template(path)
+    empty = replace(table, rows=(("",) * len(table.names),), lines=(table.header_line + 1,))
+    read_kinds(empty, robot)
+    require_columns(table, [actuator.name for actuator in robot.actuators], "a reading")
+
+
+def _check_rows(before: Observations, after: Observations, order: IntArray) -> None:
+    """Compare the rows of one kind; `order` is the place in the file of each pose."""
+    kept, name = before.weight > 0, before.kind.name
+    require_same(f"poses of {name}", order[before.rows[kept]].tolist(), after.rows.tolist())
+    require_same_numbers(f"measured values of {name}", before.measured[kept], after.measured)
+    require_same(f"number of covariances of {name}", int(kept.sum()), len(after.covariance))
+    sd = np.where(before.present, np.sqrt(np.diagonal(before.covariance, 0, 1, 2)), np.inf)[kept]
+    change = (after.covariance - before.covariance[kept]) / (sd[:, :, None] * sd[:, None, :])
+    require_same(f"covariances of {name}", True, bool((np.abs(change) <= ROUNDING).all()))
+    for what in ("session", "group"):
+        values = getattr(before, what)[kept].tolist()
+        require_same(f"{what}s of {name}", values, getattr(after, what).tolist())
+    for what, values in before.context.items():
+        require_same_numbers(f"{what} of {name}", values[kept], after.context[what])

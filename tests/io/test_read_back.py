@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each file that loopcal writes is read before it takes its name, and names it cannot hold are
+refused when they are read."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.errors import DataError, FileError
+from loopcal.io import load_measurements, load_robot, save_measurements, save_robot
+from loopcal.io.robot.robot_file import find_robot_file
+from loopcal.measure import Measurements, Observations, Position
+
+FIVE_BAR = find_robot_file("five-bar").read_text()
+
+
+def write_robot(folder, **names: str):
+    text = FIVE_BAR
+    for word, name in names.items():
+        text = re.sub(rf"\b{word}\b", lambda _, n=name: json.dumps(n, ensure_ascii=False), text)
+    path = folder / "robot.yaml"
+    path.write_text(text)
+    return path
+
+
+def make_data(robot, **changes) -> Measurements:
+    kind = Position().with_tool(robot.tool)
+    rows = Observations.from_sigma(kind, np.arange(3), np.full((3, 3), 0.1), 1e-5)
+    return Measurements(robot.name, np.full((3, 2), 0.5) + np.eye(3, 2), (rows,), **changes)
+
+
+RESERVED = ("use", "time", "temperature", "temperature.motor", "pose", "kind", "session", "group")
+PREFIXED = ("block", "note", "notes", "sigma.x", "measured.x", "commanded.x", "cov.a.b", "step")
+
+
+@pytest.mark.parametrize("name", [*RESERVED, *PREFIXED, "hold"])
+def test_an_actuator_with_the_name_of_another_column_is_refused(tmp_path, name: str) -> None:
+    with pytest.raises(FileError, match="has the name of a column that has another mean") as caught:
+        load_robot(write_robot(tmp_path, left=name))
+    assert caught.value.line == 11
+
+
+@pytest.mark.parametrize("name", ["q [", "q]", "[mm]", " q", "q "])
+def test_a_name_that_no_header_can_contain_is_refused(tmp_path, name: str) -> None:
+    for word in ("left", "west", "motor") if name.strip() == name else ("left",):
+        with pytest.raises(FileError, match="cannot be the name of a column") as caught:
+            load_robot(write_robot(tmp_path, **{word: name}))
+        assert caught.value.line is not None
+
+
+def test_a_joint_cannot_have_the_name_of_a_temperature(tmp_path) -> None:
+    with pytest.raises(FileError, match=r"the joint 'temperature.motor' has the name of a column"):
+        load_robot(write_robot(tmp_path, west="temperature"))
+
+
+@pytest.mark.parametrize("name", ["x", "y", "rx", "a, b", "#", '"', "'", "1e3", "=", "-"])
+def test_an_actuator_may_have_the_name_of_a_coordinate(tmp_path, monkeypatch, name: str) -> None:
+    """Measured values and commands then have a prefix in files."""
+    monkeypatch.chdir(tmp_path)
+    robot = load_robot(write_robot(tmp_path, left=name))
+    data = make_data(robot, labels=("#1", 'a "quoted" one, here', "é"))
+    save_measurements(data, "data.csv", robot)
+    read = load_measurements("data.csv", robot, allow_outside_stroke=True)
+    assert read.labels == data.labels
+    assert np.array_equal(read.readings, data.readings)
+    assert np.array_equal(read.observations[0].measured, data.observations[0].measured)
+
+
+def test_a_plan_tells_readings_from_commands_of_the_same_name(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    robot = load_robot(write_robot(tmp_path, left="y", right="a, b"))
+    words = "plan robot.yaml --poses 6 --hold-out 2 --kind position -o plan"
+    assert main(words.split()) == 0
+    lines = (tmp_path / "plan" / "plan.csv").read_text().splitlines()
+    header = next(line for line in lines if not line.startswith("#"))
+    assert header == 'step,pose,use,x [mm],commanded.y [mm],y [deg],"a, b [deg]"'
+    data = load_measurements("plan/measurements.csv", robot)
+    assert np.abs(data.readings).max() < 4  # [rad]: not the commands
+
+
+@pytest.mark.parametrize("label", ["", " a", "a ", "a;b", "a\nb"])
+def test_a_label_that_no_cell_can_contain_is_refused(tmp_path, label: str) -> None:
+    robot = load_robot("five-bar")
+    with pytest.raises(DataError, match="rename it"):
+        save_measurements(make_data(robot, labels=("1", label, "3")), tmp_path / "d.csv", robot)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_label_with_a_number_sign_survives_compensation(tmp_path, monkeypatch) -> None:
+    """A line that begins with # is a remark, so the label is in quotes."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "targets.csv").write_text('pose,x [mm],y [mm]\n"#1",0,330\n"a ""b"", c",5,330\n')
+    assert main(["compensate", "five-bar", "targets.csv", "-o", "readings.csv"]) == 0
+    text = (tmp_path / "readings.csv").read_text()
+    assert '"#1",' in text
+    assert '"a ""b"", c",' in text
+
+
+BROKEN = {
+    "robot": ("loopcal.io.robot.robot_file.format_robot", "simulate five-bar -o d.csv --truth F"),
+    "data": ("loopcal.io.data.measurement_writer.format_measurements", "simulate five-bar -o F"),
+    "new": ("loopcal.io.robot.derived_robots.format_new_robot", "new five-bar -o F"),
+    "template": (
+        "loopcal.io.data.measurement_writer.format_template",
+        "new five-bar -o r.yaml --measurements F",
+    ),
+    "compensation": (
+        "loopcal.io.runs.compensation_file.format_compensation",
+        "compensate five-bar targets.csv -o F",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_file_that_cannot_be_read_back_replaces_nothing(
+    tmp_path, monkeypatch, capsys, what: str
+) -> None:
+    """A defect of a writer is simulated: the first character of each line is lost."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "targets.csv").write_text("pose,x [mm],y [mm]\na,0,330\n")
+    (tmp_path / "F").write_text("old")
+    function, command = BROKEN[what]
+    module, name = function.rsplit(".", 1)
+    format_text = getattr(__import__(module, fromlist=[name]), name)
+
+    def damage(*arguments, **settings):
+        return "".join(line[1:] + "\n" for line in format_text(*arguments, **settings).splitlines())
+
+    monkeypatch.setattr(function, damage)
+    assert main([*command.split(), "--force"]) == 1
+    assert (tmp_path / "F").read_text() == "old"
+    capsys.readouterr()
+
+
+def test_values_of_a_robot_are_compared(tmp_path, monkeypatch) -> None:
+    robot = load_robot("five-bar")
+    monkeypatch.setattr(
+        "loopcal.io.robot.identified_table.format_scaled", lambda v, f: f"{v / f:.9g}"
+    )
+    with pytest.raises(FileError, match=r"identified values .* was written, but .* is read"):
+        save_robot(robot.with_values(robot.values * np.pi), tmp_path / "robot.yaml")
+    assert not list(tmp_path.iterdir())
