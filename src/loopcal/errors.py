@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from loopcal.plain_text import escape
+
 if TYPE_CHECKING:
     from loopcal.findings import Finding
 
@@ -77,7 +79,8 @@ class FileError(LoopcalError):
         self.line = line
 
     def __str__(self) -> str:
-        place = f"{self.path}" if self.line is None else f"{self.path}:{self.line}"
+        path = escape(str(self.path))
+        place = path if self.line is None else f"{path}:{self.line}"
         return f"{place}: {self.sentence}"
 
 

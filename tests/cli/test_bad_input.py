@@ -383,7 +383,7 @@ def test_missing_controller_file_is_refused(run_refused) -> None:
     text = DATA.replace(HEADER, f"pose,{commanded},z [mm]").replace(
         "# noise", "# controller: no.yaml\n# noise"
     )
-    assert "this robot file does not exist" in run_refused(
+    assert "'controller' names no.yaml, which does not exist" in run_refused(
         "calibrate hexapod-42 data.csv -o run", data_csv=text
     )
 

@@ -183,7 +183,7 @@ BAD_EXPORTS = {
     "a preamble alone": ("Liste\n", ("export.txt:1: no line names the columns Name, X, Y, Z of "
                                     ".*profile.yaml")),
     "another header": ("A;B;C\n1;2;3\n", ("export.txt:1: no line names the columns Name, X, Y, "
-                                         "Z.*the first line is 'A . B . C'")),
+                                         "Z of .*profile.yaml; correct the profile$")),
     "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
     "decimal points instead of commas": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",

@@ -67,6 +67,21 @@ MODULES = {
 }
 """Modules of this package, and the commands in each; they are imported when they run."""
 
+THREADS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "GOTO_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+"""Variables by which libraries of linear algebra choose their threads, before numpy is imported.
+
+One thread makes the last digits of results independent of the machine's settings. It is also the
+fastest, because the matrices are small and threads wait for each other (5000 poses on two cores:
+0.3 s with one thread, 5 s and more with two).
+"""
+
 
 class SectionedGroup(click.Group):
     """A group whose help lists its commands below headings, in the order of the work."""
@@ -141,11 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ----------
     arguments : words after `loopcal`; default: those of the process.
     """
-    # Linear algebra works on many small matrices here, where threads only wait for each other
-    # (5000 poses on two cores: 0.3 s with one thread, 5 s and more with two). A user who sets
-    # these variables decides.
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    os.environ.update(dict.fromkeys(THREADS, "1"))
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None

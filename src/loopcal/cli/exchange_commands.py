@@ -127,6 +127,7 @@ def import_(
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
     from loopcal.diagnose import compare_stored_geometry
+    from loopcal.io.core.names import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.formats.import_export import choose_format, save_imported
     from loopcal.report.calibration_view import with_hint
@@ -144,7 +145,7 @@ def import_(
     beside = file.with_suffix(".yaml") if source.name == "urdf" else None
     refuse_outputs((output, data), (file, settings["closures"] or beside), force)
     refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
-    imported = read(file, _make_import_options(source, output.stem, settings))
+    imported = read(file, _make_import_options(source, make_name(output.stem), settings))
     with restore_on_failure((output, data)):
         robot = save_imported(file, imported, output, data)
         noted = list(imported.findings)

@@ -253,7 +253,9 @@ def leave_out_held_out(data: Measurements) -> Measurements:
 
 
 def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
-    """Read measurement files as one set; print a note where a file names another robot, or contains
+    """Read measurement files as one set.
+
+    Print a note where a file names another robot, or another file by its absolute path, or contains
     no measured value.
 
     Raises
@@ -264,12 +266,16 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
     from loopcal.cli import terminal
     from loopcal.findings import report_finding
     from loopcal.io import load_measurements
-    from loopcal.io.core.csv_table import read_robot_name
+    from loopcal.io.core.csv_table import read_settings
+    from loopcal.io.core.references import list_absolute_references
     from loopcal.io.data.measurement_file import list_unfilled_files
 
     for path in paths:
-        stated = read_robot_name(path)
-        if stated is not None and stated != robot.name:
+        settings = read_settings(path)
+        for finding in list_absolute_references(settings):
+            terminal.print_note(str(finding))
+        stated = str(settings.content.get("robot") or "").strip()
+        if stated not in ("", robot.name):
             code = "workflow.robot-of-other-name"
             note = report_finding(code, file=str(path), stated=stated, used=robot.name)
             terminal.print_note(str(note))

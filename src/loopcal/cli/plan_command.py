@@ -282,7 +282,8 @@ def _write_plan(
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
-    from loopcal.report.plan_drawing import draw_curve, draw_plan, save_figure
+    from loopcal.report.pictures import save_figure
+    from loopcal.report.plan_drawing import draw_curve, draw_plan
 
     figures = {}
     if isinstance(result, Plan):

@@ -35,6 +35,7 @@ def new(
       loopcal new linear-delta -o printer.yaml --measurements heights.csv \\
           --kind component --components z
     """  # noqa: D301
+    from loopcal.io.core.names import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
     from loopcal.io.core.yaml_file import parse_yaml
@@ -45,7 +46,7 @@ def new(
 
     instrument = make_instrument(options)
     refuse_outputs((output, measurements), (), force)
-    robot_text = format_new_robot(family, output.stem)
+    robot_text = format_new_robot(family, make_name(output.stem))
     robot = build_robot(parse_yaml(robot_text, output, "robot file"))
     template = format_template(robot, instrument)
     with restore_on_failure((output, measurements)):

@@ -19,6 +19,7 @@ import click
 
 from loopcal.cli.time_limit import TimeLimitError
 from loopcal.errors import FileError
+from loopcal.plain_text import escape
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 WIDEST = 120
 """Characters of the longest line of prose, on wide terminals."""
+
+LONGEST_MESSAGE = 4000
+"""Characters of a message; a longer one lists more than anybody reads."""
 
 DELAY = 2.0
 """Seconds of work before progress is shown."""
@@ -51,7 +55,7 @@ def print_json(document: Any) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print text on standard output as it is.
+    """Print text on standard output, plain and otherwise as it is.
 
     Raises
     ------
@@ -59,7 +63,7 @@ def print_text(text: str) -> None:
     BrokenPipeError : its reader has stopped.
     """
     with _report_output_errors():
-        click.echo(text, nl=False)
+        click.echo(escape(text, "\n"), nl=False)
 
 
 def flush_output() -> None:
@@ -107,7 +111,8 @@ def prepare_streams() -> None:
 
 
 def print_message(text: str) -> None:
-    """Print a message on standard error: one line, which a terminal shows wrapped."""
+    """Print a message on standard error: one line of plain text, which a terminal shows wrapped."""
+    text = escape(text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]} …")
     if sys.stderr.isatty():
         text = textwrap.fill(text, width(), break_long_words=False, break_on_hyphens=False)
     with suppress(OSError):  # a message that cannot be shown must not end the work
@@ -206,7 +211,7 @@ def _make_bar() -> Any:
     )
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),

@@ -202,7 +202,9 @@ def read_content(module: str) -> dict[str, Any]:
     """Return the content of the published.yaml beside a module (its `__file__`)."""
     from loopcal.io.core.yaml_file import read_yaml
 
-    return read_yaml(Path(module).with_name("published.yaml"), "file of published numbers").content
+    return read_yaml(
+        Path(module).with_name("published.yaml"), "file of published numbers", has_names=False
+    ).content
 
 
 def last_digit(text: str) -> float:

@@ -206,7 +206,7 @@ def read_wording(module: str) -> Wording:
     from loopcal.io.core.yaml_file import read_yaml
 
     content: dict[str, Any] = read_yaml(
-        Path(module).with_name("text.yaml"), "file of claims and captions"
+        Path(module).with_name("text.yaml"), "file of claims and captions", has_names=False
     ).content
     return Wording(
         paragraphs=tuple(content["about"]),

@@ -5,7 +5,6 @@ poses.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,8 @@ from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import DIMENSIONS
 from loopcal.planning.result import Plan
 from loopcal.planning.sample_size import ErrorCurve
-from loopcal.report.robot_drawing import COLORS, DPI
+from loopcal.report.pictures import show_names
+from loopcal.report.robot_drawing import COLORS
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def draw_plan(plan: Plan) -> Figure:
         f"{plan.robot.name}: n = {plan.n_poses} poses for calibration, {n_held_out} for validation",
         fontsize=10,
     )
-    return figure
+    return show_names(figure)
 
 
 def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
@@ -117,12 +117,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     axes.set_title(
         f"{robot.name}: n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}", fontsize=10
     )
-    return figure
-
-
-def save_figure(path: Path, figure: Figure) -> None:
-    """Write a figure."""
-    figure.savefig(path, dpi=DPI)
+    return show_names(figure)
 
 
 def _unit(robot: Mechanism, name: str) -> Unit:

@@ -17,6 +17,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
+from loopcal.report.pictures import FORMATS, save_figure, show_names
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -31,8 +32,6 @@ AXIS, GUIDE = 0.06, 0.12
 """Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
 as a share of the robot's size.
 """
-DPI = 150
-FORMATS = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
     figure.suptitle(_caption(robot, where, length.symbol), fontsize=10)
     handles = _legend(robot)
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-    return figure
+    return show_names(figure)
 
 
 def save_picture(
@@ -95,7 +94,7 @@ def save_picture(
             f"{', '.join(FORMATS)}",
             path,
         )
-    draw(robot, solution, row).savefig(path, dpi=DPI)
+    save_figure(path, draw(robot, solution, row))
 
 
 def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from loopcal.plain_text import escape
 from loopcal.report.tables import Table
 
 COMMAND = "Next: loopcal "
@@ -16,7 +17,7 @@ Block = str | Table
 
 
 def render_text(blocks: Iterable[Block], width: int) -> str:
-    """Return blocks as text, with an empty line around tables.
+    """Return blocks as plain text, with an empty line around tables.
 
     Parameters
     ----------
@@ -31,7 +32,7 @@ def render_text(blocks: Iterable[Block], width: int) -> str:
             lines.append("")
         lines += (block.to_text(width) if is_table else wrap_text(block, width)).split("\n")
         after_table = is_table
-    return "\n".join(lines)
+    return escape("\n".join(lines), "\n")
 
 
 def wrap_text(text: str, width: int) -> str:

@@ -20,12 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
-from loopcal.findings import Finding
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.decimal_columns import parse_decimals
 from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_ROWS, TABLE_SIZE
+from loopcal.io.core.names import LONGEST_COMPOSED, LONGEST_NAME, find_fault
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
+from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -34,6 +36,9 @@ CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/
 
 SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_noise", "poses")
 """Keys by which a settings file is recognized among YAML files of the same name."""
+
+NAME_COLUMNS = ("pose", "use", "block", "kind", "session", "group")
+"""Columns whose cells are names."""
 
 _SETTING = re.compile(r"^#\s*[A-Za-z]\w*:(\s|$)")
 _HEADER = re.compile(r"^(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?$")
@@ -124,11 +129,15 @@ class Table:
         except ValueError:
             value = None
         if value is None or "_" in cell:
-            sentence = f"column {name!r} is {cell!r}, but a number is needed, such as 12.5 or 1e-3"
+            sentence = (
+                f"column {name!r} is {quote(cell)}, but a number is needed, such as 12.5 or 1e-3"
+            )
             raise self.row_error(row, sentence)
         if not math.isfinite(value):
             act = "leave the cell empty where nothing was measured"
-            raise self.row_error(row, f"column {name!r} is {cell!r}, which is not finite; {act}")
+            raise self.row_error(
+                row, f"column {name!r} is {quote(cell)}, which is not finite; {act}"
+            )
         return value
 
     def header_error(self, sentence: str) -> FileError:
@@ -179,7 +188,9 @@ def read_template(path: str | Path) -> Table:
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
     rows = tuple(_parse_row(path, line, text, len(units)) for line, text in numbered[1:])
-    return Table(path, settings, header_line, units, rows, tuple(line for line, _ in numbered[1:]))
+    table = Table(path, settings, header_line, units, rows, tuple(n for n, _ in numbered[1:]))
+    _refuse_names(table)
+    return table
 
 
 def _check_size(path: Path, numbered: Sequence[tuple[int, str]]) -> None:
@@ -220,10 +231,9 @@ def _quote_cell(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"#') else text
 
 
-def read_robot_name(path: str | Path) -> str | None:
-    """Return the robot that a measurement file names, None where it names none."""
-    name = _read_settings(Path(path), _read_lines(path))[0].content.get("robot")
-    return None if name is None else str(name).strip()
+def read_settings(path: str | Path) -> YamlFile:
+    """Return the settings of a measurement file; raise FileError as `read_table`."""
+    return _read_settings(as_path(path, WHAT), _read_lines(path))[0]
 
 
 def _read_lines(path: str | Path) -> list[str]:
@@ -244,6 +254,8 @@ def _read_settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
         # `# key: value` leaves one blank before each key, the same for all
         return parse_yaml(text, path, "front matter"), count
     except FileError as error:
+        if error.code is not None:
+            raise
         advice = "lines with # at the top are settings, '# key: value'; begin a remark with ##"
         raise FileError(f"{error.sentence} ({advice})", path, error.line) from None
 
@@ -272,16 +284,39 @@ def _read_sidecar(path: Path, has_front_matter: bool) -> YamlFile | None:
 def _parse_header(path: Path, line: int, text: str) -> dict[str, str | None]:
     """Return name -> unit symbol of a header line."""
     units: dict[str, str | None] = {}
-    for i, cell in enumerate(_split_cells(path, line, text)):
+    cells = _split_cells(path, line, text)
+    for i, cell in enumerate(cells):
         match = _HEADER.match(cell)
+        name = cell if match is None else match["name"]
+        fault: str | Finding | None = find_fault(name, LONGEST_COMPOSED)
         if match is None:
-            sentence = f"header of column {i + 1} is {cell!r}; write name and unit, as 'x [mm]'"
-            raise FileError(sentence, path, line)
-        name = match["name"]
-        if name in units:
-            raise FileError(f"duplicate column {name!r}; remove one", path, line)
+            fault = f"header of column {i + 1} is {quote(cell)}; write name and unit, as 'x [mm]'"
+        elif fault is None and name in units:
+            fault = f"duplicate column {name!r}; remove one"
+        if fault is not None:
+            is_ours = any(_is_header(cell) for cell in cells)
+            finding = fault if is_ours else report_finding("files.header-not-recognized")
+            raise FileError(finding, path, line)
+        assert match is not None
         units[name] = match["unit"].strip() if match["unit"] is not None else None
     return units
+
+
+def _is_header(cell: str) -> bool:
+    """Return whether a cell is by its form the header of a column: a known name, or with a unit."""
+    return cell in NAME_COLUMNS or cell.endswith(("]", ")"))
+
+
+def _refuse_names(table: Table) -> None:
+    """Raise FileError for the first cell that is no name; see `loopcal.io.core.names`."""
+    for column in NAME_COLUMNS:
+        if column not in table.units:
+            continue
+        cells = table.text(column)
+        longest = LONGEST_COMPOSED if column == "pose" else LONGEST_NAME
+        for cell in dict.fromkeys(cells):
+            if (fault := find_fault(cell, longest)) is not None:
+                raise table.row_error(cells.index(cell), fault)
 
 
 def _parse_row(path: Path, line: int, text: str, count: int) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ Reading has one function, which turns every fault of the text into one sentence.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,7 @@ from loopcal import serialization
 from loopcal.errors import FileError
 from loopcal.io.core.limits import JSON_DEPTH, PROGRAM_SIZE, FileLimit
 from loopcal.io.core.text_file import read_text
-
-_SURROGATE = re.compile("[\ud800-\udfff]")
-"""Half a character: part of a file name that is not UTF-8."""
+from loopcal.plain_text import escape_json
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -37,8 +34,7 @@ def to_json(document: Mapping[str, Any]) -> str:
     content = serialization.to_json(document, nulls)
     if nulls:
         content["nulls"] = nulls
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    return _SURROGATE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+    return escape_json(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)) + "\n"
 
 
 def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGRAM_SIZE) -> Any:

@@ -182,6 +182,23 @@ PATTERN_SECONDS = FileLimit(
     "for one export, and 0.1 ms more for each of its lines",
     "write a pattern without a repetition inside a repetition, such as `(a+)+`",
 )
+NAME_LENGTH = FileLimit(
+    "length of a name",
+    200,
+    "characters",
+    "robots, limbs, actuators, sessions, targets, and every other text of a YAML file",
+    "shorten it",
+)
+COMPOSED_LENGTH = FileLimit(
+    "length of a composed name",
+    1_000,
+    "characters",
+    "names such as `monday.tracker.x`, headers of columns, names of poses",
+    "shorten it",
+)
+TEXT_LENGTH = FileLimit(
+    "length of a text that is no name", 10_000, "characters", "`source` of a robot", "shorten it"
+)
 COPIES = FileLimit("copies of a limb", MOST_COPIES, "copies", "`copies: {count: ..}` of a limb")
 LIMBS = FileLimit("limbs of a robot", MOST_LIMBS, "limbs", "copies included")
 JOINTS = FileLimit("joints of a limb", MOST_JOINTS, "joints", "a universal joint counts as two")
@@ -199,6 +216,9 @@ LIMITS: tuple[FileLimit, ...] = (
     JOINTS,
     ACTUATORS,
     PARAMETERS,
+    NAME_LENGTH,
+    COMPOSED_LENGTH,
+    TEXT_LENGTH,
     TABLE_SIZE,
     TABLE_ROWS,
     TABLE_COLUMNS,

@@ -5,17 +5,32 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError, UnitError, suggest_names
+from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
+from loopcal.io.core.names import find_fault_below
 from loopcal.io.core.text_file import as_path, read_text
+from loopcal.plain_text import escape, quote
 from loopcal.units import Dimension, parse_quantity
 
 Location = tuple[str | int, ...]
+
+LONGEST_PROBLEM = 100
+"""Characters of a parser's sentence that a message repeats."""
+
+_KNOWN_KEY = re.compile(
+    r"""^[\s{]*["']?(format|units|family|identified|kinds?|noise|controller|instrument|robot|poses"""
+    r"""|unknowns|reading_noise|columns|delimiter|settings|closed_loop|name_mot)["']?\s*:""",
+    re.MULTILINE,
+)
+"""A line by which a file is recognized as one of loopcal; messages only quote such files."""
 
 
 @dataclass(frozen=True)
@@ -63,49 +78,78 @@ class YamlFile:
             raise self.error(f"{name_location(location)!r}: {error}", location) from None
 
 
-def read_yaml(path: str | Path, what: str) -> YamlFile:
-    """Read one mapping from a YAML 1.2 file; `what` it should be is for messages.
+def read_yaml(path: str | Path, what: str, has_names: bool = True) -> YamlFile:
+    """Read one mapping from a YAML 1.2 file.
+
+    Parameters
+    ----------
+    path : the file. what : what it should be, for messages.
+    has_names : whether its keys and texts are names (`loopcal.io.core.names`), not prose.
 
     Raises
     ------
     FileError
         Unreadable file, YAML syntax, duplicate key, a key that is not text, a number that is not
-        finite, a YAML tag, or more than the limits of `loopcal.io.core.limits` allow.
+        finite, a name that a file must not contain, a YAML tag, or more than the limits of
+        `loopcal.io.core.limits` allow.
     """
-    return parse_yaml(read_text(path, what, limit=YAML_SIZE), path, what)
+    return parse_yaml(read_text(path, what, limit=YAML_SIZE), path, what, has_names=has_names)
 
 
-def parse_yaml(text: str, path: str | Path, what: str, first_line: int = 1) -> YamlFile:
+def parse_yaml(
+    text: str, path: str | Path, what: str, first_line: int = 1, has_names: bool = True
+) -> YamlFile:
     """Parse YAML text that begins at line `first_line` of `path`; raise as `read_yaml`."""
+    path = as_path(path, what)
+    YAML_SIZE.check(len(text), what, path)
+    is_ours = not has_names or _KNOWN_KEY.search(text) is not None
+    with _hide_content(path, what) if not is_ours else nullcontext():
+        tree = _load_tree(text, path, what, first_line)
+    if not isinstance(tree, Mapping):
+        sentence = f"this {what} contains no 'key: value' lines; see the examples of loopcal"
+        raise FileError(sentence, path)
+    file = YamlFile(path, text, tree, {}, first_line)
+    with _hide_content(path, what) if not is_ours else nullcontext():
+        content = _to_plain(tree, file, ())
+        if has_names:
+            _refuse_names(content, file, ())
+    return replace(file, content=content)
+
+
+@contextmanager
+def _hide_content(path: Path, what: str) -> Iterator[None]:
+    """Replace the text of a FileError of the body: nothing of a file of somebody else is shown."""
+    try:
+        yield
+    except FileError as error:
+        finding = report_finding("files.not-recognized", what=what)
+        raise FileError(finding, path, error.line) from None
+
+
+def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
+    """Return ruamel.yaml's tree of a text; raise FileError for bad syntax."""
     from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     from loopcal.io.core.bounded_yaml import LimitError
 
-    path = as_path(path, what)
-    YAML_SIZE.check(len(text), what, path)
     try:
-        tree = make_round_trip_yaml().load(text)
+        return make_round_trip_yaml().load(text)
     except DuplicateKeyError as error:
         key = str(error.problem).split('"')[1] if '"' in str(error.problem) else "?"
         line = error.problem_mark.line + first_line if error.problem_mark else None
-        raise FileError(f"duplicate key {key!r}; remove one", path, line) from None
+        raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
     except LimitError as error:
         line = error.problem_mark.line + first_line
         raise error.limit.make_error(what, path, line=line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        problem = " ".join(str(error.problem or error.context or "not YAML").split())
+        problem = _shorten(error.problem or error.context or "not YAML")
         sentence = f"not valid YAML ({problem}); check indentation, brackets and colons"
         raise FileError(sentence, path, mark.line + first_line if mark else None) from None
     except (YAMLError, ValueError, RecursionError) as error:
-        sentence = f"not valid YAML ({' '.join(str(error).split())}); correct the syntax"
+        sentence = f"not valid YAML ({_shorten(error)}); correct the syntax"
         raise FileError(sentence, path) from None
-    if not isinstance(tree, Mapping):
-        sentence = f"this {what} contains no 'key: value' lines; see the examples of loopcal"
-        raise FileError(sentence, path)
-    file = YamlFile(path, text, tree, {}, first_line)
-    return replace(file, content=_to_plain(tree, file, ()))
 
 
 def make_round_trip_yaml() -> Any:
@@ -125,6 +169,9 @@ def refuse_unknown_keys(
     file: YamlFile, keys: Sequence[str], allowed: Sequence[str], location: Location = ()
 ) -> None:
     """Raise FileError for the first key that is not allowed, with the nearest allowed names."""
+    if set(keys).isdisjoint(allowed) and keys and not _KNOWN_KEY.search(file.text):
+        finding = report_finding("files.no-known-key", keys=tuple(sorted(allowed)))
+        raise FileError(finding, file.path)
     for key in keys:
         if key not in allowed:
             hint = suggest_names(key, allowed) or f"; allowed: {', '.join(sorted(allowed))}"
@@ -143,6 +190,12 @@ def name_location(location: Location) -> str:
     """Return a location for messages, counting from 1: `base entry 3` for ("base", 2)."""
     text = "".join(f" entry {s + 1}" if isinstance(s, int) else f".{s}" for s in location)
     return text.removeprefix(".")
+
+
+def _shorten(problem: object) -> str:
+    """Return a parser's sentence in one line, which may quote the file, without its end."""
+    text = " ".join(str(problem).split())
+    return escape(text if len(text) <= LONGEST_PROBLEM else f"{text[:LONGEST_PROBLEM]}…")
 
 
 def _inside(location: Location) -> str:
@@ -164,7 +217,7 @@ def _to_plain(node: Any, file: YamlFile, location: Location) -> Any:
     if isinstance(node, Mapping):
         for key in node:
             if not isinstance(key, str):
-                sentence = f"key {key!r}{_inside(location)} is not text; put it in quotes"
+                sentence = f"key {quote(key)}{_inside(location)} is not text; put it in quotes"
                 raise file.error(sentence, (*location, key))
         return {str(key): _to_plain(value, file, (*location, key)) for key, value in node.items()}
     if isinstance(node, bool) or node is None:
@@ -179,6 +232,20 @@ def _to_plain(node: Any, file: YamlFile, location: Location) -> Any:
         return node.isoformat()
     sentence = f"{name_location(location)!r} has a YAML tag, which is not allowed here; remove it"
     raise file.error(sentence, location)
+
+
+def _refuse_names(node: Any, file: YamlFile, location: Location) -> None:
+    """Raise FileError for the first key or text that is not a name, or no text where one may be."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            if (fault := find_fault_below(location, key)) is not None:
+                raise file.error(fault, (*location, key))
+            _refuse_names(value, file, (*location, key))
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            _refuse_names(value, file, (*location, i))
+    elif isinstance(node, str) and (fault := find_fault_below(location, node)) is not None:
+        raise file.error(fault, location)
 
 
 def _finite(value: float, file: YamlFile, location: Location) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, read_table, require_columns
+from loopcal.io.core.references import find_reference
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.data.columns import get_dimension, read_context
 from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
@@ -271,10 +272,10 @@ def _read_tables(path: Paths) -> tuple[Table, ...]:
         name = table.settings.content.get("poses")
         if name is None:
             continue
-        beside = table.path.parent / str(name)
-        if not beside.is_file():
-            sentence = f"'poses' names {beside}, which does not exist; correct the name"
-            raise table.settings.error(sentence, ("poses",))
+        beside = find_reference(table.settings, "poses")
+        if beside is None:
+            finding = report_finding("files.reference-missing", key="poses", path=str(name))
+            raise table.settings.error(finding, ("poses",))
         if not any(beside.samefile(other.path) for other in tables):
             tables.append(read_table(beside))
     return tuple(tables)

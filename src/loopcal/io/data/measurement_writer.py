@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.io.core.csv_table import format_row
+from loopcal.io.core.names import format_comment
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
 from loopcal.io.data.column_names import find_column_fault
@@ -289,7 +290,7 @@ def _format_settings(
     robot: Mechanism, settings: Sequence[tuple[str, Mapping[str, str]]], remark: str
 ) -> list[str]:
     """Return the front matter, from the label and the settings of each kind."""
-    lines = [f"## {' '.join(remark.split())}"] if remark else []
+    lines = [f"## {format_comment(remark)}"] if remark else []
     lines += [f"# format: {FORMAT}", f"# robot: {quote_scalar(robot.name)}"]
     if len(settings) == 1:
         return lines + [f"# {key}: {text}" for key, text in settings[0][1].items()]

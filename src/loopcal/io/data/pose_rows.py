@@ -19,11 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import suggest_names
+from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
+from loopcal.io.core.references import find_reference
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextColumn, list_columns
-from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
 
@@ -261,8 +263,13 @@ def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
         return None
     if name is None:
         return robot.nominal
-    beside = table.path.parent / str(name)
-    return load_robot(beside if beside.exists() else str(name))
+    beside = find_reference(table.settings, "controller")
+    if beside is None:
+        beside = list_shipped_robots().get(str(name))
+    if beside is None:
+        finding = report_finding("files.reference-missing", key="controller", path=str(name))
+        raise table.settings.error(finding, ("controller",))
+    return load_robot(beside)
 
 
 def states_reading_noise(table: Table, robot: Mechanism) -> bool:

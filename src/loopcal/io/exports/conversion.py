@@ -26,7 +26,8 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import format_row
+from loopcal.io.core.csv_table import NAME_COLUMNS, format_row
+from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.text_file import as_path
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
@@ -39,6 +40,7 @@ from loopcal.io.exports.export_lines import (
     read_lines,
 )
 from loopcal.io.exports.profile import ColumnSource, Place, Profile, strip_target
+from loopcal.plain_text import quote
 
 Row = dict[str, str]
 """Column -> cell."""
@@ -90,7 +92,7 @@ def _split_row(row: Row, profile: Profile) -> tuple[Row, Row]:
         return row, {}
     target = row["target"]
     if target not in targets:
-        raise Misfit(f"the target {target!r} is not one of {', '.join(targets)}")
+        raise Misfit(f"the target {quote(target)} is not one of {', '.join(targets)}")
     shared = {name: cell for name, cell in row.items() if name != "target"}
     if len(targets) == 1:
         return shared, {}
@@ -208,6 +210,8 @@ def convert_export(path: str | Path, profile: Profile) -> Conversion:
             raise FileError("the profile skips every line of this export; correct it", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
+        if lines[0].header is None:  # nothing shows that the profile is meant for this file
+            raise FileError(f"{sentence}; compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
     text = _format_file(path, profile, rows, misfits, findings)
     return Conversion(text, len(rows), skipped, tuple(misfits), findings)
@@ -226,11 +230,17 @@ def _parse_row(line: Line, profile: Profile) -> Row:
         if source.pattern is not None:
             row |= _match_name(text, source.pattern)
         else:
-            row[name] = _parse_time(text, source) if name == TIME else text
+            row[name] = make_name(text) if name.startswith(NOTE) else text
+            row[name] = _parse_time(text, source) if name == TIME else row[name]
     if (use := row.get(USE_COLUMN.name, "")) not in ("", *USE_COLUMN.choices):
-        raise Misfit(f"the use {use!r} is not {' or '.join(USE_COLUMN.choices)}")
+        raise Misfit(f"the use {quote(use)} is not {' or '.join(USE_COLUMN.choices)}")
+    for name in NAME_COLUMNS:
+        if (fault := find_fault(row.get(name, ""))) is not None:
+            raise Misfit(str(fault))
     if "pose" in profile.columns and (not row["pose"] or LINK in row["pose"]):
-        raise Misfit(f"{row['pose']!r} is not a name of a pose: it is empty or contains {LINK!r}")
+        raise Misfit(
+            f"{quote(row['pose'])} is not a name of a pose: it is empty or contains {LINK!r}"
+        )
     if profile.record.matrix_places:
         cells = (_get_cell(line, place) for place in profile.record.matrix_places)
         row |= _to_quaternion([_parse_number(cell, profile, "matrix") for cell in cells])
@@ -256,7 +266,7 @@ def _parse_number(text: str, profile: Profile, name: str) -> str:
     if value in profile.missing_numbers:
         return ""
     if value is None:
-        raise Misfit(f"{text!r} is not a number for {name!r}")
+        raise Misfit(f"{quote(text)} is not a number for {name!r}")
     return profile.with_point(text)
 
 
@@ -279,7 +289,7 @@ def _match_name(name: str, pattern: re.Pattern[str]) -> Row:
     """Return the pose, and the target, in a name."""
     match = pattern.fullmatch(name)
     if match is None:
-        raise Misfit(f"the name {name!r} does not match {pattern.pattern}")
+        raise Misfit(f"the name {quote(name)} does not match {pattern.pattern}")
     groups = match.groupdict().items()
     return {key: (value or "").strip() for key, value in groups if key in {"pose", "target"}}
 
@@ -294,7 +304,7 @@ def _parse_time(text: str, source: ColumnSource) -> str:
         return datetime.strptime(text, source.format).isoformat()
     except ValueError:
         wanted = source.format or "ISO 8601, such as 2026-05-04T10:22:31"
-        raise Misfit(f"the time {text!r} does not have the format {wanted}") from None
+        raise Misfit(f"the time {quote(text)} does not have the format {wanted}") from None
 
 
 def _to_quaternion(cells: Sequence[str]) -> Row:
@@ -321,10 +331,11 @@ def _format_file(
 ) -> str:
     """Return the text of the measurement file."""
     columns = list_headers(profile)
-    lines = [" ".join(f"## converted from {path.name} by {profile.file.path.name}".split())]
+    origin = format_comment(f"converted from {path.name} by {profile.file.path.name}")
+    lines = [f"## {origin}"]
     if misfits:
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
-    lines += [f"## {finding}" for finding in findings]
+    lines += [f"## {format_comment(str(finding))}" for finding in findings]
     settings = {"format": FORMAT, **profile.record.settings}
     lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
     headers = (f"{n} [{symbol}]" if symbol is not None else n for n, symbol in columns.items())

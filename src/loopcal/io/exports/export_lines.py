@@ -19,6 +19,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.text_file import read_bytes
 from loopcal.io.exports.profile import Profile, normalize_name
+from loopcal.plain_text import quote
 
 
 class Misfit(Exception):  # noqa: N818
@@ -88,8 +89,7 @@ def _refuse_header(
     """
     if nearest is None or nearest[0] == 0:
         names, number = ", ".join(sorted(named)), None if nearest is None else nearest[1]
-        shown = "" if nearest is None else f"; the first line is {' | '.join(nearest[2])!r}"
-        sentence = f"no line names the columns {names} of {profile.file.path}{shown}"
+        sentence = f"no line names the columns {names} of {profile.file.path}"
         raise FileError(f"{sentence}; correct the profile", path, number)
     _, number, cells = nearest
     known = {cell.casefold(): cell for cell in reversed(cells) if cell}
@@ -102,7 +102,7 @@ def _refuse_header(
         "files.export-column-missing",
         profile=str(profile.file.path),
         missing=tuple(missing),
-        columns=tuple(cell for cell in cells if cell),
+        columns=tuple(quote(cell)[1:-1] for cell in cells if cell),
     )
     raise FileError(finding, path, number)
 

@@ -48,6 +48,7 @@ from loopcal.io.formats.program_format import (
     ImportOptions,
 )
 from loopcal.io.formats.value_file import Name, Value, ValueFile, format_number, is_same
+from loopcal.plain_text import quote
 
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
 FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")
@@ -134,7 +135,7 @@ def parse_gcode(lines: Iterable[str], path: Path, one_in_a_line: bool = False) -
                 )
                 raise FileError(sentence, path, i + 1)
             if rest:
-                sentence = f"{command} has {rest!r}, but a letter and its number are needed"
+                sentence = f"{command} has {quote(rest)}, but a letter and its number are needed"
                 raise FileError(f"{sentence}; correct it", path, i + 1)
             for k, (letter, start, length) in enumerate(letters):
                 if any(letter == other for other, *_ in letters[:k]):

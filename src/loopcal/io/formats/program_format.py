@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
+from loopcal.io.core.names import format_comment
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.text_file import read_bytes
 from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.mechanism import Mechanism
+from loopcal.plain_text import quote
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -159,7 +161,7 @@ def format_head(
     ----------
     what : the content of that file. units : of length and angle. remark : for people.
     """
-    origin = " ".join(f"{path.name}, {what}".split())
+    origin = format_comment(f"{path.name}, {what}")
     return "\n".join(
         [
             *(f"# {line}" for line in textwrap.wrap(f"Read from {origin}. {remark}", 98)),
@@ -176,7 +178,7 @@ def parse_number(text: str, what: str, path: Path, line: int) -> float:
     """Return a finite number of a file; FileError with its line for other text."""
     value = parse_finite(text)
     if value is None:
-        sentence = f"{what} is {text!r}, but a finite number is needed; correct it"
+        sentence = f"{what} is {quote(text)}, but a finite number is needed; correct it"
         raise FileError(sentence, path, line)
     return value
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import FileError, MechanismError
+from loopcal.io.core.names import find_fault
 from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.formats.program_format import parse_number
@@ -146,6 +147,8 @@ class _Parser:
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._stack.append(name)
         line = self._expat.CurrentLineNumber
+        if len(self._stack) < 3 and (fault := find_fault(attributes.get("name", ""))) is not None:
+            raise FileError(fault, self.path, line)
         if self._stack == ["robot", "link"]:
             self.links.append(attributes.get("name", ""))
         elif self._stack == ["robot", "joint"]:

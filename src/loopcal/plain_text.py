@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Plain text: characters that every program shows where they stand.
+
+Names of files, cells of tables and values of settings are written by others. Control characters
+drive a terminal, end a comment, or begin a command in a controller's file; characters that reverse
+the direction of text, or that nobody sees, make a name look like another one. `escape` shows them
+as a Python string would, such as `\x1b`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import unicodedata
+from typing import Any
+
+SHOWN = 40
+"""Characters of another's text that a message quotes."""
+
+_NOT_PLAIN = re.compile(
+    "["
+    "\x00-\x1f\x7f-\x9f"  # control characters
+    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # direction of text
+    "\u2028\u2029"  # separators of lines and of paragraphs
+    "\u00ad\u200b\u2060\ufeff\U000e0000-\U000e007f"  # invisible
+    "\ud800-\udfff"  # halves of characters: no UTF-8; bytes of names of files that are not UTF-8
+    "\ufdd0-\ufdef\ufff9-\ufffb\ufffe\uffff"  # no characters of any text
+    "]"
+)
+
+
+def find_not_plain(text: str, allowed: str = "") -> str | None:
+    """Return the first character of a text that is not plain, except for those `allowed`."""
+    return next((m[0] for m in _NOT_PLAIN.finditer(text) if m[0] not in allowed), None)
+
+
+def escape(text: str, allowed: str = "") -> str:
+    r"""Return a text with every character that is not plain as its escape.
+
+    Examples
+    --------
+    >>> escape("leg 1\x1b[31m")
+    'leg 1\\x1b[31m'
+    """
+    return _NOT_PLAIN.sub(lambda m: m[0] if m[0] in allowed else _escape_one(m[0]), text)
+
+
+def escape_json(text: str) -> str:
+    r"""Return JSON text with the same content, in which strings are plain, by JSON's escapes.
+
+    Between the strings of JSON, line breaks are the only characters that are not plain.
+    """
+    return _NOT_PLAIN.sub(lambda m: m[0] if m[0] == "\n" else json.dumps(m[0])[1:-1], text)
+
+
+def quote(value: Any) -> str:
+    """Return a text in quotes and escaped, or another value; of long ones the first characters."""
+    if isinstance(value, str):
+        return escape(repr(value if len(value) <= SHOWN else value[:SHOWN] + "…"))
+    text = repr(value)
+    return escape(text if len(text) <= SHOWN else text[:SHOWN] + "…")
+
+
+def name_character(character: str) -> str:
+    """Return a character for messages, such as `U+202E (right-to-left override)`."""
+    name = unicodedata.name(character, "").lower()
+    kind = {"Cc": "a control character", "Cs": "half of a character"}
+    name = name or kind.get(unicodedata.category(character), "no character")
+    return f"U+{ord(character):04X} ({name})"
+
+
+def _escape_one(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

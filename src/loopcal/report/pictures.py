@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures as files: names as they are written, and identical bytes for identical content."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMATS = (".png", ".svg", ".pdf")
+DPI = 150
+"""Resolution of a PNG picture."""
+
+SALT = "loopcal"
+"""Identifiers in an SVG are random without a salt."""
+
+METADATA: dict[str, dict[str, None]] = {
+    ".png": {},
+    ".svg": {"Date": None},
+    ".pdf": {"CreationDate": None},
+}
+"""The time of writing, which is left out, by format."""
+
+
+def show_names(figure: Figure) -> Figure:
+    r"""Show all texts of a figure as they are written; return it.
+
+    matplotlib reads what stands between two `$` as mathematics: `$\frac{` in the name of a robot
+    would make it fail.
+    """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
+    return figure
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a figure in the format of the file's ending, one of `FORMATS`."""
+    from matplotlib import rc_context
+
+    with rc_context({"svg.hashsalt": SALT}):
+        figure.savefig(path, dpi=DPI, metadata=METADATA[path.suffix.lower()])
