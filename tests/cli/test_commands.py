@@ -85,7 +85,7 @@ def test_calibrate_json_equals_the_result_in_the_run_folder(run, tmp_path) -> No
     assert json.loads(out) == {
         k: v
         for k, v in json.loads((tmp_path / "run" / "result.json").read_text()).items()
-        if k != "format"
+        if k not in ("format", "files")
     }
 
 

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
-
-import numpy as np
 
 from loopcal.mechanism import Mechanism
 from loopcal.report.numbers import ABSENT, format_in, format_number, units_of
@@ -80,15 +79,14 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
 def _add(budget: Mapping[str, Any]) -> dict[str, Any]:
     """Return the line of the sum."""
     worst = budget["worst_parameter"]
-    sd = budget["parameters"][worst] if worst else np.nan
     return {
         "kind": "all sources",
         "name": "",
         "evaluation": "",
         "degrees": None,
-        "position": budget["position"]["rms"] ** 2,
-        "orientation": budget["orientation"]["rms"] ** 2,
-        "parameters": {worst: sd**2},
+        "position": _square(budget["position"]["rms"]),
+        "orientation": _square(budget["orientation"]["rms"]),
+        "parameters": {worst: _square(budget["parameters"][worst])} if worst else {},
         "halved": None,
     }
 
@@ -104,12 +102,25 @@ def _list_row(line: Mapping[str, Any], worst: str, units: Sequence[Any]) -> list
     degrees = line["degrees"]
     kind: str = line["kind"]
     return [
-        WORDS.get(kind, kind).format(name=line["name"]),
+        WORDS[kind].format(name=line["name"]) if kind in WORDS else kind,
         line["evaluation"],
         ABSENT if degrees is None else format_number(degrees, 3),
-        *(_show(None if v is None else np.sqrt(v), u) for v, u in zip(values, units, strict=False)),
+        *(
+            _show(None if v is None else math.sqrt(v), u)
+            for v, u in zip(values, units, strict=False)
+        ),
         *(_show(value, u) for value, u in zip(left, units, strict=False)),
     ]
+
+
+def _square(value: float | None) -> float | None:
+    """Return the square of a number; None where it is infinite, as in files."""
+    return None if value is None else value**2
+
+
+def _root(value: float | None) -> float | None:
+    """Return the square root of a number; None where there is none."""
+    return None if value is None else math.sqrt(value)
 
 
 def _show(value: float | None, unit: Any) -> str:

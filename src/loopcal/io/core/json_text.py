@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """JSON text without NaN: numbers that are not finite become null, with the reason under `nulls`.
 
-Reading has one function, which turns every fault of the text into one sentence.
+Reading has one function, which turns every fault of the text into one sentence. What it returns is
+plain: finite numbers, and no key twice.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -47,15 +49,22 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
 
     Raises
     ------
-    FileError : see `read_text`; or not JSON, or nested too deeply.
+    FileError : see `read_text`; or not JSON, a number that is not finite, a key that is there
+        twice, or nested too deeply.
     """
     text = read_text(path, what, limit=limit)
     try:
-        content = json.loads(text)
+        content = json.loads(
+            text,
+            parse_float=lambda number: _refuse_infinite(float(number), number),
+            parse_int=lambda number: _refuse_infinite(int(number), number),
+            parse_constant=lambda name: _refuse_infinite(math.nan, name),
+            object_pairs_hook=_refuse_duplicates,
+        )
     except json.JSONDecodeError as error:
         sentence = f"not valid JSON ({error.msg}); {action}"
         raise FileError(sentence, path, error.lineno) from None
-    except ValueError as error:  # a whole number of thousands of digits
+    except ValueError as error:  # also a whole number of thousands of digits
         raise FileError(f"not valid JSON ({error}); {action}", path) from None
     except RecursionError:
         raise JSON_DEPTH.make_error(what, path) from None
@@ -70,3 +79,24 @@ def _measure_depth(content: Any) -> int:
         depth += 1
         layer = [c for n in layer for c in (n.values() if isinstance(n, dict) else n)]
     return depth
+
+
+def _refuse_infinite(value: float, text: str) -> float:
+    """Return a number that fits a double."""
+    try:
+        is_finite = math.isfinite(float(value))
+    except OverflowError:
+        is_finite = False
+    if not is_finite:
+        raise ValueError(f"the number {text[:20]} is not finite")
+    return value
+
+
+def _refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the mapping of a JSON object whose keys are different."""
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"the key {key!r} is there twice")
+        content[key] = value
+    return content

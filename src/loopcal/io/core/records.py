@@ -3,8 +3,9 @@
 
 The annotations of the fields say everything. Numbers annotated `Length`, `Angle` or `Ratio` are
 converted to SI: by the units of the file, or, where the file has none, from texts such as `5 um`.
-Keys that are not fields are refused; a field `from_` has the key `from`. pydantic checks the rest
-strictly (text is not a number), and its first complaint becomes one sentence with a line.
+Keys that are not fields are refused, except in records whose class says `OTHER_KEYS = True`; a
+field `from_` has the key `from`. pydantic checks the rest strictly (text is not a number), and its
+first complaint becomes one sentence with a line.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import dataclasses
 import json
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, suggest_names
@@ -37,6 +39,7 @@ def read_record(
     record: type[T],
     units: Units | None,
     location: Location = (),
+    word: Callable[[Path, str], FileError] | None = None,
 ) -> T:
     """Return a record built from the content of a file.
 
@@ -47,6 +50,8 @@ def read_record(
     record : a dataclass with annotated fields.
     units : of the numbers in the file; None where each number states its own, as in `5 um`.
     location : of `content` in the file.
+    word : makes the error from the file and what does not fit, for files that nobody edits; by
+        default it names the line and says what to write.
 
     Raises
     ------
@@ -58,7 +63,10 @@ def read_record(
     try:
         return _make_adapter(record).validate_json(json.dumps(scaled), strict=True)
     except ValidationError as error:
-        raise _translate(error, file, content, location) from None
+        (fact, act), place = _translate(error, file, content, location)
+        if word is not None:
+            raise word(file.path, fact) from None
+        raise file.error(f"{fact}{act}", place) from None
 
 
 def read_units(file: YamlFile) -> dict[Dimension, Unit]:
@@ -127,13 +135,15 @@ def _to_si(
         return _to_si(branch, node, file, units, location)
     if isinstance(node, dict) and _is_record(annotation):
         hints = get_field_types(annotation)
+        if getattr(annotation, "OTHER_KEYS", False):
+            node = {key: value for key, value in node.items() if key in hints}
         refuse_unknown_keys(file, list(node), list(hints), location)
         names = {_key(field.name): field.name for field in dataclasses.fields(annotation)}
         return {
             names[key]: _to_si(hints[key], value, file, units, (*location, key))
             for key, value in node.items()
         }
-    if isinstance(node, dict) and origin is not None and issubclass(origin, Mapping):
+    if isinstance(node, dict) and _is_mapping(annotation):
         return {
             key: _to_si(arguments[1], value, file, units, (*location, key))
             for key, value in node.items()
@@ -162,6 +172,11 @@ def _is_record(annotation: Any) -> bool:
     return dataclasses.is_dataclass(annotation) and isinstance(annotation, type)
 
 
+def _is_mapping(annotation: Any) -> bool:
+    origin = get_origin(annotation)
+    return isinstance(origin, type) and issubclass(origin, Mapping)
+
+
 def _fit(annotation: Any, node: Any) -> float:
     """Return how well the form of `node` fits an annotation (negative: not at all).
 
@@ -177,7 +192,7 @@ def _fit(annotation: Any, node: Any) -> float:
         return 1.0 if node is None else -1.0
     if isinstance(node, dict):
         if not _is_record(annotation):
-            return 0.05 if origin is not None and issubclass(origin, Mapping) else -1.0
+            return 0.05 if _is_mapping(annotation) else -1.0
         hints = get_field_types(annotation)
         tags = {key: get_args(h) for key, h in hints.items() if get_origin(h) is Literal}
         score = sum(10.0 if node[key] in tags[key] else -10.0 for key in tags if key in node)
@@ -198,8 +213,8 @@ def _fit(annotation: Any, node: Any) -> float:
 
 def _translate(
     error: Any, file: YamlFile, content: Mapping[str, Any], location: Location
-) -> FileError:
-    """Return the first complaint of pydantic (by line) as our own sentence.
+) -> tuple[tuple[str, str], Location]:
+    """Return the first complaint of pydantic (by line) in our own words, and its location.
 
     Where pydantic names branches of a union, the deepest complaint is the relevant one.
     """
@@ -213,7 +228,7 @@ def _translate(
     missing = [c["loc"][-1] for c in complaints if c["loc"][:-1] == complaint["loc"][:-1]]
     needed = max((step + 1 for step in missing if isinstance(step, int)), default=0)
     path = (*location, *path)
-    return file.error(_word(complaint, path, node, needed), path)
+    return _word(complaint, path, node, needed), path
 
 
 def _resolve(loc: tuple[str | int, ...], content: Any) -> tuple[Location, Any]:
@@ -242,10 +257,11 @@ SHAPES: Mapping[str, tuple[str, str]] = {
     "bool_type": ("true or false", "write one of the two"),
 }
 """Complaint of pydantic -> what is needed, and what to do."""
+ADD = "; add the missing ones"
 
 
-def _word(complaint: Any, location: Location, node: Any, needed: int) -> str:
-    """Return one sentence for a complaint of pydantic: found, allowed, what to do.
+def _word(complaint: Any, location: Location, node: Any, needed: int) -> tuple[str, str]:
+    """Return what is wrong by a complaint of pydantic (found, allowed), and `; ` what to do.
 
     `needed` is the number of values of a fixed list of which some are missing.
     """
@@ -253,29 +269,30 @@ def _word(complaint: Any, location: Location, node: Any, needed: int) -> str:
     name = repr(name_location(location)) if location else "this file"
     if kind in ("missing", "missing_argument"):
         if isinstance(node, list):
-            return f"{name} has {len(node)} values, but {needed} are needed; add the missing ones"
-        return f"{name} has no key {_key(str(complaint['loc'][-1]))!r}; add it"
+            return f"{name} has {len(node)} values, but {needed} are needed", ADD
+        return f"{name} has no key {_key(str(complaint['loc'][-1]))!r}", "; add it"
     if kind in ("too_long", "too_short"):
         bound = context.get("max_length", context.get("min_length"))
-        act = "remove the others" if kind == "too_long" else "add the missing ones"
-        return f"{name} has {len(node)} values, but {bound} are needed; {act}"
+        act = "; remove the others" if kind == "too_long" else ADD
+        return f"{name} has {len(node)} values, but {bound} are needed", act
     if kind in NUMBERS:
-        act = "write a number"
+        act = "; write a number"
         if isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
-            act = "write the number without quotes and without a unit"
-            act = "write a decimal point, not a comma" if "," in node else act
-        return f"{name} is {_describe(node)}, but {NUMBERS[kind]} is needed; {act}"
+            act = "; write the number without quotes and without a unit"
+            act = "; write a decimal point, not a comma" if "," in node else act
+        return f"{name} is {_describe(node)}, but {NUMBERS[kind]} is needed", act
     if kind in SHAPES:
         shape, act = SHAPES[kind]
-        return f"{name} is {_describe(node)}, but {shape} is needed; {act}"
+        return f"{name} is {_describe(node)}, but {shape} is needed", f"; {act}"
     if kind == "literal_error":
         expected = context["expected"].replace(" or ", ", ")
-        hint = suggest_names(str(node), [part.strip("' ") for part in expected.split(",")])
-        return f"{name} is {node!r}{hint}; allowed: {expected}"
+        names = [part.strip("' ") for part in expected.split(",")]
+        hint = "" if str(node) in names else suggest_names(str(node), names)
+        return f"{name} is {node!r}{hint}; allowed: {expected}", ""
     if kind == "value_error":
-        return f"{name}: {context.get('error', complaint['msg'])}"
+        return f"{name}: {context.get('error', complaint['msg'])}", ""
     reason = complaint["msg"][:1].lower() + complaint["msg"][1:]
-    return f"{name} is {_describe(node)}, which does not fit ({reason}); correct it"
+    return f"{name} is {_describe(node)}, which does not fit ({reason})", "; correct it"
 
 
 def _describe(node: Any) -> str:

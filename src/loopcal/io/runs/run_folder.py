@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run folders of calibrations: the report with its numbers, arrays, robot file and provenance.
 
-result.json    `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validation` and more, and
-               under `made_by` its provenance (see MADE_BY); parameters in the units of the robot
+result.json    `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validation` and more, under
+               `made_by` its provenance (see MADE_BY), and under `files` the SHA-256 of the other
+               files; parameters in the units of the robot
                file, the rest in SI; a number that is not finite is null, with the reason under
                `nulls`
 arrays.npz     `Identification.arrays()`, `initial` (values of all parameters before the
@@ -24,8 +25,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.json_text import read_json
-from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.result_folder import (
     FolderKind,
@@ -41,7 +40,8 @@ from loopcal.io.robot.robot_file import (
     list_shipped_robots,
     load_robot,
 )
-from loopcal.io.runs.arrays_file import read_arrays
+from loopcal.io.runs.run_arrays import read_run_arrays
+from loopcal.io.runs.run_result import FORMAT, read_result, report_damage
 from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
     ROBOT,
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
     from loopcal.measure import FittedRows, Measurements
     from loopcal.workflow import CalibrationReport
 
-FORMAT = 1
 RESULT, ARRAYS = "result.json", "arrays.npz"
 RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))
 
@@ -137,7 +136,8 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
 
     Raises
     ------
-    FileError : not a run folder, made by a newer loopcal, or damaged.
+    FileError : not a run folder, made by a newer loopcal, or damaged; with the file and what is
+        wrong in it. What loopcal reads back is declared in `run_result` and `run_arrays`.
     """
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():
@@ -146,20 +146,18 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         leftover = "" if path.exists() else describe_leftover(path, RESULT)
         advice = leftover or "name a folder that a calibration wrote"
         raise FileError(f"{sentence}; {advice}", path)
-    action = "this run folder is damaged; restore it, or repeat the calibration"
-    result = read_json(path / RESULT, "run result", action, TABLE_SIZE)
-    if not isinstance(result, dict) or result.get("format", 0) > FORMAT:
-        sentence = f"this run has a newer format than {FORMAT}"
-        raise FileError(f"{sentence}; use a newer loopcal, or repeat the run", path)
     names = (ARRAYS, _find_robot_file(path).name)
     if missing := [name for name in names if not (path / name).is_file()]:
         sentence = f"this run folder is damaged: {' and '.join(missing)} missing"
         raise FileError(f"{sentence}; restore it, or repeat the calibration", path)
-    try:
-        arrays = read_arrays(path / ARRAYS)
-    except ValueError as error:
-        sentence = f"this run folder is damaged: {ARRAYS} cannot be read ({error})"
-        raise FileError(f"{sentence}; repeat the calibration", path) from error
+    result = read_result(path / RESULT)
+    digest = result["files"].get(ARRAYS, "none") if "files" in result else None
+    arrays = read_run_arrays(path / ARRAYS, digest)
+    for name, key in (("estimate", "parameters"), ("local_estimate", "local")):
+        rows = result["fit"].get(key, ())
+        if name in arrays and len(arrays[name]) != len(rows):
+            problem = f"'fit.{key}' has {len(rows)} entries, but the array {name!r} of {ARRAYS} has"
+            raise report_damage(path / RESULT, f"{problem} {len(arrays[name])}")
     return result, arrays
 
 
@@ -191,9 +189,8 @@ class Run:
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
-        verdict = (
-            f", {self.result['verdict'].replace('_', ' ')}" if "verdict" in self.result else ""
-        )
+        verdict = self.result.get("verdict")
+        verdict = f", {verdict.replace('_', ' ')}" if verdict else ""
         return f"<Run {str(self.path)!r}: {self.robot.name}{verdict}>"
 
     @property
@@ -251,7 +248,7 @@ class Run:
         DataError : the run has no intervals, or was made by an earlier version.
         """
         budget = self.result.get("expected_error")
-        if budget is None or "sources" not in budget:
+        if budget is None or budget.get("sources") is None:
             raise DataError(report_finding("files.no-budget", run=str(self.path)))
         return dict(budget)
 
@@ -343,15 +340,32 @@ def load_run(path: str | Path) -> Run:
     path = as_path(path, "run folder")
     result, arrays = read_run_folder(path)
     robot = load_robot(_find_robot_file(path))
-    initial = robot.with_values(arrays.get("initial", robot.parameters.nominal))
-    names = [row["name"] for row in result.get("fit", {}).get("local") or ()]
+    before = arrays.get("initial", robot.parameters.nominal)
+    _refuse_other_parameters(result, len(before), robot, _find_robot_file(path))
+    initial = robot.with_values(before)
+    names = [row["name"] for row in result["fit"].get("local", ())]
     values, initial_values = (
-        dict(zip(names, array.tolist(), strict=True))
-        if (array := arrays.get(key)) is not None and len(array) == len(names)
-        else {}
+        dict(zip(names, arrays[key].tolist(), strict=True)) if key in arrays else {}
         for key in ("local_estimate", "local_start")
     )
     return Run(path, result, robot, initial, values, initial_values, arrays)
+
+
+def _refuse_other_parameters(
+    result: Mapping[str, Any], count: int, robot: Mechanism, path: Path
+) -> None:
+    """Raise FileError where the robot file of a run has other parameters than its result, which
+    states those that were identified, and other ones than the `count` before the calibration.
+    """
+    stated = [row["name"] for row in result["fit"]["parameters"]]
+    table = robot.parameters
+    names = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
+    if stated == names and count == len(table):
+        return
+    different = sorted(set(stated) ^ set(names)) or names
+    raise FileError(
+        report_finding("files.run-robot-changed", result=RESULT, name=different[0]), path
+    )
 
 
 def load_run_or_robot(path: str | Path) -> Run:

@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every damage of a run folder is named with its file, before anything is computed."""
+
+import copy
+import dataclasses
+import hashlib
+import io
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+from loopcal.errors import FileError, LoopcalError
+from loopcal.estimate.poses.smooth_errors import describe_smooth_errors
+from loopcal.io.runs.run_arrays import (
+    DISCREPANCY,
+    FINITE,
+    FITTED,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RULES,
+    find_problem,
+)
+from loopcal.io.runs.run_folder import Run
+from loopcal.io.runs.run_result import read_result
+from loopcal.report.budget_view import view_budget
+
+DATA = """# kind: position
+# places: [[20 mm, 10 mm, 5 mm]]
+# unknown: [frame]
+# frame: tracker
+# noise: {x: 10 um, y: 10 um, z: 10 um}
+"""
+COMMANDS = (
+    "validate RUN new.csv",
+    "budget RUN",
+    "compensate RUN targets.csv",
+    "compensate RUN/robot.yaml targets.csv",
+    "export RUN -o parameters.csv",
+    "bootstrap RUN --count 5",
+    "sample RUN",
+    "region RUN -p west.length",
+    "calibrate five-bar new.csv -o second --prior RUN",
+)
+"""Commands that read a run folder."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a folder with a run of a small robot with an unknown frame, and files to use it on."""
+    folder = tmp_path_factory.mktemp("damaged")
+    for name, seed in (("old.csv", 1), ("new.csv", 2)):
+        words = f"simulate five-bar --draw 14 --kind position --seed {seed} -o {folder / name}"
+        assert main(words.split()) == 0
+        rows = [r for r in (folder / name).read_text().splitlines() if not r.startswith("#")]
+        (folder / name).write_text(DATA + "\n".join(rows) + "\n")
+    (folder / "targets.csv").write_text("x [mm],y [mm]\n0,150\n")
+    report = lc.calibrate(
+        robot := lc.load_robot("five-bar"),
+        lc.load_measurements(folder / "old.csv", robot),
+        lc.CalibrationOptions(hold_out=0.25),
+    )
+    lc.save_run(folder / "RUN", report, {"data": folder / "old.csv"}, ["loopcal", "calibrate"])
+    return folder
+
+
+@pytest.fixture
+def run(folder, tmp_path, monkeypatch) -> Path:
+    """Return a copy of the run, in the current folder."""
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "RUN"
+
+
+def write_result(run: Path, result: Any) -> None:
+    """Replace result.json."""
+    (run / "result.json").write_text(json.dumps(result))
+
+
+def write_arrays(run: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Replace arrays.npz by an intact one with other arrays, as result.json names it."""
+    with (run / "arrays.npz").open("wb") as stream:
+        np.savez(stream, **arrays)
+    result = json.loads((run / "result.json").read_text())
+    content = (run / "arrays.npz").read_bytes()
+    result["files"]["arrays.npz"] = hashlib.sha256(content).hexdigest()
+    write_result(run, result)
+
+
+def read_arrays(run: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an intact run."""
+    with np.load(run / "arrays.npz") as archive:
+        return dict(archive)
+
+
+def use_everything(run: Run) -> None:
+    """Use all that commands use of the result of a run; they may refuse, but not fail."""
+    for use in (
+        lambda: view_budget(run.load_budget(), run.robot),
+        run.load_uncertainty,
+        lambda: (run.failure, run.held_out, run.excluded, repr(run)),
+    ):
+        with suppress(LoopcalError):
+            use()
+
+
+def edit_zip(change: Callable[[bytearray], object]) -> Callable[[Path], object]:
+    """Return a damage that changes the bytes of arrays.npz."""
+
+    def edit(path: Path) -> None:
+        content = bytearray(path.read_bytes())
+        change(content)
+        path.write_bytes(content)
+
+    return edit
+
+
+def pack(*entries: tuple[str, bytes]) -> bytes:
+    """Return a zip archive."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in entries:
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def replace_by_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+BROKEN_FILES: dict[str, Callable[[Path], object]] = {
+    "text": lambda path: path.write_text("not an archive"),
+    "nothing": lambda path: path.write_bytes(b""),
+    "no file": lambda path: path.unlink(),
+    "folder": replace_by_folder,
+    "empty archive": lambda path: path.write_bytes(pack()),
+    "archive of text": lambda path: path.write_bytes(pack(("estimate.npy", b"1 2 3"))),
+    "one array": lambda path: np.save(path.open("wb"), np.zeros(3)),
+    "pickle": lambda path: np.save(path.open("wb"), np.array([{}]), allow_pickle=True),
+    "truncated": edit_zip(lambda content: content.__delitem__(slice(len(content) // 2, None))),
+    "half": edit_zip(lambda content: content.__delitem__(slice(0, len(content) // 2))),
+    "one bit": edit_zip(lambda content: content.__setitem__(300, content[300] ^ 1)),
+}
+
+
+@pytest.mark.parametrize("damage", BROKEN_FILES)
+@pytest.mark.parametrize("is_digest_right", [False, True])
+def test_broken_archive_is_refused(run, damage, is_digest_right) -> None:
+    path = run / "arrays.npz"
+    BROKEN_FILES[damage](path)
+    if is_digest_right and path.is_file():
+        result = json.loads((run / "result.json").read_text())
+        result["files"]["arrays.npz"] = hashlib.sha256(path.read_bytes()).hexdigest()
+        write_result(run, result)
+    with pytest.raises(FileError, match=r"arrays\.npz"):
+        lc.load_run(run)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_names_the_damaged_file(run, capsys, command) -> None:
+    (run / "arrays.npz").write_bytes(pack())
+    before = sorted(path.name for path in run.parent.rglob("*"))
+    assert main(command.split()) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "RUN/arrays.npz: this file of a run is damaged" in err
+    assert err.endswith("repeat the calibration\n")
+    write_result(run, {"format": 2})
+    assert main(command.split()) == 1
+    assert "RUN/result.json: this file of a run is damaged: it states no 'verdict'" in (
+        capsys.readouterr().err
+    )
+    assert sorted(path.name for path in run.parent.rglob("*")) == before
+
+
+def list_wrong_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Return arrays that are not allowed in place of one."""
+    yield "object", np.full(array.shape, None)
+    yield "one axis more", array[..., None]
+    yield "scalar", np.zeros((), array.dtype)
+    yield "complex", np.zeros((*array.shape, 1), complex)[..., 0]
+    yield "bytes", np.full(array.shape, b"x")
+    yield "longer", np.concatenate([array, np.ones((1, *array.shape[1:]), array.dtype)])
+    if array.dtype.kind == "f":
+        yield "single", array.astype("f4")
+        yield "text", array.astype(str)
+        yield "whole", array.astype("f8").round().astype("i8", casting="unsafe")
+    if array.dtype.kind == "f" and array.size:
+        yield "shorter", array[:-1]
+
+
+def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
+    arrays = read_arrays(folder / "RUN")
+    own = describe_smooth_errors(np.tile(np.eye(4), (3, 1, 1)), np.zeros(3)).arrays()
+    m, p = 6 * len(own["discrepancy_centers"]), len(arrays["estimate"])
+    own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(2)}
+    own |= {"discrepancy_directions": np.eye(p), "discrepancy_variance": np.ones(p)}
+    arrays |= own
+    assert set(RULES) <= set(arrays)
+    assert set(DISCREPANCY) == set(own)
+    assert find_problem(arrays) is None
+    for name in (*RULES, "fitted_0_position"):
+        if name in RULES:
+            without = {key: array for key, array in arrays.items() if key != name}
+            is_alone = name == "posterior_shown_noise"
+            assert (find_problem(without) is None) == is_alone, name
+        for form, wrong in list_wrong_arrays(arrays[name]):
+            problem = find_problem(arrays | {name: wrong})
+            is_free = name in ("fitted_0_position", "frames_readings", "initial")
+            assert (is_free and form in ("longer", "shorter")) or problem is not None, (name, form)
+        values = RULES.get(name, FITTED).values
+        is_defined = values in (FINITE, POSITIVE) or name.startswith("fitted")
+        wrong_numbers = [np.nan] if is_defined else []
+        wrong_numbers += [-1.0] if values in (NOT_NEGATIVE, POSITIVE) else []
+        for number in wrong_numbers if arrays[name].size else ():
+            wrong = np.full(arrays[name].shape, number)
+            assert find_problem(arrays | {name: wrong}) is not None, (name, number)
+
+
+CONTRADICTIONS = {
+    "posterior_part": lambda a: a + 5,
+    "frames_names": lambda a: np.repeat(a, 2),
+    "frames_by_parameters": lambda a: a[:, :, :-1],
+    "posterior_source": lambda a: np.frombuffer(
+        np.uint32([0x110000] * len(a)).tobytes(), dtype="<U1"
+    ),
+    "fitted_0_position": lambda a: np.full(a.shape, np.nan),
+    "initial": lambda a: a[:-1],
+    "local_estimate": lambda a: a[:0],
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_arrays_that_contradict_each_other_or_the_result_are_refused(run, name) -> None:
+    arrays = read_arrays(run)
+    arrays[name] = CONTRADICTIONS[name](arrays[name])
+    write_arrays(run, arrays)
+    with pytest.raises(FileError, match="RUN"):
+        lc.load_run(run)
+
+
+def list_places(node: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Return the places of all values, of lists those of the first entry."""
+    if place:
+        yield place
+    if isinstance(node, dict):
+        for key in node:
+            yield from list_places(node[key], (*place, key))
+    if isinstance(node, list) and node:
+        yield from list_places(node[0], (*place, 0))
+
+
+def replace(document: Any, place: tuple[str | int, ...], value: Any) -> Any:
+    """Return a document with another value at a place; without it for `...`."""
+    changed = copy.deepcopy(document)
+    node = changed
+    for step in place[:-1]:
+        node = node[step]
+    if value is ...:
+        del node[place[-1]]
+    else:
+        node[place[-1]] = value
+    return changed
+
+
+READ = ("format", "made_by", "verdict", "passed", "reasons", "split", "nulls", "files")
+OF_FIT = ("parameters", "local", "status", "dropped", "sigma_scale")
+WRONG = (..., -1.5, "{x}", [], {}, None, True, [[1]], {"a": 1}, 10**30)
+
+
+def test_every_wrong_value_of_a_result_is_refused_or_harmless(run) -> None:
+    """The parts that loopcal reads are tried in full, with all kinds of values."""
+    whole = json.loads((run / "result.json").read_text())
+    budget = copy.deepcopy(whole["expected_error"])
+    budget["sources"] = budget["sources"][:1]
+    whole = {key: whole[key] for key in READ} | {
+        "fit": {key: whole["fit"][key] for key in OF_FIT},
+        "expected_error": budget,
+    }
+    intact = lc.load_run(run)
+    sentences, tried = [], 0
+    for place in list_places(whole):
+        for value in WRONG:
+            write_result(run, replace(whole, place, value))
+            tried += 1
+            sentence, result = read_or_refuse(run / "result.json")
+            if sentence is None:
+                use_everything(dataclasses.replace(intact, result=result))
+            else:
+                sentences.append(sentence)
+    assert all("RUN/result.json: " in text and "; " in text for text in sentences)
+    assert len(sentences) > 0.7 * tried > 400
+
+
+def read_or_refuse(path: Path) -> tuple[str | None, dict[str, Any]]:
+    """Return the sentence with which a result is refused, or its content."""
+    try:
+        return None, read_result(path)
+    except FileError as error:
+        return str(error), {}
+
+
+MISTYPED = {
+    "": "is empty",
+    "{": ":1: not valid JSON (Expecting property name",
+    "[1, 2]": "it contains no mapping",
+    '{"format": NaN}': "the number NaN is not finite",
+    '{"format": 1e999}': "the number 1e999 is not finite",
+    '{"format": 1, "format": 1}': "the key 'format' is there twice",
+    "[" * 100_000: "levels of nesting",
+    '{"format": "2"}': "'format' is '2'; allowed: 1, 2",
+    '{"format": 99}': "this run has format 99, but this loopcal reads formats up to 2",
+    "9" * 5000: "not valid JSON (",
+}
+
+
+@pytest.mark.parametrize("text", MISTYPED, ids=lambda text: text[:12])
+def test_result_that_is_no_plain_json_is_refused(run, text) -> None:
+    (run / "result.json").write_text(text)
+    with pytest.raises(FileError) as caught:
+        lc.load_run(run)
+    assert "RUN/result.json:" in str(caught.value)
+    assert MISTYPED[text] in str(caught.value)
+
+
+def test_a_changed_robot_file_is_read_while_its_parameters_are_those_of_the_run(run) -> None:
+    path = run / "robot.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("name: five-bar", "name: our five-bar"))
+    assert lc.load_run(run).robot.name == "our five-bar"
+    path.write_text(text.replace("units:", "fixed: [west.length]\nunits:"))
+    with pytest.raises(FileError, match=r"robot\.yaml: .*compare 'west\.length'"):
+        lc.load_run(run)
+
+
+def test_a_run_of_format_1_is_still_read(run) -> None:
+    result = json.loads((run / "result.json").read_text())
+    del result["files"]
+    write_result(run, result | {"format": 1})
+    assert len(lc.load_run(run).load_posterior().unit) == 10
+    (run / "arrays.npz").write_bytes(pack())
+    with pytest.raises(FileError, match="the array 'nominal' is missing"):
+        lc.load_run(run)
