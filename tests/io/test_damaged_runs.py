@@ -282,6 +282,12 @@ def test_every_wrong_value_of_a_result_is_refused_or_harmless(run) -> None:
     whole = json.loads((run / "result.json").read_text())
     budget = copy.deepcopy(whole["expected_error"])
     budget["sources"] = budget["sources"][:1]
+    budget["finding"] = {"text": budget["finding"]["text"]}
+    for name in ("position", "orientation"):
+        budget[name] = {"rms": budget[name]["rms"]}
+    for key in ("parameters", "local"):
+        rows = whole["fit"][key]
+        whole["fit"][key] = [{k: row[k] for k in ("name", "plus_minus")} for row in rows]
     whole = {key: whole[key] for key in READ} | {
         "fit": {key: whole["fit"][key] for key in OF_FIT},
         "expected_error": budget,
@@ -298,7 +304,7 @@ def test_every_wrong_value_of_a_result_is_refused_or_harmless(run) -> None:
             else:
                 sentences.append(sentence)
     assert all("RUN/result.json: " in text and "; " in text for text in sentences)
-    assert len(sentences) > 0.7 * tried > 400
+    assert len(sentences) > 0.6 * tried > 300
 
 
 def read_or_refuse(path: Path) -> tuple[str | None, dict[str, Any]]:
