@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run folders are written completely or not at all, and only over other run folders."""
 
-import hashlib
 import json
 import math
 

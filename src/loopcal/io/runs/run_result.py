@@ -173,7 +173,9 @@ def read_result(path: Path) -> dict[str, Any]:
         if key not in content or (key in NEVER_NULL and content[key] is None):
             raise report_damage(path, f"it states no {key!r}")
     plain = json.loads(_SURROGATE.sub("?", json.dumps(content, ensure_ascii=False)))
-    stated = read_record(YamlFile(path, "", {}, plain), plain, StoredResult, None, word=report_damage)
+    stated = read_record(
+        YamlFile(path, "", {}, plain), plain, StoredResult, None, word=report_damage
+    )
     if problem := _find_contradiction(stated):
         raise report_damage(path, problem)
     return content
