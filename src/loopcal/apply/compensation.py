@@ -312,12 +312,15 @@ def _report_targets(
     is_loose = last > np.maximum(REDUCED * first, ROUNDING)
     position = np.linalg.norm(not_compensable[:, 3:], axis=1)
     angle = np.linalg.norm(not_compensable[:, :3], axis=1)
+    solved = [(solution, solution.converged) for solution in (best, uncorrected, final)]
+    is_solved, closed = np.all([converged for _, converged in solved], axis=0), best.closed
     findings = []
     for i in range(len(not_compensable)):
-        failed = next((s for s in (best, uncorrected, final) if not s.converged[i]), None)
-        if failed is best and best.closed[i]:
-            findings.append(report_finding("compensation.other-mode"))
-        elif failed is not None:
+        if not is_solved[i]:
+            failed = next(solution for solution, converged in solved if not converged[i])
+            if failed is best and closed[i]:
+                findings.append(report_finding("compensation.other-mode"))
+                continue
             whose = "the controller's geometry: " if failed is uncorrected else ""
             reason = whose + str(failed.explain(i))
             findings.append(report_finding("compensation.unreachable", reason=reason))

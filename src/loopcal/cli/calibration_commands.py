@@ -149,7 +149,9 @@ def calibrate(
     with terminal.ProgressBar() as progress:
         report = workflow.calibrate(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
-    save_run(output, report, inputs, sys.argv, force)
+    with terminal.ProgressBar() as progress:
+        progress(0, 1, "writing the run folder")
+        save_run(output, report, inputs, sys.argv, force)
     if as_json:
         terminal.print_json(build_document(report, inputs, sys.argv))
     else:
@@ -359,7 +361,7 @@ def compensate(
         terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
     missed = [
         f"target {label!r}: {with_hint(result.findings[i], hint_for)}"
-        for i, label in enumerate(labels)
-        if not result.usable[i]
+        for i, (label, is_usable) in enumerate(zip(labels, result.usable, strict=True))
+        if not is_usable
     ]
     return terminal.print_failures([*([] if failure is None else [failure]), *missed])

@@ -280,11 +280,14 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
             note = report_finding(code, file=str(path), stated=stated, used=robot.name)
             terminal.print_note(str(note))
     try:
-        data = load_measurements(paths, robot, **allowed)
+        with terminal.ProgressBar() as progress:
+            progress(0, 1, "reading the measurements")
+            data = load_measurements(paths, robot, **allowed)
+            unfilled = list_unfilled_files(paths, data)
     except DataError as error:
         if error.finding is not None and error.finding.code == "data.outside-stroke":
             _refuse_explained_strokes(error.finding, paths, robot, allowed)
         raise
-    for file in list_unfilled_files(paths, data):
+    for file in unfilled:
         terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
     return data

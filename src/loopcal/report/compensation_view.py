@@ -34,8 +34,8 @@ def view_compensation(result: Compensation) -> list[Block]:
             result.uncertainty.expanded_orientation / angle.factor_to_si,
         ]
     cells = tuple(
-        (label, result.reach[i].value, *(format_number(float(column[i]), 3) for column in values))
-        for i, label in enumerate(result.labels)
+        (label, reach.value, *(format_number(float(column[i]), 3) for column in values))
+        for i, (label, reach) in enumerate(zip(result.labels, result.reach, strict=True))
     )
     caption = f"{result.robot.name}: {len(cells)} targets, {result.mode}"
     blocks: list[Block] = [Table(caption, tuple(columns), cells)]

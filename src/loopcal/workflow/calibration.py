@@ -52,8 +52,10 @@ NOTHING_TO_COMPARE = (
 """Codes of data that leave nothing to compare: all values locate the poses, or the initial geometry
 reaches none of these."""
 
-STEPS = 5
-"""Steps that the progress callback counts: conventions, model, fit, examination, suggestions."""
+STEPS = 8
+"""Steps that the progress callback counts: conventions, model, fit, what the residuals add to the
+uncertainty, validation, examination, uncertainty budget, suggestions.
+"""
 
 
 def calibrate(
@@ -115,6 +117,7 @@ def calibrate(
         raise DataError(report_finding("data.no-held-out-value"))
     held_out = 0 if split.held_out is None else split.held_out.n_poses
     result = _fit(robot, split.fitted, options, count, held_out)
+    count.begin("testing the residuals for patterns and slow errors")
     result = replace(result, fit=adjust_uncertainty(result.fit, split.fitted))
     return _report(result, split, conventions, options, count)
 
@@ -181,9 +184,11 @@ def _report(
 ) -> CalibrationReport:
     """Validate and examine a fit, and return the report."""
     fit, fitted, held_out = interpret_fit(result.fit), split.fitted, split.held_out
+    count.begin("predicting the held-out poses" if held_out is not None else "computing errors")
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count.begin("examining the residuals")
     examination = examine_fit(fit, fitted, count.progress, options.frame) if fit.converged else None
+    count.begin("computing the uncertainty budget")
     budget = compute_error_budget(fit, fitted, options.frame) if fit.converged else None
     count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)

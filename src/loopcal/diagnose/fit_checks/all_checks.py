@@ -77,11 +77,13 @@ def examine_fit(
     Parameters
     ----------
     fit : an identification. data : the measurements it was made from.
-    progress : receives the progress of the search for outliers, which takes longest.
+    progress : receives the rounds of the search for outliers, which takes longest, and that the
+        other tests begin.
     frame : in which expected errors are stated, see `choose_error_frame`.
     """
     check_fitted_data(fit, data)
     outliers = find_outliers(fit, data, progress=progress)
+    progress(0, 1, "testing for common errors and heavy tails")
     return FitExamination(
         outliers,
         check_lack_of_fit(fit, data),
