@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time and memory grow in proportion to rows, poses and targets."""
+
+from __future__ import annotations
+
+import gc
+import math
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from loopcal.apply import compensate
+from loopcal.diagnose.fit_checks import cluster_covariance
+from loopcal.diagnose.fit_checks.cluster_covariance import choose_clusters, compute_robust_spread
+from loopcal.diagnose.fit_checks.independent_units import Clusters
+from loopcal.diagnose.residuals.residual_rows import ResidualRows
+from loopcal.estimate import identify
+from loopcal.estimate.observation_rows import list_block_labels
+from loopcal.io import load_measurements, load_robot
+from loopcal.io.data.measurement_file import load_pose_names
+from loopcal.io.runs.compensation_file import format_compensation, load_targets
+from loopcal.report.compensation_view import view_compensation
+from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
+
+MORE, MOST = 8, 24.0
+"""Times as many rows, and the largest growth of the time: 8 in proportion, 64 for all pairs."""
+
+
+def count_calls(function: Callable[[], object]) -> int:
+    """Return the number of Python functions, generators included, that a call enters."""
+    count = 0
+
+    def notice(_frame: object, event: str, _argument: object) -> None:
+        nonlocal count
+        count += event == "call"
+
+    sys.setprofile(notice)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def measure_growth(make: Callable[[int], Callable[[], object]], small: int) -> float:
+    """Return how much longer `MORE` times as much takes, by the shortest CPU time of three."""
+    times = []
+    gc.disable()
+    try:
+        for function in (make(small), make(MORE * small)):
+            rounds = []
+            for _ in range(3):
+                begin = time.process_time()
+                function()
+                rounds.append(time.process_time() - begin)
+            times.append(min(rounds))
+    finally:
+        gc.enable()
+    return times[1] / times[0]
+
+
+def draw_targets(n: int) -> np.ndarray:
+    """Return n positions in the workspace of the linear delta [m]."""
+    robot = ROBOTS["linear-delta"]
+    ranges = np.array([robot.assembly.workspace[name] for name in robot.controlled])
+    return np.random.default_rng(0).uniform(ranges[:, 0], ranges[:, 1], (n, len(ranges)))
+
+
+def test_compensation_and_its_table_are_linear_in_the_targets() -> None:
+    robot = load_robot("linear-delta")
+
+    def work(n: int) -> int:
+        targets = draw_targets(n)
+
+        def run() -> None:
+            result = compensate(robot, targets)
+            format_compensation(result)
+            view_compensation(result)
+            str(result)
+
+        return count_calls(run)
+
+    work(10)
+    few, many = work(100), work(400)
+    assert (many - few) / few < 3.5
+
+
+@pytest.mark.parametrize("read", ["poses", "targets", "measurements"])
+def test_files_are_read_in_time_proportional_to_their_rows(tmp_path, read) -> None:
+    robot = load_robot("linear-delta")
+    head = {
+        "poses": "pose",
+        "targets": "pose,x [mm],y [mm],z [mm]",
+        "measurements": "# kind: component\n# components: [z]\n# noise: {z: 10 um}\n"
+        "pose,q1 [mm],q2 [mm],q3 [mm],z [mm]",
+    }[read]
+
+    def make(n: int) -> Callable[[], object]:
+        rows = ("", ",1.5,2,{0}", ",2{0}.5,2{0},2{0},{1}")
+        row = "p{1}" + rows[("poses", "targets", "measurements").index(read)]
+        file = tmp_path / f"{n}.csv"
+        lines = (row.format(i % 90, i) for i in range(n))
+        file.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+        return {
+            "poses": lambda: load_pose_names(file),
+            "targets": lambda: load_targets(file, robot),
+            "measurements": lambda: load_measurements(file, robot, allow_outside_stroke=True),
+        }[read]
+
+    assert measure_growth(make, 1500) < MOST
+
+
+def test_labels_of_blocks_are_listed_in_time_proportional_to_the_poses() -> None:
+    assert list_block_labels(("a", "b", "c"), np.array([1, 0, 1])) == (("b",), ("a", "c"))
+
+    def make(n: int) -> Callable[[], object]:
+        labels = tuple(map(str, range(n)))
+        return lambda: list_block_labels(labels, np.arange(n))
+
+    assert measure_growth(make, 5000) < MOST
+
+
+def draw_rows(count: int, parameters: int) -> ResidualRows:
+    """Return rows with random residuals of a fit of some parameters."""
+    rng = np.random.default_rng(1)
+    basis = np.linalg.qr(rng.standard_normal((count, parameters)))[0]
+    errors = rng.standard_normal(count)
+    zero = np.zeros(count, dtype=np.int64)
+    residual = errors - basis @ (basis.T @ errors)
+    return ResidualRows(basis, residual, basis, np.eye(parameters), zero, zero, zero, zero)
+
+
+def test_rows_that_a_fit_does_not_use_are_as_good_as_those_with_an_error_of_their_own() -> None:
+    rows, wrong = draw_rows(60, 5), np.array([3, 40, 41])
+    kept = np.setdiff1d(np.arange(60), wrong)
+    left, own = rows.without(wrong), rows.with_effects(np.eye(60)[:, wrong])
+    np.testing.assert_allclose(left.residual, own.residual[kept], atol=1e-13)
+    projector = np.eye(60) - own.basis @ own.basis.T
+    np.testing.assert_allclose(
+        np.eye(57) - left.basis @ left.basis.T, projector[np.ix_(kept, kept)], atol=1e-12
+    )
+
+
+def test_rows_are_left_out_without_a_square_matrix() -> None:
+    rows, wrong = draw_rows(6000, 5), np.arange(0, 6000, 100)
+    tracemalloc.start()
+    rows.without(wrong)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20 * rows.basis.nbytes  # a matrix of all rows has 1200 times as many
+
+
+def test_an_even_choice_of_clusters_stands_for_all(monkeypatch) -> None:
+    _, data = measure("linear-delta", "component", draw_errors(240, 3, 4), 4)
+    fit = identify(ROBOTS["linear-delta"], data)
+    clusters = Clusters("pose", np.arange(240), 240)
+    whole = compute_robust_spread(fit, data, clusters)
+    monkeypatch.setattr(cluster_covariance, "MOST_CLUSTERS", 80)
+    chosen, times = choose_clusters(clusters)
+    assert (chosen.count, times, int((chosen.member >= 0).sum())) == (80, 3.0, 80)
+    part = compute_robust_spread(fit, data, clusters)
+    effect = np.eye(len(fit.names))
+    all_ratio, ratio = whole.compare(effect), part.compare(effect)
+    assert len(part.scores) == 80
+    assert ratio.degrees < all_ratio.degrees / 2.0
+    # the square of a ratio has the standard deviation sqrt(2 / degrees)
+    for each in (ratio, all_ratio):
+        assert abs(each.ratio**2 - 1.0) < 4.0 * math.sqrt(2.0 / each.degrees)
+        assert each.p_value > 1e-3
