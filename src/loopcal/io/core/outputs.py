@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.replacement import create_temporary, place_folder, restore_file
+from loopcal.io.core.replacement import create_temporary, place_folder, restore_files
 from loopcal.io.core.text_file import check_readable, report_write_errors, resolve_target
 
 
@@ -62,10 +62,7 @@ def refuse_outputs(
 @contextmanager
 def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Restore or remove these files where the body fails; None is skipped."""
-    with ExitStack() as stack:
-        for path in outputs:
-            if path is not None:
-                stack.enter_context(restore_file(resolve_target(path)))
+    with restore_files([resolve_target(path) for path in outputs if path is not None]):
         yield
 
 

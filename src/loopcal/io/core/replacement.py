@@ -18,8 +18,8 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -138,23 +138,28 @@ def _hold(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def restore_file(target: Path) -> Iterator[None]:
-    """Restore a file, or its absence, where the body fails."""
-    aside = _name_beside(target, OLD)
-    existed = target.exists()
-    if existed:
-        _copy_or_link(target, aside)
-    try:
-        with _hold(aside):
-            yield
-    except BaseException:
-        if existed:
-            aside.replace(target)
-        else:
-            target.unlink(missing_ok=True)
-        raise
-    finally:
-        aside.unlink(missing_ok=True)
+def restore_files(targets: Sequence[Path]) -> Iterator[None]:
+    """Restore files, or their absence, where the body fails: all of them or none."""
+    for target in targets:
+        remove_leftovers(target, Path.is_file)
+    asides = {target: _name_beside(target, OLD) for target in targets if target.exists()}
+    with ExitStack() as locks:
+        try:
+            for target, aside in asides.items():
+                _copy_or_link(target, aside)
+                locks.enter_context(_hold(aside))
+            try:
+                yield
+            except BaseException:
+                for target in targets:
+                    if target in asides:
+                        asides[target].replace(target)
+                    else:
+                        target.unlink(missing_ok=True)
+                raise
+        finally:
+            for aside in asides.values():
+                aside.unlink(missing_ok=True)
 
 
 def _copy_or_link(file: Path, name: Path) -> None:
@@ -180,11 +185,11 @@ def _exchange(new: Path, old: Path) -> None:
     if _exchange_names(new, old):
         return
     aside = _name_beside(old, OLD)
-    old.rename(aside)
     try:
+        old.rename(aside)
         new.rename(old)
     except BaseException:
-        if not old.exists():
+        if aside.exists() and not old.exists():
             aside.rename(old)
         raise
     aside.rename(new)
@@ -276,7 +281,7 @@ def remove_leftovers(target: Path, is_own: Callable[[Path], bool]) -> None:
     """
     for path in reversed(list_leftovers(target, OLD)):
         with _lock_leftover(path) as is_abandoned:
-            if is_abandoned and not os.path.lexists(target):
+            if is_abandoned and path.is_dir() and not os.path.lexists(target):
                 path.rename(target)
     for path in list_leftovers(target):
         with _lock_leftover(path) as is_abandoned:
