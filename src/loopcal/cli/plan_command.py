@@ -282,7 +282,7 @@ def _write_plan(
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
-    from loopcal.report.pictures import save_figure
+    from loopcal.report.pictures import render_figure
     from loopcal.report.plan_drawing import draw_curve, draw_plan
 
     figures = {}
@@ -294,9 +294,7 @@ def _write_plan(
     else:
         texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
     document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
-    pictures = {
-        name: functools.partial(save_figure, figure=figure) for name, figure in figures.items()
-    }
+    pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
     read_back = functools.partial(check_written_plan, plan=result)
     write_plan_folder(output, texts, document, pictures, force, read_back)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"

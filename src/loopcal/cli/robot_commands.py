@@ -91,7 +91,7 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.core.text_file import replace_file
+    from loopcal.io.core.text_file import write_bytes
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.workflow.robot_inspection import inspect_robot
 
@@ -100,8 +100,7 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     if plot is not None:
         from loopcal.report import save_picture
 
-        with replace_file(plot) as file:
-            save_picture(file, inspection.robot)
+        save_picture(plot, inspection.robot, write=write_bytes)
     if as_json:
         assembly = {"assembly": inspection.robot.assembly} if expand else {}
         terminal.print_json(inspection.to_dict() | assembly)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from io import BytesIO
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -38,9 +38,11 @@ def show_names(figure: Figure) -> Figure:
     return figure
 
 
-def save_figure(path: Path, figure: Figure) -> None:
-    """Write a figure in the format of the file's ending, one of `FORMATS`."""
+def render_figure(figure: Figure, ending: str) -> bytes:
+    """Return a figure as a file with this ending, one of `FORMATS`."""
     from matplotlib import rc_context
 
+    stream = BytesIO()
     with rc_context({"svg.hashsalt": SALT}):
-        figure.savefig(path, dpi=DPI, metadata=METADATA[path.suffix.lower()])
+        figure.savefig(stream, format=ending[1:], dpi=DPI, metadata=METADATA[ending])
+    return stream.getvalue()

@@ -8,7 +8,7 @@ links comes from `mechanism.frames`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
-from loopcal.report.pictures import FORMATS, save_figure, show_names
+from loopcal.report.pictures import FORMATS, render_figure, show_names
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -79,9 +79,13 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
 
 
 def save_picture(
-    path: Path, robot: Mechanism, solution: Solution | None = None, row: int = 0
+    path: Path,
+    robot: Mechanism,
+    solution: Solution | None = None,
+    row: int = 0,
+    write: Callable[[Path, bytes], object] = Path.write_bytes,
 ) -> None:
-    """Write the picture of a robot to a file.
+    """Write the picture of a robot to a file, by the function `write`.
 
     Raises
     ------
@@ -94,7 +98,7 @@ def save_picture(
             f"{', '.join(FORMATS)}",
             path,
         )
-    save_figure(path, draw(robot, solution, row))
+    write(path, render_figure(draw(robot, solution, row), path.suffix.lower()))
 
 
 def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:

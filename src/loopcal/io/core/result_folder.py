@@ -124,7 +124,7 @@ def write_result_folder(
     path: Path,
     kind: FolderKind,
     document: Mapping[str, Any],
-    files: Mapping[str, bytes | Callable[[Path], None]],
+    files: Mapping[str, bytes],
     force: bool = False,
     read_back: Callable[[Path], object] | None = None,
 ) -> None:
@@ -133,7 +133,7 @@ def write_result_folder(
     Parameters
     ----------
     document : content of the document, to which the list of files is added.
-    files : name -> content, or function that writes it. force : see `refuse_folder`.
+    files : name -> content. force : see `refuse_folder`.
     read_back : reads the complete folder before it takes its name.
 
     Raises
@@ -145,10 +145,7 @@ def write_result_folder(
         for name, content in files.items():
             file = folder / name
             file.parent.mkdir(exist_ok=True)
-            if isinstance(content, bytes):
-                file.write_bytes(content)
-            else:
-                content(file)
+            file.write_bytes(content)
         digests = {name: sha256(folder / name) for name in sorted(files)} | {kind.document: _BLANK}
         text = to_json({**document, FILES: digests})
         digest = hashlib.sha256(text.encode()).hexdigest()

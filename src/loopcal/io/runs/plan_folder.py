@@ -130,7 +130,7 @@ def write_plan_folder(
     path: Path,
     texts: Mapping[str, str],
     document: Mapping[str, Any],
-    pictures: Mapping[str, Callable[[Path], None]],
+    pictures: Mapping[str, bytes],
     force: bool = False,
     read_back: Callable[[Path], object] | None = None,
 ) -> None:
@@ -140,7 +140,7 @@ def write_plan_folder(
     ----------
     path : the folder to make. texts : name -> text of a file.
     document : content of plan.json; `format` and `files` are added.
-    pictures : name -> function that writes it. force : replace an older, unchanged plan.
+    pictures : name -> content. force : replace an older, unchanged plan.
     read_back : see `write_result_folder`.
 
     Raises
