@@ -2,8 +2,10 @@
 """Each file that loopcal writes is read before it takes its name, and names it cannot hold are
 refused when they are read."""
 
+import csv
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -133,6 +135,30 @@ def test_a_file_that_cannot_be_read_back_replaces_nothing(
     assert main([*command.split(), "--force"]) == 1
     assert (tmp_path / "F").read_text() == "old"
     capsys.readouterr()
+
+
+@pytest.mark.parametrize("name", ["klipper", "marlin", "reprap", "json", "csv"])
+def test_a_controller_file_is_read_back(tmp_path, monkeypatch, capsys, name: str) -> None:
+    """A defect is simulated: digits of the written numbers are lost."""
+    monkeypatch.chdir(tmp_path)
+    robot = load_robot("linear-delta")
+    save_robot(robot.with_values(robot.values * 1.001), "delta.yaml")
+    command = f"export delta.yaml --format {name} --force -o out".split()
+    assert main(command) == 0
+    before = (tmp_path / "out").read_text()
+    if name in ("json", "csv"):
+        dump = csv.DictWriter.writerows
+        damaged = SimpleNamespace(dumps=lambda *_, **__: "{}", loads=json.loads)
+        monkeypatch.setattr("loopcal.io.formats.parameter_table.json", damaged)
+        monkeypatch.setattr(csv.DictWriter, "writerows", lambda w, rows: dump(w, rows[1:]))
+    else:
+        monkeypatch.setattr(
+            "loopcal.io.formats.value_file.ValueFile.format", lambda _, number: f"{number:.1f}"
+        )
+    capsys.readouterr()
+    assert main(command) == 1
+    assert "This is a defect of loopcal" in " ".join(capsys.readouterr().err.split())
+    assert (tmp_path / "out").read_text() == before
 
 
 def test_values_of_a_robot_are_compared(tmp_path, monkeypatch) -> None:

@@ -185,8 +185,7 @@ def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
 def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_json: bool) -> None:
     """Write the measurements of an export; report lines that were skipped or do not match."""
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.core.text_file import write_text
-    from loopcal.io.exports import convert_export, read_profile
+    from loopcal.io.exports import convert_export, read_profile, save_conversion
     from loopcal.report.calibration_view import with_hint
 
     used = {"file", "profile", "output", "force", "as_json"}
@@ -197,7 +196,7 @@ def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_jso
     )
     refuse_outputs((output,), (file, profile), force)
     converted = convert_export(file, read_profile(profile))
-    write_text(output, converted.text)
+    save_conversion(converted, output)
     if as_json:
         misfits = [{"line": line, "reason": reason} for line, reason in converted.misfits]
         document = {
@@ -285,7 +284,7 @@ def _correct_file(
     if not is_written:
         return _Correction(report, failure, (), is_written)
     exported = export_robot(ExportSource(report.robot), source, file)
-    write_text(output, exported.text)
+    write_text(output, exported.text, exported.read_back)
     return _Correction(report, failure, tuple(map(str, exported.findings)), is_written)
 
 
@@ -359,7 +358,7 @@ def export(
             terminal.print_json(document)
         return terminal.print_failures(with_hint(failure, hint_for) for failure in failures)
     exported = export_robot(load_source(source), target, into)
-    write_text(output, exported.text)
+    write_text(output, exported.text, exported.read_back)
     if as_json:
         notes = [str(finding) for finding in exported.findings]
         document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}

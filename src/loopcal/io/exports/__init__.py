@@ -3,5 +3,6 @@
 
 from loopcal.io.exports.conversion import Conversion as Conversion
 from loopcal.io.exports.conversion import convert_export as convert_export
+from loopcal.io.exports.conversion import save_conversion as save_conversion
 from loopcal.io.exports.profile import Profile as Profile
 from loopcal.io.exports.profile_reader import read_profile as read_profile

@@ -26,10 +26,11 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import NAME_COLUMNS, format_row
+from loopcal.io.core.csv_table import NAME_COLUMNS, format_row, read_table
 from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
-from loopcal.io.core.text_file import as_path
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import as_path, write_text
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.exports.export_lines import (
@@ -174,16 +175,21 @@ class Conversion:
 
     Parameters
     ----------
-    text : the measurement file. rows : their number. passed : number of lines without data.
+    text : the measurement file. table : its header and rows. passed : number of lines without data.
     misfits : lines that do not fit the profile, with the reason.
     findings : differences between lines of a pose that the file does not keep.
     """
 
     text: str
-    rows: int
+    table: tuple[tuple[str, ...], ...]
     passed: int
     misfits: tuple[tuple[int, str], ...]
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self.table) - 1
 
 
 def convert_export(path: str | Path, profile: Profile) -> Conversion:
@@ -213,8 +219,27 @@ def convert_export(path: str | Path, profile: Profile) -> Conversion:
         if lines[0].header is None:  # nothing shows that the profile is meant for this file
             raise FileError(f"{sentence}; compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
-    text = _format_file(path, profile, rows, misfits, findings)
-    return Conversion(text, len(rows), skipped, tuple(misfits), findings)
+    settings = _format_settings(path, profile, misfits, findings)
+    table = _tabulate(profile, rows)
+    text = "\n".join([*settings, *map(format_row, table)]) + "\n"
+    return Conversion(text, table, skipped, tuple(misfits), findings)
+
+
+def save_conversion(conversion: Conversion, path: str | Path) -> None:
+    """Write the measurement file of an export.
+
+    Raises
+    ------
+    FileError : the file cannot be written.
+    """
+
+    def check(written: Path) -> None:
+        table = read_table(written)
+        for before, after in zip(conversion.table[1:], table.rows, strict=True):
+            require_same("row", before, after)
+        require_same("columns", len(conversion.table[0]), len(table.names))
+
+    write_text(path, conversion.text, check)
 
 
 def _parse_row(line: Line, profile: Profile) -> Row:
@@ -322,31 +347,30 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
     return dict(zip(QUATERNION, quaternion, strict=True))
 
 
-def _format_file(
-    path: Path,
-    profile: Profile,
-    rows: Sequence[Row],
-    misfits: Sequence[tuple[int, str]],
-    findings: Sequence[Finding],
-) -> str:
-    """Return the text of the measurement file."""
-    columns = list_headers(profile)
+def _format_settings(
+    path: Path, profile: Profile, misfits: Sequence[tuple[int, str]], findings: Sequence[Finding]
+) -> list[str]:
+    """Return the remarks and settings of the measurement file."""
     origin = format_comment(f"converted from {path.name} by {profile.file.path.name}")
     lines = [f"## {origin}"]
     if misfits:
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
     lines += [f"## {format_comment(str(finding))}" for finding in findings]
     settings = {"format": FORMAT, **profile.record.settings}
-    lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
+    return lines + [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
+
+
+def _tabulate(profile: Profile, rows: Sequence[Row]) -> tuple[tuple[str, ...], ...]:
+    """Return the header and the rows of the measurement file."""
+    columns = list_headers(profile)
     headers = (f"{n} [{symbol}]" if symbol is not None else n for n, symbol in columns.items())
-    lines.append(format_row(headers))
+    # a target without a line has no covariance
+    absent = {name: "0" if name.startswith(COVARIANCE) else "" for name in columns}
+    table = [tuple(headers)]
     for i, row in enumerate(rows, 1):
-        cells = {"pose": str(i), **row}
-        # a target without a line has no covariance
-        absent = ("0" if name.startswith(COVARIANCE) else "" for name in columns)
-        pairs = zip(columns, absent, strict=True)
-        lines.append(format_row(cells.get(name, usual) for name, usual in pairs))
-    return "\n".join(lines) + "\n"
+        cells = {**absent, "pose": str(i), **row}
+        table.append(tuple(cells[name] for name in columns))
+    return tuple(table)
 
 
 def _format_setting(value: Any) -> str:

@@ -16,6 +16,8 @@ from typing import Any
 
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.numbers import format_scaled
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.units import find_unit
 
@@ -45,8 +47,14 @@ def write_csv(source: ExportSource, into: Path | None) -> Exported:
     stream = io.StringIO()
     writer: csv.DictWriter[str] = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(list_rows(source))
-    return Exported(stream.getvalue(), _report_intervals(source))
+    rows = list(list_rows(source))
+    writer.writerows(rows)
+
+    def check(written: Path) -> None:
+        read = csv.DictReader(io.StringIO(read_text(written, "table of parameters")))
+        require_same("rows", rows, list(read))
+
+    return Exported(stream.getvalue(), _report_intervals(source), check)
 
 
 def write_json(source: ExportSource, into: Path | None) -> Exported:
@@ -59,7 +67,11 @@ def write_json(source: ExportSource, into: Path | None) -> Exported:
     ]
     document = {"format": FORMAT, "robot": source.robot.name, "parameters": rows}
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
-    return Exported(text + "\n", _report_intervals(source))
+
+    def check(written: Path) -> None:
+        require_same("document", document, json.loads(read_text(written, "table of parameters")))
+
+    return Exported(text + "\n", _report_intervals(source), check)
 
 
 def _report_intervals(source: ExportSource) -> tuple[Finding, ...]:

@@ -110,10 +110,17 @@ class ExportSource:
 
 @dataclass(frozen=True)
 class Exported:
-    """The text of a file of another program, with changes and what it cannot express."""
+    """The text of a file of another program.
+
+    Attributes
+    ----------
+    findings : changes, and what it cannot express.
+    read_back : reads the written file; raises LoopcalError where it does not state the values.
+    """
 
     text: str
     findings: tuple[Finding, ...] = ()
+    read_back: Callable[[Path], object] | None = None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ the text stays as it is.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.io.formats import urdf_tree
 from loopcal.io.formats.program_format import (
@@ -153,7 +155,16 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     others = tuple(name for name, d in deviations.items() if d and name not in expressed)
     rest = (report_finding("files.not-expressed", format="the URDF", names=others),)
     text = get_byte_order_mark(into) + urdf.text
-    return Exported(text, (*report_changes(changes), *(rest if others else ())))
+    findings = (*report_changes(changes), *(rest if others else ()))
+    return Exported(text, findings, partial(_check_written, urdf=urdf))
+
+
+def _check_written(path: Path, urdf: Urdf) -> None:
+    """Read a written URDF; raise LoopcalError where its joints have other places."""
+    read = urdf_tree.read(path)
+    require_same("joints", list(urdf.joints), list(read.joints))
+    for name, joint in urdf.joints.items():
+        require_same_numbers(f"origin of {name}", joint.origin, read.joints[name].origin)
 
 
 def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:

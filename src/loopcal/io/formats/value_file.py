@@ -10,11 +10,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, Self
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import (
     Exported,
     get_byte_order_mark,
@@ -156,11 +159,24 @@ class ValueFile(ABC):
         findings: Sequence[Finding] = (),
     ) -> Exported:
         """Return the text with other numbers; with all of them, where `into` names no file."""
+        check = partial(self._check_written, wanted=wanted, defaults=defaults)
         if into is None:
-            return Exported("".join(self.correct(wanted, {})[0].lines), tuple(findings))
+            return Exported("".join(self.correct(wanted, {})[0].lines), tuple(findings), check)
         file, changes = self.correct(wanted, defaults)
         text = get_byte_order_mark(into) + "".join(file.lines)
-        return Exported(text, (*report_changes(changes), *findings))
+        return Exported(text, (*report_changes(changes), *findings), check)
+
+    def _check_written(
+        self, path: Path, wanted: Mapping[Name, float | str], defaults: Mapping[Name, float]
+    ) -> None:
+        """Read a written file; raise LoopcalError for a value that is not the wanted one."""
+        read = self.with_lines(read_text(path, "written file").splitlines(keepends=True))
+        for name, value in wanted.items():
+            if isinstance(value, str):
+                is_same = read.text(*name) == value
+            else:
+                is_same = self.is_same(read.number(*name, defaults.get(name)), value)
+            require_same(f"{self.title.format(*name)} is {value}", True, is_same)
 
 
 def format_number(value: float) -> str:
