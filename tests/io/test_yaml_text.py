@@ -64,7 +64,7 @@ KEPT = "one of these comments"
 
 
 def parse(text: str):
-    return parse_yaml(text, Path("robot.yaml"), "robot file")
+    return parse_yaml(text, Path("robot.yaml"), "robot file", has_names=False)
 
 
 @pytest.mark.parametrize("text", STYLES.values(), ids=STYLES)

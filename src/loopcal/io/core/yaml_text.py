@@ -19,9 +19,6 @@ from loopcal.io.core.yaml_file import YamlFile, make_round_trip_yaml, parse_yaml
 PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
 """Text that every version of YAML reads as the same text without quotes."""
 
-Span = tuple[int, int]
-"""First character of a part of a text, and the one behind it."""
-
 
 def quote_scalar(text: str) -> str:
     """Return text as a YAML scalar in one line, in double quotes where it needs them."""
@@ -41,7 +38,7 @@ def add_key(file: YamlFile, entry: str) -> YamlFile:
     file : without the key. entry : the key and its value in block style at the left margin, in
         complete lines; a comment in them is lost where the file is in flow style.
     """
-    wanted = file.content | parse_yaml(entry, file.path, "entry").content
+    wanted = file.content | _parse(entry, file).content
     return _choose(file, _list_additions(file, entry), wanted)
 
 
@@ -58,13 +55,18 @@ def _choose(file: YamlFile, candidates: Iterator[str], wanted: dict[str, Any]) -
     exact = json.dumps(wanted, sort_keys=True)
     for candidate in candidates:
         try:
-            changed = parse_yaml(candidate, file.path, "changed file")
+            changed = _parse(candidate, file)
         except FileError:
             continue
         if json.dumps(changed.content, sort_keys=True) == exact:
             return changed
     rows = ",\n ".join(_format_inside({name: value}) for name, value in wanted.items())
-    return parse_yaml(f"{{{rows}}}\n", file.path, "changed file")
+    return _parse(f"{{{rows}}}\n", file)
+
+
+def _parse(text: str, file: YamlFile) -> YamlFile:
+    """Parse a changed text of a file, or a part of it, whose names were checked before."""
+    return parse_yaml(text, file.path, "changed file", has_names=False)
 
 
 def _list_additions(file: YamlFile, entry: str) -> Iterator[str]:
@@ -76,7 +78,7 @@ def _list_additions(file: YamlFile, entry: str) -> Iterator[str]:
     root = make_round_trip_yaml().compose(text)
     start, stop = root.start_mark.index, root.end_mark.index
     if root.flow_style:
-        inside = _format_inside(parse_yaml(entry, file.path, "entry").content)
+        inside = _format_inside(_parse(entry, file).content)
         for comma in (",", ""):
             yield f"{text[: stop - 1]}{comma}{end}{inside}{text[stop - 1 :]}"
         return
