@@ -34,6 +34,7 @@ class Parameter:
         An error that it has in common with others is not included, see `CommonError`.
     free : False keeps it at its nominal value.
     scope : the rows that share a value: those of the machine, a session, a group or a pose.
+    positive : whether only values above zero exist, as of the length of a rod.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Parameter:
     tolerance: float | None = None
     free: bool = True
     scope: str = "machine"
+    positive: bool = False
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated
+from typing import Annotated, Any
 
 from loopcal.errors import UnitError, suggest_names
 
@@ -23,6 +23,13 @@ class Dimension(Enum):
     ANGLE = "angle"
     RATIO = "ratio"
 
+
+LARGEST = 1e9
+"""Largest number of a file [m, rad, 1]: beyond it, squares and cubes lose all meaning."""
+SMALLEST_SD = 1e-15
+"""Smallest standard deviation above zero [m, rad, 1]: the size of an atom's nucleus."""
+SD_RANGE = f"from {SMALLEST_SD:g} to {LARGEST:g} m, rad or 1"
+"""The allowed standard deviations, for messages."""
 
 Length = Annotated[float, Dimension.LENGTH]
 Angle = Annotated[float, Dimension.ANGLE]
@@ -132,7 +139,31 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
             f"{text!r} has no unit; add one of {', '.join(list_symbols(dimension))}, for example "
             f"{example}"
         )
-    return value * find_unit(symbol, dimension).factor_to_si
+    return to_si(value, find_unit(symbol, dimension))
+
+
+def to_si(value: float, unit: Unit) -> float:
+    """Return a finite number in SI.
+
+    Raises
+    ------
+    UnitError
+        The number is larger than LARGEST.
+    """
+    if not abs(value) <= LARGEST / unit.factor_to_si:
+        shown = (
+            f"{value:g}" if isinstance(value, float) else f"a number of {len(str(value))} digits"
+        )
+        raise UnitError(
+            f"{shown} {unit} is beyond {LARGEST:g} {SI_SYMBOLS[unit.dimension]}; write a number "
+            "that a machine can have"
+        )
+    return value * unit.factor_to_si
+
+
+def is_sd(value: Any) -> Any:
+    """Return whether a number, or which of an array, can be a standard deviation: SD_RANGE."""
+    return (value >= SMALLEST_SD) & (value <= LARGEST)
 
 
 def _is_number(text: str) -> bool:

@@ -125,7 +125,7 @@ def test_error_in_a_robot_file_is_reported_with_its_line(
         ),
         (
             "{name: leg1.base.x, value: 1, unit: deg}",
-            "the unit of 'leg1.base.x': 'deg' is a unit of angle",
+            "'leg1.base.x': 'deg' is a unit of angle",
         ),
         ("{name: leg1.base.x, value: a, unit: mm}", "the value of 'leg1.base.x' is 'a'"),
         ("{name: leg1.base.x, value: 1}", "has no 'unit'"),

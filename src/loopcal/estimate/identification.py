@@ -72,7 +72,7 @@ from loopcal.estimate.result import History, Identification, KindResiduals, Spec
 from loopcal.findings import Finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -274,6 +274,7 @@ def _assemble(
         *([] if converged else [history.finding]),
         report_noise(data, robot, test),
         *report_divergence(free, fit.deviation[0], method, converged),
+        *(finding for _, finding in find_impossible_values(robot, values)),
         *on_prior,
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),

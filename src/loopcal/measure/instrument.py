@@ -15,6 +15,7 @@ from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
+from loopcal.units import SD_RANGE, is_sd
 
 # --- noise
 
@@ -34,9 +35,10 @@ class Noise(ABC):
 
 def _check_positive(value: ArrayLike, what: str) -> FloatArray:
     array = check_array(value, what, (None,))
-    if np.any(array <= 0.0):
+    wrong = array[~is_sd(array)]
+    if len(wrong):
         raise DataError(
-            f"{what} contains {float(np.min(array)):.6g}; give a number above 0 for each column"
+            f"{what} contains {wrong[0]:.6g}; give a number above 0 for each column, {SD_RANGE}"
         )
     return array
 

@@ -19,6 +19,7 @@ from loopcal.measure.kinds import Kind
 from loopcal.measure.observations import Observations
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray
+from loopcal.units import SD_RANGE, is_sd
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class StatedValue:
     nominal: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.sd < float("inf"):
+        if self.sd != 0.0 and not is_sd(self.sd):
             raise DataError(
-                f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, or "
-                "0 to fix the parameter"
+                f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, "
+                f"{SD_RANGE}, or 0 to fix the parameter"
             )
         if self.nominal is not None and not np.isfinite(self.nominal):
             raise DataError(f"the value of {self.name!r} is {self.nominal}; give a finite number")
@@ -114,10 +115,10 @@ class NuisanceParameters:
         """Return a copy with a prior of this standard deviation [SI] on parameters such as
         `tracker.*`.
         """
-        if not sd > 0.0:
+        if not is_sd(sd):
             raise DataError(
-                f"the standard deviation of {pattern!r} is {sd}; give a number above 0, or fix the "
-                "parameter"
+                f"the standard deviation of {pattern!r} is {sd}; give a number above 0, "
+                f"{SD_RANGE}, or fix the parameter"
             )
         return self._changed(pattern, tolerance=sd)
 

@@ -14,6 +14,7 @@ from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.whitening import compute_whitener
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import SD_RANGE, is_sd
 
 TextArray = NDArray[np.str_]
 """Names of sessions or groups."""
@@ -172,8 +173,9 @@ class Observations:
             )
         shape = (len(values), len(kind.noise_columns))
         sd = _broadcast(sigma, shape, "sigma", f"one number, or one for each of {names}")
-        if np.any(sd < 0.0):
-            raise DataError(f"sigma contains {np.nanmin(sd):.6g}; give numbers above 0")
+        wrong = sd[~(is_sd(sd) | np.isnan(sd) | (sd == 0.0))]
+        if len(wrong):
+            raise DataError(f"sigma contains {wrong[0]:.6g}; give numbers above 0, {SD_RANGE}")
         N = kind.linearize_noise(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
         of_session, of_group = np.asarray(session), np.asarray(group)

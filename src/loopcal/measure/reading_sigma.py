@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import Dimension
+from loopcal.units import SMALLEST_SD, Dimension
 
 if TYPE_CHECKING:
     from loopcal.measure.measurements import Measurements
@@ -22,7 +22,8 @@ LARGEST_SIGMA = 1e6
 """Largest finite sigma of a reading, in sizes of the robot or radians."""
 
 NOT_A_SIGMA = (
-    "is not a standard deviation; give 0 (exact), a positive number, or infinity (missing)"
+    "is not a standard deviation; give 0 (exact), a positive number from "
+    f"{SMALLEST_SD:g} on, or infinity (missing)"
 )
 
 
@@ -76,7 +77,7 @@ def check_reading_sigma(
         value = f"{checked[pose, column]:.6g}"
         return f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1}"
 
-    _refuse(~(checked >= 0.0), name, NOT_A_SIGMA)
+    _refuse(~((checked == 0.0) | (checked >= SMALLEST_SD)), name, NOT_A_SIGMA)
     is_missing = np.isnan(readings) & np.isfinite(checked)
     _refuse(is_missing, name, "belongs to a missing reading; give the reading, or infinity")
     checked.setflags(write=False)
@@ -138,7 +139,7 @@ def _check_size(robot: Mechanism, sigma: FloatArray) -> None:
         value = f"{sigma[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
         return f"the sigma {value} of the reading of {actuator.name} in row {pose + 1}"
 
-    _refuse(~(sigma >= 0.0), name, NOT_A_SIGMA)
+    _refuse(~((sigma == 0.0) | (sigma >= SMALLEST_SD)), name, NOT_A_SIGMA)
     is_huge = np.isfinite(sigma) & (sigma / size > LARGEST_SIGMA)
     _refuse(
         is_huge, name, "is larger than any possible error of a reading; give inf (missing) instead"

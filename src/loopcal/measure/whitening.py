@@ -5,6 +5,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import SD_RANGE, is_sd
 
 _SMALLEST_PIVOT = 1e-7
 """Smallest pivot [1] of a correlation matrix. Below it a component equals a combination of
@@ -46,11 +47,11 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
     diagonal = np.eye(present.shape[1], dtype=bool)
     C = np.where(both, covariance, 0.0) + (diagonal & ~both)
     variance = np.einsum("rii->ri", C)
+    sd = np.sqrt(np.maximum(variance, 0.0))
     _refuse(
-        ~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(variance > 0.0, axis=1),
-        "has a variance that is not above 0",
+        ~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(is_sd(sd), axis=1),
+        f"has a variance that is not above 0 (standard deviations {SD_RANGE})",
     )
-    sd = np.sqrt(variance)
     correlation = C / (sd[:, :, None] * sd[:, None, :])
     asymmetric = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > 1e-9
     _refuse(np.any(asymmetric, axis=(1, 2)), "is not symmetric")

@@ -66,6 +66,7 @@ from loopcal.mechanism.platform_coordinates import check_coordinates as check_co
 from loopcal.mechanism.platform_coordinates import compare_coordinates as compare_coordinates
 from loopcal.mechanism.platform_coordinates import pose_from_coordinates as pose_from_coordinates
 from loopcal.mechanism.platform_coordinates import read_coordinates as read_coordinates
+from loopcal.mechanism.possible_values import find_impossible_values as find_impossible_values
 from loopcal.mechanism.redundant_actuation import PoseDrivenSensitivity as PoseDrivenSensitivity
 from loopcal.mechanism.redundant_actuation import differentiate_at_pose as differentiate_at_pose
 from loopcal.mechanism.redundant_actuation import solve_at_pose as solve_at_pose

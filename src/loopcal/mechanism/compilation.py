@@ -23,6 +23,7 @@ from loopcal.mechanism.batch_kinematics import (
 from loopcal.mechanism.mobility import check_mobility, find_idle_joints, refuse_uncontrolled
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.possible_values import check_nominal_values
 from loopcal.mechanism.states import make_start
 from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
@@ -57,6 +58,7 @@ def build(
     """
     check_assembly(assembly)
     table = ParameterTable(assembly.parameters, assembly.common_errors)
+    check_nominal_values(table)
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.actuators)

@@ -29,7 +29,7 @@ from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import LARGEST, Dimension, find_unit
 
 WHAT = "measurement file"
 CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/exports.md)"
@@ -104,6 +104,12 @@ class Table:
             if not infinite or cell != "inf":
                 value = self.number(name, row, cell, empty)
             values[row] = parse_exact(cell, factor) if math.isfinite(value) else value
+        beyond = np.flatnonzero((np.abs(values) > LARGEST) & np.isfinite(values))
+        if len(beyond):
+            row = int(beyond[0])
+            allowed = f"{LARGEST / factor:g} [{self.units[name]}]"
+            sentence = f"column {name!r} is {cells[row]}, beyond {allowed}"
+            raise self.row_error(row, f"{sentence}; correct the number or the unit")
         return values
 
     def factor(self, name: str, dimension: Dimension, symbol: str | None = None) -> float:

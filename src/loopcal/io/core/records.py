@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from loopcal.errors import FileError, suggest_names
+from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.io.core.yaml_file import (
     Location,
     YamlFile,
@@ -27,7 +27,7 @@ from loopcal.io.core.yaml_file import (
     name_location,
     refuse_unknown_keys,
 )
-from loopcal.units import Dimension, Unit, find_unit, list_symbols
+from loopcal.units import Dimension, Unit, find_unit, list_symbols, to_si
 
 T = TypeVar("T")
 Units = Mapping[Dimension, Unit]
@@ -164,7 +164,10 @@ def _scale(
     if units is None and dimension is not Dimension.RATIO and node is not None:
         return file.quantity(node, dimension, location)
     if isinstance(node, int | float) and not isinstance(node, bool):
-        return float(node) if units is None else node * units[dimension].factor_to_si
+        try:
+            return to_si(node, find_unit("1") if units is None else units[dimension])
+        except UnitError as error:
+            raise file.error(f"{name_location(location)!r}: {error}", location) from None
     return node
 
 

@@ -9,13 +9,15 @@ from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.core.yaml_text import add_key, quote_scalar
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.typing import FloatArray
-from loopcal.units import find_unit
+from loopcal.units import find_unit, to_si
 
 TABLE = "identified"
 PLUS_MINUS = "+/-"
 KEYS = ("name", "value", PLUS_MINUS, "unit")
+NOT_CALIBRATED = "# NOT CALIBRATED"
+"""Beginning of a robot file that a failed calibration made."""
 EXAMPLE = "'{name: .., value: .., unit: ..}'"
 
 
@@ -65,6 +67,22 @@ def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     return values
 
 
+def read_possible_values(file: YamlFile, robot: Mechanism) -> FloatArray:
+    """Return the values as `read_identified_values`; refuse those that no machine has.
+
+    A file of a calibration that failed keeps such values, to be looked at.
+    """
+    values = read_identified_values(file, robot)
+    if file.text.startswith(NOT_CALIBRATED):
+        return values
+    for name, finding in find_impossible_values(robot, values)[:1]:
+        rows = [row.get("name") for row in file.content[TABLE]]
+        place: Location = (TABLE, rows.index(name)) if name in rows else (TABLE,)
+        advice = "correct the value, or delete this table to restore the nominal robot"
+        raise file.error(f"{finding}; {advice}", place)
+    return values
+
+
 def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
     """Return the values [SI] of the file's table by name; raise as `read_identified_values`."""
     rows = file.content[TABLE]
@@ -89,8 +107,7 @@ def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
             raise file.error(f"the value of {name!r} is {value!r}; write a number", place)
         dimension = robot.parameters.dimensions[robot.parameters.index(name)]
         try:
-            factor = find_unit(str(symbol), dimension).factor_to_si
+            values[name] = to_si(value, find_unit(str(symbol), dimension))
         except UnitError as error:
-            raise file.error(f"the unit of {name!r}: {error}", place) from None
-        values[name] = value * factor
+            raise file.error(f"{name!r}: {error}", place) from None
     return values

@@ -28,7 +28,7 @@ from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.core.yaml_text import remove_key
 from loopcal.io.data.column_names import find_column_fault
-from loopcal.io.robot.identified_table import TABLE, add_table, read_identified_values
+from loopcal.io.robot.identified_table import TABLE, add_table, read_possible_values
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,
@@ -102,7 +102,7 @@ def build_robot(file: YamlFile) -> Mechanism:
         _refuse_column_names(robot, file)
     if TABLE not in file.content:
         return robot
-    return robot.with_values(read_identified_values(file, robot))
+    return robot.with_values(read_possible_values(file, robot))
 
 
 def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None = None) -> None:

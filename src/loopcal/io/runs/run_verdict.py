@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.findings import Finding, report_finding
+from loopcal.io.robot.identified_table import NOT_CALIBRATED
 
 if TYPE_CHECKING:
     from loopcal.workflow import CalibrationReport
@@ -22,8 +23,8 @@ ROBOT, FAILED_ROBOT = "robot.yaml", "robot-not-calibrated.yaml"
 FAILED_VERDICT, CONVERGED = "not_calibrated", "converged"
 """Verdict of a calibration that failed, and status of a fit that converged, in result.json."""
 
-WARNING = """\
-# NOT CALIBRATED: the calibration that made this file failed; see result.json beside it.
+WARNING = f"""\
+{NOT_CALIBRATED}: the calibration that made this file failed; see result.json beside it.
 """
 
 

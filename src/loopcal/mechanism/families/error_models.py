@@ -88,10 +88,20 @@ class ErrorTolerances:
 
 
 def single_error(
-    name: str, dimension: Dimension, nominal: float, tolerance: float | None, *maps: LinearMap
+    name: str,
+    dimension: Dimension,
+    nominal: float,
+    tolerance: float | None,
+    *maps: LinearMap,
+    positive: bool = False,
 ) -> ErrorModel:
-    """Return an error model of one named parameter."""
-    return ErrorModel((Parameter(name, dimension, float(nominal), tolerance),), maps)
+    """Return an error model of one named parameter.
+
+    `positive` : whether only values above zero exist; a nominal value of zero then allows others.
+    """
+    has_sign = positive and nominal > 0.0
+    parameter = Parameter(name, dimension, float(nominal), tolerance, positive=has_sign)
+    return ErrorModel((parameter,), maps)
 
 
 def displacement_error(
@@ -101,10 +111,12 @@ def displacement_error(
     axis: str,
     tolerance: float | None,
     nominal: float = 0.0,
+    positive: bool = False,
 ) -> ErrorModel:
     """Return a displacement of a link, of AXES in its carried frame, as a parameter."""
     maps = map_displacement(name, limb, element, axis)
-    return single_error(name, get_axis_dimension(axis), nominal, tolerance, *maps)
+    dimension = get_axis_dimension(axis)
+    return single_error(name, dimension, nominal, tolerance, *maps, positive=positive)
 
 
 def point_errors(limb: PlacedLimb, element: str, tolerance: float | None, label: str) -> ErrorModel:
@@ -123,15 +135,21 @@ def point_errors(limb: PlacedLimb, element: str, tolerance: float | None, label:
 def rod_length_error(limb: PlacedLimb, name: str, tolerance: float | None) -> ErrorModel:
     """Return the length of the rod of a `distance` ending at reading zero as a parameter."""
     rod = LinearMap(name, Address(limb.name, "rod", "length"))
-    return single_error(name, Dimension.LENGTH, limb.limb.length, tolerance, rod)
+    length = limb.limb.length
+    return single_error(name, Dimension.LENGTH, length, tolerance, rod, positive=True)
 
 
 def offset_error(
-    name: str, actuator: str, dimension: Dimension, nominal: float, tolerance: float | None
+    name: str,
+    actuator: str,
+    dimension: Dimension,
+    nominal: float,
+    tolerance: float | None,
+    positive: bool = False,
 ) -> ErrorModel:
     """Return the value of a driven joint at reading zero as a parameter."""
     offset = LinearMap(name, Address(actuator, "transmission", "offset"))
-    return single_error(name, dimension, nominal, tolerance, offset)
+    return single_error(name, dimension, nominal, tolerance, offset, positive=positive)
 
 
 def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = True) -> ErrorModel:

@@ -101,6 +101,11 @@ class Gough(RobotRecord):
         self._check()
         legs, actuators, errors = [], [], ErrorModel()
         for i, length in enumerate(values_per_leg(self.lengths, 6, "lengths")):
+            if not length >= 0.0:
+                raise MechanismError(
+                    f"leg {i + 1} of {self.name} has the length {length * 1e3:g} mm at reading "
+                    "zero; a length must be positive, or zero where readings are whole lengths"
+                )
             leg, motor = self._leg(i, length), f"q{i + 1}"
             legs.append(leg.limb)
             # a rod has its length in the ending, a chain in the offset of its sliding joint
@@ -183,4 +188,6 @@ class Gough(RobotRecord):
             errors += point_errors(leg, "platform", platform_sd, "platform")
         if self.legs == "rod":
             return errors + rod_length_error(leg, name, length_sd)
-        return errors + offset_error(name, motor, Dimension.LENGTH, length, length_sd)
+        return errors + offset_error(
+            name, motor, Dimension.LENGTH, length, length_sd, positive=True
+        )

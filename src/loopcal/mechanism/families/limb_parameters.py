@@ -81,7 +81,8 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
         parameter, address = f"{name}.{term}", Address(name, "transmission", axis)
         sd = standard_deviation(tolerance, parameter)
         entry = LinearMap(parameter, address, coefficient)
-        errors.append(single_error(parameter, dimension, nominal, sd, entry))
+        is_scale = axis == "gain"
+        errors.append(single_error(parameter, dimension, nominal, sd, entry, positive=is_scale))
     return join_errors(errors)
 
 

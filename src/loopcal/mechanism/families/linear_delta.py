@@ -116,7 +116,7 @@ class LinearDelta(RobotRecord):
             name: standard_deviation(getattr(self.tolerances, name), f"the {name}")
             for name in ("radius", "angles", "arms", "stops")
         }
-        errors = single_error("radius", Dimension.LENGTH, self.radius, sd["radius"])
+        errors = single_error("radius", Dimension.LENGTH, self.radius, sd["radius"], positive=True)
         limbs, actuators = [], []
         for k, (angle, arm, stop) in enumerate(zip(self.angles, arms, stops, strict=True), start=1):
             limb, motor = f"arm{k}", f"q{k}"
@@ -132,7 +132,7 @@ class LinearDelta(RobotRecord):
             names = (f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop")
             parameters = (
                 Parameter(names[0], Dimension.ANGLE, angle, sd["angles"], free=k < 3),
-                Parameter(names[1], Dimension.LENGTH, arm, sd["arms"]),
+                Parameter(names[1], Dimension.LENGTH, arm, sd["arms"], positive=True),
                 Parameter(names[2], Dimension.LENGTH, stop, sd["stops"]),
             )
             rod = LinearMap(names[1], Address(limb, "rod", "length"))

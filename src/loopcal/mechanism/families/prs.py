@@ -163,7 +163,9 @@ def carriage_errors(
     if limb.limb.ending == "distance":
         errors.append(rod_length_error(limb, rod, length))
     else:
-        errors.append(displacement_error(rod, limb, "tip", "z", length, frames.length))
+        errors.append(
+            displacement_error(rod, limb, "tip", "z", length, frames.length, positive=True)
+        )
     for axis in guide:
         name, has_joint = f"thB{number}{axis}", len(limb.limb.joints) > 1
         if has_joint:

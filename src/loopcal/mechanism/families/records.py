@@ -19,7 +19,7 @@ from loopcal.mechanism.assembly import Actuator, Assembly, Limb
 from loopcal.mechanism.families.error_models import ErrorModel
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
-from loopcal.units import Angle, Dimension, Length, Ratio
+from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
 
 Point = tuple[Length, Length, Length]
 
@@ -86,11 +86,11 @@ def standard_deviation(
             f"the tolerance of {name} must state either sd or limits, not both or neither"
         )
     stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
-    if not stated > 0:
+    if not is_sd(stated):
         unit = {LengthTolerance: " m", AngleTolerance: " rad", RatioTolerance: ""}[type(tolerance)]
         raise MechanismError(
-            f"the tolerance of {name} is {stated:g}{unit}; it must be greater than zero, or left "
-            "out"
+            f"the tolerance of {name} is {stated:g}{unit}; it must be greater than zero "
+            f"({SD_RANGE}), or left out"
         )
     return float(stated if tolerance.sd is not None else stated / np.sqrt(3.0))
 

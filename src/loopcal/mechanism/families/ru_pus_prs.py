@@ -131,7 +131,7 @@ class RuPusPrs(RobotRecord):
         """Return r and the angles of the post."""
         left_out = LEFT_OUT if self.parameters == "twenty-five" else ()
         return displacement_error(
-            "r", post, "universal1", "z", spread.length, self.post
+            "r", post, "universal1", "z", spread.length, self.post, positive=True
         ) + join_errors(
             displacement_error(name, post, element, axis, spread.angle)
             for name, element, axis in POST_ANGLES
