@@ -18,7 +18,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-INFINITE = "infinite: these data do not determine it"
+INFINITE = "infinite: these data do not determine it, or it is divided by zero"
 UNDEFINED = "undefined: there is nothing to compute it from"
 
 

@@ -51,6 +51,7 @@ from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.fit_uncertainty import FitUncertainty, collect_uncertainty
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
+from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
 from loopcal.units import Unit
@@ -142,8 +143,10 @@ class Validation:
 
     def improvement(self, index: str = "position", statistic: str = "rms") -> float:
         """Return how many times smaller a statistic of the prediction error became."""
-        after = getattr(self.after.statistics(index), statistic)
-        return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
+        before, after = (
+            getattr(errors.statistics(index), statistic) for errors in (self.before, self.after)
+        )
+        return ErrorChange(before, after, 0.0, 1).times
 
     def changes(self) -> dict[str, ErrorChange]:
         """Return the change of the rms error of each quantity.
@@ -192,7 +195,9 @@ class Validation:
             factor, symbol = (1.0, "sigma") if unit is None else (unit.factor_to_si, unit.symbol)
             name = "all kinds" if unit is None else quantity
             values = (change.before, change.after, change.noise_floor)
-            before, after, floor = (f"{value / factor:.3g} {symbol}" for value in values)
+            before, after, floor = (
+                f"{round_to_digits(value / factor)} {symbol}" for value in values
+            )
             lines.append(
                 f"  {name} (rms): {before} before, {after} after calibration (noise floor {floor})"
             )

@@ -55,8 +55,12 @@ class ErrorChange:
 
     @property
     def times(self) -> float:
-        """How many times smaller the error became."""
-        return self.before / self.after if self.after > 0.0 else np.inf
+        """How many times smaller the error became; infinite where it vanished, NaN if unknown."""
+        if not (np.isfinite(self.before) and np.isfinite(self.after)):
+            return np.nan
+        if self.after > 0.0:
+            return self.before / self.after
+        return np.inf if self.before > 0.0 else 1.0
 
     @property
     def largest_noise(self) -> float:

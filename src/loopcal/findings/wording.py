@@ -163,6 +163,8 @@ def _word(value: Any, spec: str) -> str:
     """Word a value in one of the formats, or in one of Python's."""
     if spec == "list":
         return list_names(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return round_to_digits(value)
     if spec == "percent":
         return f"{round_to_digits(100.0 * value)} %"
     if spec == "factor":

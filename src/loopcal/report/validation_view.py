@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from loopcal.apply import Validation
@@ -176,12 +177,16 @@ def view_validation(validation: Validation, with_before: bool, verbose: bool) ->
 
 def _compare(change: ErrorChange) -> str:
     """Return in words how much an error changed."""
-    if change.before != change.before:  # NaN: the geometry before has no setup that fits
+    if math.isnan(change.before):  # the geometry before has no setup that fits
         return "not known before calibration"
+    if math.isnan(change.after):
+        return "not known after calibration"
     if change.is_noise:
         return "within the noise before and after calibration"
     if abs(change.times - 1.0) < SIMILAR:
         return "the same before and after calibration"
+    if math.isinf(change.times):
+        return "zero after calibration"
     if change.times > 1.0:
         return f"{change.times:.3g} times smaller after calibration"
     if change.times > 0.0:

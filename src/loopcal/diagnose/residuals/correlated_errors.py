@@ -89,7 +89,8 @@ def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> Corr
     covariance = np.einsum("i,ijk->jk", weight, np.array(covariances))
     sizes = np.array([np.trace(c) for c in covariances])
     mean = float(weight @ sizes)
-    scatter = float(weight @ (sizes - mean) ** 2) / mean**2
+    # without a direction that the data determine there is no covariance, hence no scatter of it
+    scatter = float(weight @ (sizes - mean) ** 2) / mean**2 if mean > 0.0 else 0.0
     return CorrelatedErrors(
         covariance,
         2.0 / max(scatter + 2.0 / nu, LEAST_SCATTER),
