@@ -123,10 +123,7 @@ def test_error_in_a_robot_file_is_reported_with_its_line(
             "{name: leg1.base.q, value: 1, unit: mm}",
             "'leg1.base.q' is not a parameter of this robot .did you mean 'leg1.base",
         ),
-        (
-            "{name: leg1.base.x, value: 1, unit: deg}",
-            "'leg1.base.x': 'deg' is a unit of angle",
-        ),
+        ("{name: leg1.base.x, value: 1, unit: deg}", "'leg1.base.x': 'deg' is a unit of angle"),
         ("{name: leg1.base.x, value: a, unit: mm}", "the value of 'leg1.base.x' is 'a'"),
         ("{name: leg1.base.x, value: 1}", "has no 'unit'"),
         ("{name: leg1.base.x, vale: 1, unit: mm}", "unknown key 'vale' .*did you mean 'value'"),
