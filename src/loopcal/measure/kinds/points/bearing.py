@@ -82,10 +82,13 @@ class Bearing(TargetKind):
         a, b, c = x[..., 0], x[..., 1], x[..., 2]
         flat = a * a + b * b
         reach, level = flat + c * c, np.sqrt(flat)
-        slopes = [
-            np.stack([-b / flat, a / flat, np.zeros_like(a)], axis=-1),
-            np.stack([-a * c / level, -b * c / level, level], axis=-1) / reach[..., None],
-        ]
+        # a target straight above or below the station has an azimuth without a slope: NaN, by
+        # which a fit refuses the row
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slopes = [
+                np.stack([-b / flat, a / flat, np.zeros_like(a)], axis=-1),
+                np.stack([-a * c / level, -b * c / level, level], axis=-1) / reach[..., None],
+            ]
         angles = np.stack([np.arctan2(b, a), np.arctan2(c, level)], axis=-1)
         return angles, np.stack(slopes, axis=-2), {}
 
