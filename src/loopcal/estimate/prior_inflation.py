@@ -160,7 +160,8 @@ class _FactorError(NamedTuple):
 def _estimate_factor_error(result: Identification, fit: Descent) -> _FactorError:
     """Return what the error of the factor on all tolerances does.
 
-    In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i.
+    In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i, and deviations
+    of the variance tau_i^2 cause the error (1 - f_i) tau_i.
     """
     method = result.method
     assert isinstance(method, MAP)
@@ -171,7 +172,10 @@ def _estimate_factor_error(result: Identification, fit: Descent) -> _FactorError
     change = np.where(penalty > 0.0, change, 0.0)
     test, free = result.residual_test, result.free_parameters
     prior = find_variance_sources(d, fit.penalty, test, method, free).prior
-    caused = d.scale[:, None] * d.prior_roots(fit.penalty, prior)[0]
+    inverse = np.divide(1.0, penalty, out=np.zeros_like(penalty), where=penalty > 0.0)
+    variance = inverse if prior is None else np.where(penalty > 0.0, prior, 0.0)
+    left = (1.0 - d.filter_factors(penalty)) * np.sqrt(variance)
+    caused = d.scale[:, None] * d.directions[0] * left[0]
     return _FactorError(d.deviation(change * spread)[0], caused, spread)
 
 

@@ -199,17 +199,6 @@ class Decomposition(TrialBatch):
         gain = np.divide(s, total, out=np.zeros_like(s), where=np.isfinite(total) & (total > 0.0))
         return self.directions * (np.sqrt(np.reshape(noise, (-1, 1))) * gain)[:, None, :]
 
-    def prior_roots(self, penalty: FloatArray, prior: FloatArray | None = None) -> FloatArray:
-        """Return a square root (t, p, p) of the covariance of z / scale by the true coordinates,
-        whose variance is tau_i^2 (`prior`, 1 / penalty by default): V diag((1 - f_i) tau_i), zero
-        in directions without a penalty and in those that are not used.
-        """
-        used = np.isfinite(penalty) & (penalty > 0.0)
-        finite = np.where(used, penalty, 1.0)
-        variance = 1.0 / finite if prior is None else np.where(used, prior, 0.0)
-        left = np.where(used, finite / (self.singular_values**2 + finite), 0.0)
-        return self.directions * (left * np.sqrt(variance))[:, None, :]
-
     def covariance(
         self, penalty: FloatArray, noise: FloatArray | float = 1.0, prior: FloatArray | None = None
     ) -> FloatArray:
