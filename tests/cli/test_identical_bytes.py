@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same commands write identical bytes, whatever the environment and the current folder are."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TARGETS = "pose,x [mm],y [mm]\na,0,330\nb,10,320\n"
+SHORT = """\
+check five-bar --plot robot.svg --json
+simulate five-bar -o data.csv --kind position --draw 12 --draw-errors --truth truth.yaml
+calibrate five-bar data.csv -o run --method map --hold-out 0.25 -v"""
+LONG = f"""\
+{SHORT}
+check five-bar --plot robot.png
+check five-bar --plot robot.pdf
+new linear-delta -o new.yaml --measurements new.csv --kind component --components z
+simulate five-bar -o more.csv --kind position --draw 6 --seed 5
+identifiability five-bar data.csv --json
+calibrate five-bar data.csv -o run-2 --method map --loss huber --json
+calibrate linear-delta {{root}}/examples/delta-printer/heights.csv -o delta --choose-model
+validate run more.csv --json
+budget run --json
+compensate run targets.csv -o commands.csv
+bootstrap run --count 20 --json
+sample run --json
+region run -p west.motor.* --json
+plan five-bar -o plan --kind position --candidates 40 --accuracy 0.3mm
+plan linear-delta -o surfaces --measure plane-line --groups 4 --points 4
+import {{root}}/examples/cable-robot/samples.json --format hangprinter -o cable.yaml
+import {{root}}/examples/exports/tracker-points.txt -o tracker.csv \
+--profile {{root}}/examples/exports/tracker-points.yaml
+export delta -o printer.cfg
+export run -o run.csv
+export run -o run.json
+per-leg hexapod-42 {{root}}/examples/hexapod-42/measurements.csv -o per-leg.yaml
+reproduce hexapod-42 -o study --trials 2"""
+
+WORK = """
+import contextlib, io, sys
+from pathlib import Path
+from loopcal.cli import main
+for n, command in enumerate(sys.argv[1].splitlines()):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(command.split())
+    text = f"{command}\\n{code}\\n{out.getvalue()}{err.getvalue()}"
+    Path(f"printed-{n}.txt").write_bytes(text.encode())
+"""
+
+USUAL = {"PYTHONHASHSEED": "0", "TZ": "UTC", "LC_ALL": "C.UTF-8"}
+"""Environment of the first run."""
+
+OTHER = {
+    "PYTHONHASHSEED": "12345",
+    "TZ": "Asia/Tokyo",
+    "LC_ALL": "C",
+    "LANG": "de_DE.UTF-8",
+    "OMP_NUM_THREADS": "4",
+    "OPENBLAS_NUM_THREADS": "4",
+    "SOURCE_DATE_EPOCH": "86400",
+    "COLUMNS": "80",
+}
+
+MORE = {
+    "no variables": {},
+    "two threads": {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "PYTHONHASHSEED": "1"},
+    "four threads": {"OPENBLAS_NUM_THREADS": "4", "OMP_NUM_THREADS": "4", "PYTHONHASHSEED": "2"},
+    "another time zone": {"TZ": "America/St_Johns", "PYTHONHASHSEED": "random"},
+    "C": {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+    "a decimal comma": {"LC_ALL": "de_DE.UTF-8", "PYTHONHASHSEED": "3"},
+}
+
+
+def run_commands(folder: Path, commands: str, variables: dict[str, str]) -> dict[str, bytes]:
+    """Run commands in a process and a folder of their own; return the content of all files."""
+    folder.mkdir()
+    (folder / "targets.csv").write_text(TARGETS)
+    kept = {"PATH", "PYTHONPATH", "HOME", "MPLCONFIGDIR"}
+    environment = {k: v for k, v in os.environ.items() if k in kept} | variables
+    words = [sys.executable, "-c", WORK, commands]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def make_locale(folder: Path, name: str) -> None:
+    """Make a locale of the operating system, which may lack it; without tools it stays C."""
+    folder.mkdir()
+    if shutil.which("localedef"):
+        words = ["localedef", "-i", name, "-f", "UTF-8", str(folder / f"{name}.UTF-8")]
+        subprocess.run(words, check=False, capture_output=True)
+
+
+def list_differences(first: dict[str, bytes], second: dict[str, bytes]) -> list[str]:
+    return sorted(n for n in first.keys() | second.keys() if first.get(n) != second.get(n))
+
+
+def test_files_and_pages_are_identical_in_another_environment(tmp_path) -> None:
+    first = run_commands(tmp_path / "first", SHORT, USUAL)
+    second = run_commands(tmp_path / "second folder", SHORT, OTHER)
+    assert {"robot.svg", "data.csv", "run/result.json", "run/arrays.npz"} <= set(first)
+    assert list_differences(first, second) == []
+
+
+@pytest.mark.evidence
+def test_files_and_pages_of_all_commands_are_identical_in_any_environment(tmp_path, root) -> None:
+    commands = LONG.format(root=root)
+    make_locale(tmp_path / "locales", "de_DE")
+    first = run_commands(tmp_path / "first", commands, USUAL)
+    codes = {n: text.split(b"\n")[:2] for n, text in first.items() if n.startswith("printed")}
+    assert [c for c in codes.values() if c[1] not in (b"0", b"2")] == []
+    for i, (name, variables) in enumerate(MORE.items()):
+        again = run_commands(
+            tmp_path / str(i), commands, {**variables, "LOCPATH": str(tmp_path / "locales")}
+        )
+        assert list_differences(first, again) == [], name
