@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,9 @@ from loopcal.plain_text import escape
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
+
+MOST_NAMES = 2000
+"""Names that are compared with a wrong one, which takes some microseconds each."""
 
 
 class LoopcalError(Exception):
@@ -87,7 +91,11 @@ class FileError(LoopcalError):
 def suggest_names(name: str, allowed: Iterable[str], n: int = 3) -> str:
     """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`.
 
-    The text is empty if no name is similar.
+    The text is empty if no name is similar, or where there are more names than `MOST_NAMES`, such
+    as those of all poses: then any wrong name is similar to many.
     """
-    close = difflib.get_close_matches(name, list(allowed), n=n, cutoff=0.6)
+    names = list(islice(allowed, MOST_NAMES + 1))
+    if len(names) > MOST_NAMES:
+        return ""
+    close = difflib.get_close_matches(name, names, n=n, cutoff=0.6)
     return f" (did you mean {' or '.join(repr(c) for c in close)}?)" if close else ""

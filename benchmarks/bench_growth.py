@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What many rows and targets cost: reading a file against csv, and the growth of whole tasks with
+four times as many of them.
+"""
+
+import csv
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import Metric, measure_ratio, time_once
+from loopcal.apply import compensate
+from loopcal.io import load_measurements, load_robot, save_measurements
+from loopcal.io.runs.compensation_file import format_compensation
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Sensor,
+    sample_truth,
+    simulate,
+)
+from loopcal.mechanism import Mechanism
+from loopcal.workflow import CalibrationOptions, calibrate
+
+UM = 1e-6
+ROWS, FEW, MANY = 100_000, 10_000, 40_000
+LIMIT = 5.0
+"""Growth for four times as much: 4 in proportion, and a fifth for fewer hits of the cache."""
+
+
+def _targets(robot: Mechanism, n: int) -> np.ndarray:
+    """Random controlled coordinates in the workspace."""
+    ranges = np.array([robot.assembly.workspace[name] for name in robot.controlled])
+    return np.random.default_rng(0).uniform(ranges[:, 0], ranges[:, 1], (n, len(ranges)))
+
+
+def _measured(robot: Mechanism, n: int) -> Measurements:
+    """A machine drawn from the tolerances, whose position is measured in n poses."""
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    sensor = Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 10 * UM)))
+    return simulate(truth, _targets(robot, n), Instrument((sensor,)), 0)
+
+
+def _growth(name: str, few: Callable[[], object], many: Callable[[], object]) -> Metric:
+    """The ratio of the shorter of two times each."""
+    less, more = (min(time_once(work) for _ in range(2)) for work in (few, many))
+    note = f"{less:.3g} s and {more:.3g} s for {FEW} and {MANY}"
+    return Metric(name, more / less, tolerance=0.25, limit=LIMIT, note=note)
+
+
+def bench_reading() -> Metric:
+    """Read 1e5 rows with three readings and three coordinates, each number rounded once and every
+    row checked, against Python's csv module, which only splits the same text.
+    """
+    robot = load_robot("linear-delta")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "data.csv"
+        save_measurements(_measured(robot, ROWS), file, robot)
+        lines = file.read_text(encoding="utf-8").splitlines()[-ROWS:]
+        return measure_ratio(
+            "growth.reading_of_csv",
+            lambda: load_measurements(file, robot),
+            lambda: [float(x) for row in csv.reader(lines) for x in row[1:]],
+            repeats=5,
+        )
+
+
+def bench_calibration() -> Metric:
+    """Calibrate with 40,000 rows against 10,000: conventions, fit, all examinations, held-out
+    poses.
+    """
+    robot = load_robot("linear-delta")
+    options = CalibrationOptions(hold_out=0.25)
+    data = [_measured(robot, n) for n in (FEW, MANY)]
+    tasks = (lambda d=d: calibrate(robot, d, options) for d in data)
+    return _growth("growth.calibration_of_rows", *tasks)
+
+
+def bench_compensation() -> Metric:
+    """Compensate 40,000 targets against 10,000, and write the file."""
+    robot = load_robot("linear-delta")
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    targets = [_targets(robot, n) for n in (FEW, MANY)]
+    tasks = (lambda x=x: format_compensation(compensate(truth, x)) for x in targets)
+    return _growth("growth.compensation_of_targets", *tasks)
