@@ -41,6 +41,9 @@ LEVEL = 1e-3
 the verdict.
 """
 
+FOLDED = 10_000
+"""Rows that are factorized at once."""
+
 ANYWHERE = 1e3
 """Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians."""
 
@@ -86,11 +89,14 @@ class HeldOutBlocks:
     def combine(self, excluded: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the factor R (k, k) and solution y (k,) of the blocks that are not excluded."""
         k = self.groups[0][1].shape[2]
-        stacked = [np.column_stack([np.eye(k), np.zeros(k)])]
+        stacked, count = [np.column_stack([np.eye(k), np.zeros(k)])], 0
         for numbers, H, residual, _ in self.groups:
             kept = ~excluded[numbers]
             rows = np.concatenate([H[kept], residual[kept][..., None]], axis=2)
             stacked.append(rows.reshape(-1, k + 1))
+            count += len(stacked[-1])
+            if count > FOLDED:
+                stacked, count = [np.linalg.qr(np.concatenate(stacked), mode="r")], 0
         triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
         R = triangle[:k, :k]
         return R, -np.linalg.solve(R, triangle[:k, k])
