@@ -29,7 +29,9 @@ from loopcal.workflow import CalibrationOptions, calibrate
 UM = 1e-6
 ROWS, FEW, MANY = 100_000, 10_000, 40_000
 LIMIT = 5.0
-"""Growth for four times as much: 4 in proportion, and a fifth for fewer hits of the cache."""
+"""Largest growth for four times as much: 4 in proportion, and a quarter for a busy machine. What
+compares each row with all others grows sixteenfold.
+"""
 
 
 def _targets(robot: Mechanism, n: int) -> np.ndarray:
@@ -49,7 +51,7 @@ def _growth(name: str, few: Callable[[], object], many: Callable[[], object]) ->
     """The ratio of the shorter of two times each."""
     less, more = (min(time_once(work) for _ in range(2)) for work in (few, many))
     note = f"{less:.3g} s and {more:.3g} s for {FEW} and {MANY}"
-    return Metric(name, more / less, tolerance=0.25, limit=LIMIT, note=note)
+    return Metric(name, more / less, tolerance=None, limit=LIMIT, note=note)
 
 
 def bench_reading() -> Metric:
@@ -66,6 +68,7 @@ def bench_reading() -> Metric:
             lambda: load_measurements(file, robot),
             lambda: [float(x) for row in csv.reader(lines) for x in row[1:]],
             repeats=5,
+            tolerance=0.5,
         )
 
 
