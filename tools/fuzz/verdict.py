@@ -82,7 +82,7 @@ def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
             yield Find("control-character", f"{command} {name}: {normalize(near)}", repr(near))
     if "not enough memory" in outcome.err:
         yield Find("memory", command, outcome.err[-300:])
-    if re.search(r"defect of loopcal|Traceback", outcome.err):
+    if not is_usage and re.search(r"defect of loopcal|Traceback", outcome.err):
         yield Find("defect-message", normalize(outcome.err), outcome.err[-600:])
     if re.search(r"object at 0x|<class '|NoneType|dtype\(|array\(\[", outcome.err):
         yield Find("internal-words", f"{command}: {normalize(outcome.err)}", outcome.err[-600:])
