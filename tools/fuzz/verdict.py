@@ -42,6 +42,10 @@ class Find:
 
 def judge(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     """Return every rule that the answer to an input breaks."""
+    return list({find.signature: find for find in _list_finds(case, outcome, folder)}.values())
+
+
+def _list_finds(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     finds = [
         Find("traceback", f"{kind} at {find_place(text)}", text) for kind, text in outcome.failures
     ]
