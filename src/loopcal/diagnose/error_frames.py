@@ -125,7 +125,7 @@ class FrameFit:
 
     def __call__(self, twists: FloatArray) -> FloatArray:
         """Return the motions (12, r) that fit twists (m, 6, r) of the reference poses best."""
-        return self.solution @ twists.reshape(self.solution.shape[1], -1)
+        return self.solution @ twists.reshape(self.solution.shape[1], twists.shape[-1])
 
     def remove(self, twists: FloatArray, T: FloatArray, reference: FloatArray) -> FloatArray:
         """Return errors (t, n, 6) of t machines at poses T (n, 4, 4) without the motions that fit
@@ -147,8 +147,10 @@ def fit_frames(robot: Mechanism, T: FloatArray, motions: FloatArray) -> FrameFit
     # where the orientation is constant, opposite motions of both frames move nothing
     used = s > FIT_TOLERANCE * np.linalg.norm(by_frames)
     moving = motions @ vt[used].T
-    inverse = (u[:, used] / s[used]).T.reshape(-1, m, 1, 6)
-    return FrameFit(T, moving, robot.size, moving @ np.matmul(inverse, weight).reshape(-1, 6 * m))
+    count = np.count_nonzero(used)  # none where the motions are errors of rounding
+    inverse = (u[:, used] / s[used]).T.reshape(count, m, 1, 6)
+    solution = moving @ np.matmul(inverse, weight).reshape(count, 6 * m)
+    return FrameFit(T, moving, robot.size, solution)
 
 
 def fit_unfixed_frames(posterior: Posterior) -> FrameFit:
@@ -335,7 +337,7 @@ def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tupl
     """Return which frames a motion (12, p) that fits twists (m, 6, p) moves: the fewest."""
     M = frame_twists(fit.poses, fit.size)
     weight = np.array([fit.size] * 3 + [1.0] * 3)[:, None]
-    moved = (weight * (M @ motion)).reshape(6 * len(M), -1)
+    moved = (weight * (M @ motion)).reshape(6 * len(M), motion.shape[-1])
     length = np.linalg.norm(moved)
     if not length > FIT_TOLERANCE * np.linalg.norm(weight * twists):
         return ()

@@ -88,7 +88,7 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
             )
     kept = np.array([label not in excluded for label in data.labels])
     observations = tuple(
-        o.with_weights(o.weight * kept[o.rows].reshape(len(o), -1).all(axis=1))
+        o.with_weights(o.weight * kept[o.rows].reshape(len(o), o.kind.poses_per_row).all(axis=1))
         for o in data.observations
     )
     return replace(

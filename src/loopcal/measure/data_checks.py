@@ -164,7 +164,11 @@ def check_duplicates(
         return
     places_of = dict(zip(map(id, measurements.observations), places, strict=False))
     for alike in _group_equal_kinds(measurements.observations):
-        poses = np.concatenate([rows.rows.reshape(len(rows), -1) for rows in alike])
+        poses = np.concatenate(
+            [rows.rows.reshape(len(rows), rows.kind.poses_per_row) for rows in alike]
+        )
+        if not len(poses):
+            continue
         texts = [
             np.concatenate([getattr(rows, name) for rows in alike]) for name in ("session", "group")
         ]

@@ -70,7 +70,8 @@ def _is_same_file(path: Path, other: Path) -> bool:
     """Return whether two names denote one file, existing or not."""
     if path.exists() and other.exists():
         return path.samefile(other)
-    return path.resolve() == other.resolve()
+    # not Path.resolve, which refuses a link that leads to itself
+    return os.path.realpath(path) == os.path.realpath(other)
 
 
 def resolve_folder(path: Path) -> Path:

@@ -70,7 +70,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     if name is None:
         example = "write '# kind: pose' at the top, or 'kind: pose' in a .yaml file of this name"
         raise file.error(f"no kind of measurement is stated; {example} (kinds: {known})", location)
-    if name not in KINDS:
+    if not isinstance(name, str) or name not in KINDS:
         sentence = f"{name!r} is not a kind of measurement{suggest_names(str(name), KINDS)}"
         raise file.error(f"{sentence}; allowed: {known}", (*location, "kind"))
     kind = KINDS[name]

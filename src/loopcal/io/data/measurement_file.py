@@ -156,7 +156,8 @@ def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[in
     """Return the place of the first row of each pose, such as `data.csv:12`."""
     first: dict[int, str] = {}
     for rows, of_rows in zip(data.observations, places, strict=True):
-        for poses, place in zip(rows.rows.reshape(len(rows), -1).tolist(), of_rows, strict=True):
+        named = rows.rows.reshape(len(rows), rows.kind.poses_per_row)
+        for poses, place in zip(named.tolist(), of_rows, strict=True):
             for pose in poses:
                 first.setdefault(pose, place)
     return first

@@ -280,7 +280,7 @@ def _read_names(file: YamlFile, urdf: Urdf) -> tuple[list[tuple[str, str]], tupl
     pairs, kinds, motors = (file.content.get(k, []) for k in ("closed_loop", "type", "name_mot"))
     lists = isinstance(pairs, list) and isinstance(kinds, list) and isinstance(motors, list)
     is_valid = lists and len(kinds) == len(pairs)
-    if not is_valid or any(not isinstance(pair, list) or len(pair) != 2 for pair in pairs):
+    if not is_valid or any(not _is_pair_of_names(pair) for pair in pairs):
         sentence = "write 'closed_loop:' as a list of pairs, 'type:' with one entry for each, and"
         raise file.error(f"{sentence} 'name_mot:' as a list")
     for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
@@ -292,6 +292,10 @@ def _read_names(file: YamlFile, urdf: Urdf) -> tuple[list[tuple[str, str]], tupl
             sentence = f"closure {pair[0]!r} is of type {kind!r}, but only '6d' is allowed"
             raise file.error(f"{sentence}, between two revolute joints", ("type", i))
     return [(a, b) for a, b in pairs], tuple(str(name) for name in motors)
+
+
+def _is_pair_of_names(value: Any) -> bool:
+    return isinstance(value, list) and [type(name) for name in value] == [str, str]
 
 
 def _list_tree_joints(urdf: Urdf, ends: set[str]) -> tuple[GraphJoint, ...]:

@@ -66,7 +66,8 @@ class TargetKind(Kind):
             self, targets=targets, T_base_frame=check_pose(self.T_base_frame, "T_base_frame")
         )
         if self.places is not None:
-            places = np.atleast_2d(self.places)
+            one = np.ndim(self.places[0]) == 0 if len(self.places) else False
+            places = [self.places] if one else self.places
             shape = (len(targets), 3)
             set_fields(self, places=check_array(places, "the places of the targets", shape))
 

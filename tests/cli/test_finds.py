@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs at which random inputs (tools/fuzz) found a traceback, a warning or a wrong answer: the
+smallest that shows it, and the right answer.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.diagnose.error_frames import fit_frames
+from loopcal.io import load_robot
+
+DATA = """\
+# kind: {kind}
+# noise: {noise}
+pose,q1 [mm],q2 [mm],q3 [mm],{columns}
+"""
+POSITION = DATA.format(
+    kind="position", noise="{x: 20 um, y: 20 um, z: 20 um}", columns="x [mm],y [mm],z [mm]"
+)
+ROWS = "a,180,190,200,1,2,3\nb,190,180,200,1,2,3\n"
+SEPARATION = DATA.format(kind="separation", noise="{separation: 20 um}", columns="separation [mm]")
+LIMB = '<link name="{0}"/><joint name="{0}j" type="revolute"><parent link="base"/><child link="{0}"/><axis xyz="0 0 1"/></joint>'  # noqa: E501
+URDF = f"<robot name='r'><link name='base'/>{LIMB.format('a')}{LIMB.format('b')}</robot>"
+
+
+@dataclass(frozen=True)
+class Find:
+    """A command line, the files that it reads, its exit code, and what it says."""
+
+    command: str
+    files: Mapping[str, str] = field(default_factory=dict)
+    code: int = 1
+    says: str = ""
+
+
+FINDS = {
+    "kind that is a list": Find(
+        "identifiability linear-delta d.csv",
+        {"d.csv": POSITION.replace("kind: position", "kind: [position]") + ROWS},
+        says="d.csv:1: ['position'] is not a kind of measurement",
+    ),
+    "places of different length": Find(
+        "identifiability linear-delta d.csv",
+        {"d.csv": "# places: [[1 mm, 2 mm, 3 mm], [1 mm]]\n# targets: [a, b]\n" + POSITION + ROWS},
+        says="give an array of numbers of shape (2, 3)",
+    ),
+    "kind without a measured value": Find(
+        "validate linear-delta d.csv",
+        {"d.csv": SEPARATION + "a,180,190,200,\nb,190,180,200,\n"},
+        says="Fill in the measured values",
+    ),
+    "closure of a list": Find(
+        "import r.urdf --closures c.yaml -o new.yaml",
+        {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
+        says="write 'closed_loop:' as a list of pairs",
+    ),
+}
+
+
+@pytest.mark.parametrize("find", FINDS.values(), ids=FINDS)
+def test_input_found_at_random_has_its_answer(tmp_path, monkeypatch, capsys, find) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, text in find.files.items():
+        (tmp_path / name).write_text(text, "utf-8")
+    code = main(find.command.split())
+    printed = capsys.readouterr()
+    assert find.says in " ".join((printed.out + printed.err).split())
+    assert code == find.code
+    assert {path.name for path in tmp_path.iterdir()} == set(find.files)
+
+
+def test_link_to_itself_is_refused_as_an_output(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop.yaml").symlink_to("loop.yaml")
+    assert main("new limbs -o loop.yaml --measurements d.csv".split()) == 1
+    assert "loop.yaml: this symbolic link has no target" in capsys.readouterr().err
+
+
+def test_motions_that_move_nothing_fit_nothing() -> None:
+    robot = load_robot("linear-delta")
+    fit = fit_frames(robot, robot.home[None], np.zeros((12, 2)))
+    assert fit.solution.shape == (12, 6)
+    assert not fit(np.ones((1, 6, 3))).any()
