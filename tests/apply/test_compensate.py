@@ -150,3 +150,14 @@ def test_compensation_progress_counts_passes_over_all_targets(mode, passes) -> N
     robot = hexapod()
     compensate(robot, robot.home[None], mode, progress=lambda *report: reports.append(report))
     assert [(done, total) for done, total, _ in reports] == [(i, passes) for i in range(passes)]
+
+
+def test_no_error_is_stated_where_the_machine_does_not_get_to_a_pose():
+    robot = load_robot("3-prs")
+    targets = np.array([[0.7, 0.2, 0.2], [0.5, 3.0, 2.0]])
+    for mode in ("readings", "commands"):
+        result = compensate(robot, targets, mode)
+        assert result.usable.tolist() == [True, False]
+        assert np.isfinite(result.before[0]).all()
+        assert np.isnan(result.before[1]).all()
+        assert np.isnan(result.remaining[1]).all() or mode == "commands"

@@ -86,7 +86,8 @@ class Compensation:
     wanted, reached : (n, 4, 4) platform poses; `reached` is that of the identified robot.
     before : (n, 6) error of the machine when its controller commands the target unchanged, in the
         frame of `uncertainty` where that is "fitted", else in the base frame.
-    remaining : (n, 6) error after compensation. not_compensable : (n, 6) the part of it that no
+    remaining : (n, 6) error after compensation; it and `before` are NaN where the machine does not
+        get to a pose. not_compensable : (n, 6) the part of it that no
         reading can remove.
     residual_position, residual_orientation : (steps + 1, n) [m], [rad] distance from the best
         reachable pose before the first and after each fixed-point step; zeros (1, n) where readings
@@ -200,7 +201,8 @@ def compensate(
     count.begin(TASK)
     best = inverse(robot, targets)
     count.begin(TASK)
-    before = geometry.pose_difference(forward(robot, uncorrected.q).T, wanted)
+    unchanged = forward(robot, uncorrected.q)
+    before = geometry.pose_difference(unchanged.T, wanted)
     if mode == "readings":
         result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
     else:
@@ -213,6 +215,7 @@ def compensate(
     if posterior is not None:
         uncertainty = pose_uncertainty(posterior, final, frame=frame, origin_name=names[0])
         before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
+    has_before, has_after = uncorrected.converged & unchanged.converged, final.converged
     return Compensation(
         mode=mode,
         labels=names,
@@ -222,8 +225,8 @@ def compensate(
         commands=result.commands,
         wanted=wanted,
         reached=final.T,
-        before=before,
-        remaining=geometry.pose_difference(final.T, wanted),
+        before=np.where(has_before[:, None], before, np.nan),
+        remaining=np.where(has_after[:, None], geometry.pose_difference(final.T, wanted), np.nan),
         not_compensable=not_compensable,
         residual_position=np.linalg.norm(distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(distances[..., :3], axis=2),

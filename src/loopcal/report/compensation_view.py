@@ -39,10 +39,11 @@ def view_compensation(result: Compensation) -> list[Block]:
     )
     caption = f"{result.robot.name}: {len(cells)} targets, {result.mode}"
     blocks: list[Block] = [Table(caption, tuple(columns), cells)]
-    if result.commands is not None:
+    usable = result.usable
+    if result.commands is not None and usable.any():
         for step in range(1, len(result.residual_position)):
-            position = np.nanmax(result.residual_position[step]) / length.factor_to_si
-            turn = np.nanmax(result.residual_orientation[step]) / angle.factor_to_si
+            position = result.residual_position[step, usable].max() / length.factor_to_si
+            turn = result.residual_orientation[step, usable].max() / angle.factor_to_si
             blocks.append(
                 f"After step {step}: at most {format_number(position, 3)} {length} and "
                 f"{format_number(turn, 3)} {angle} from the best reachable poses."

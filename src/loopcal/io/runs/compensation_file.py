@@ -117,5 +117,7 @@ def format_compensation(result: Compensation) -> str:
 
 
 def _format_error(value: float) -> str:
-    """Return a number; nothing for NaN, `inf` where it is unbounded."""
+    """Return a number; nothing where it is unknown, a word where it is unbounded."""
+    if math.isinf(value):
+        return "unbounded"
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results do not depend on what a user may choose freely: the base frame, the frame of the
+instrument, the units of the file, and the order of poses, limbs and actuators. Every shipped robot.
+
+A new file in src/loopcal/robots is included automatically.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from loopcal import geometry
+from loopcal.estimate import FitOptions, identify
+from loopcal.io.core.records import _to_si, read_units
+from loopcal.io.core.yaml_file import read_yaml
+from loopcal.io.robot.robot_file import HEADER, list_shipped_robots, load_robot
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    Measurements,
+    Position,
+    Sensor,
+    sample_truth,
+    simulate,
+)
+from loopcal.mechanism import FAMILIES, Mechanism, build, forward, inverse, sample_workspace
+from tests.zoo import move_base
+
+Array = NDArray[np.float64]
+ROBOTS = tuple(list_shipped_robots())
+POSES = 20
+CORNERS = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02], [-0.05, -0.08, 0.1]])
+
+
+@cache
+def load_cached_robot(name: str) -> Mechanism:
+    return load_robot(name)
+
+
+@cache
+def draw_readings(name: str) -> Array:
+    return sample_workspace(load_cached_robot(name), POSES, seed=4).solution.q
+
+
+def make_motion(robot: Mechanism, seed: int = 1) -> Array:
+    """Return a rigid motion (4, 4) that keeps the plane of a planar robot."""
+    w, v = 0.2 * np.random.default_rng(seed).standard_normal((2, 3))
+    if not {"rx", "ry", "z"} & set(robot.freedoms):
+        w[:2], v[2] = 0.0, 0.0
+    return geometry.make_pose(geometry.exp_so3(w), v)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_poses_move_with_the_base(name: str) -> None:
+    robot, q = load_cached_robot(name), draw_readings(name)
+    G = make_motion(robot)
+    moved = build(move_base(robot.assembly, G))
+    here, there = forward(robot, q), forward(moved, q)
+    assert there.converged.all()
+    assert_allclose(there.T, G @ here.T, rtol=0, atol=1e-10)
+    if len(robot.controlled) == 6:
+        assert_allclose(inverse(moved, G @ here.T).q, q, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_order_of_limbs_and_actuators_does_not_matter(name: str) -> None:
+    robot, q = load_cached_robot(name), draw_readings(name)
+    rng = np.random.default_rng(2)
+    limbs = rng.permutation(len(robot.assembly.limbs))
+    order = rng.permutation(len(robot.actuators))
+    changed = replace(
+        robot.assembly,
+        limbs=tuple(robot.assembly.limbs[i] for i in limbs),
+        actuators=tuple(robot.actuators[i] for i in order),
+    )
+    other = build(changed)
+    assert_allclose(forward(other, q[:, order]).T, forward(robot, q).T, rtol=0, atol=1e-11)
+    back = inverse(other, forward(robot, q).T)
+    assert back.converged.all()
+    assert_allclose(back.q, q[:, order], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_units_of_the_file_do_not_matter(name: str, tmp_path: Path) -> None:
+    from ruamel.yaml import YAML
+
+    robot, q = load_cached_robot(name), draw_readings(name)
+    file = read_yaml(list_shipped_robots()[name], "robot file")
+    content = {key: value for key, value in file.content.items() if key not in HEADER}
+    family = FAMILIES[file.content["family"]]
+    si = _to_si(family, content, file, read_units(file), ())
+    head = {"format": 1, "units": {"length": "m", "angle": "rad"}, "family": family.family}
+    path = tmp_path / "robot.yaml"
+    with path.open("w") as stream:
+        YAML().dump({**head, **_restore_keys(si)}, stream)
+    other = load_robot(path)
+    assert other.parameters.names == robot.parameters.names
+    assert_allclose(other.values, robot.values, rtol=1e-15, atol=0)
+    assert_allclose(other.parameters.tolerance, robot.parameters.tolerance, rtol=1e-15, atol=0)
+    assert_allclose(forward(other, q).T, forward(robot, q).T, rtol=0, atol=1e-12)
+    assert_allclose(inverse(other, forward(robot, q).T).q, q, rtol=0, atol=1e-10)
+
+
+def _restore_keys(node: object) -> object:
+    """Return a record with the keys of a file: `from` for `from_`."""
+    if isinstance(node, dict):
+        return {key.removesuffix("_"): _restore_keys(value) for key, value in node.items()}
+    return [_restore_keys(value) for value in node] if isinstance(node, list) else node
+
+
+@cache
+def measure_robot(name: str) -> Measurements:
+    """Return positions of three targets on a robot with the errors of its tolerances."""
+    robot = load_cached_robot(name)
+    true = robot.with_values(sample_truth(robot, 1, 5)[0])
+    kind = Position(targets=("a", "b", "c"), places=CORNERS, unknown=("frame",), frame="tracker")
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(9, 2e-5))),))
+    return simulate(true, draw_poses(name), instrument, 6)
+
+
+@cache
+def draw_poses(name: str) -> Array:
+    return sample_workspace(load_cached_robot(name), POSES, seed=4).coordinates
+
+
+@cache
+def identify_values(name: str) -> Array:
+    return identify(load_cached_robot(name), measure_robot(name), options=OPTIONS).robot.values
+
+
+OPTIONS = FitOptions()
+SHARE = 1e-5
+"""Of a standard deviation: how far two descents may end from each other."""
+
+
+def compare_fits(name: str, data: Measurements, order: Array | None = None) -> None:
+    """Assert that data lead to the values of `measure_robot`, within a share of their sd."""
+    robot = load_cached_robot(name)
+    result = identify(robot, data, options=OPTIONS)
+    sd = np.zeros(len(robot.values))
+    sd[result.free_parameters.places] = result.standard_deviations
+    gap = np.abs(result.robot.values - identify_values(name))
+    assert (gap <= SHARE * sd + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_fit_does_not_depend_on_the_frame_of_the_instrument(name: str) -> None:
+    data = measure_robot(name)
+    (rows,) = data.observations
+    G = geometry.invert_pose(make_motion(load_cached_robot(name), seed=7))
+    points = rows.measured.reshape(-1, 3) @ G[:3, :3].T + G[:3, 3]
+    moved = replace(rows, measured=points.reshape(rows.measured.shape))
+    compare_fits(name, replace(data, observations=(moved,)))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_fit_does_not_depend_on_the_order_of_poses(name: str) -> None:
+    data = measure_robot(name)
+    compare_fits(name, data.take(np.random.default_rng(8).permutation(POSES)))
