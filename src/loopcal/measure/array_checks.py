@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.typing import FloatArray
-from loopcal.units import LARGEST
 
 
 def check_array(
@@ -54,12 +53,6 @@ def check_array(
         value = array[tuple(i - 1 for i in place)]
         raise DataError(
             f"{what}: {where} is {value}; give a finite number" + (" or NaN" if allow_nan else "")
-        )
-    beyond = array[np.abs(array) > LARGEST]
-    if len(beyond):
-        raise DataError(
-            f"{what} contains {beyond[0]:g}; no number may be beyond {LARGEST:g}: correct it, or "
-            "its unit"
         )
     array.setflags(write=False)
     return array
