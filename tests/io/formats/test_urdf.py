@@ -189,3 +189,38 @@ def test_invalid_closures_are_refused_in_one_sentence(tmp_path, closures, senten
     (tmp_path / "a.yaml").write_text(closures)
     with pytest.raises(LoopcalError, match=sentence):
         urdf.read(tmp_path / "a.urdf", ImportOptions("a"))
+
+
+CIRCLE = """<robot name="r">
+<link name="root"/><link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/>
+<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>
+<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint>
+<joint name="motor" type="revolute"><parent link="root"/><child link="c"/></joint>
+<joint name="one" type="revolute"><parent link="c"/><child link="d"/></joint>
+<joint name="other" type="revolute"><parent link="b"/><child link="e"/></joint>
+</robot>
+"""
+
+
+def test_circle_of_fixed_joints_is_refused(tmp_path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(CIRCLE)
+    with pytest.raises(FileError, match=r"urdf:4: joint 'k' closes a circle of links: 'a' is carr"):
+        urdf_tree.read(path)
+    path.write_text(CIRCLE.replace('"fixed"', '"revolute"'))
+    with pytest.raises(FileError, match="closes a circle of links"):
+        urdf_tree.read(path)
+
+
+def test_urdf_is_limited_in_joints_elements_and_nesting(tmp_path) -> None:
+    path = tmp_path / "robot.urdf"
+    joint = '<joint name="j{}" type="fixed"><parent link="a"/><child link="b"/></joint>'
+    many = "".join(joint.format(i) for i in range(301))
+    for content, reason in (
+        (many, "has 301 joints, but the limit is 300"),
+        ("<visual/>" * 20_001, "more than 20,000 elements"),
+        ("<a>" * 60 + "</a>" * 60, "more than 50 levels of nesting"),
+    ):
+        path.write_text(f'<robot name="r">{content}</robot>')
+        with pytest.raises(FileError, match=reason):
+            urdf_tree.read(path)

@@ -136,6 +136,13 @@ PROGRAM_SIZE = FileLimit(
     "check that this is the file that was meant, or remove what does not belong there",
     MEGABYTE,
 )
+XML_JOINTS = FileLimit(
+    "joints of a URDF",
+    300,
+    "joints",
+    "fixed ones included",
+    "leave out joints that belong to no loop",
+)
 JSON_DEPTH = FileLimit(
     "nesting of JSON text",
     200,
@@ -175,12 +182,18 @@ PATTERN_LENGTH = FileLimit(
     "`match` and `ignore`",
     "write a shorter pattern",
 )
+PATTERN_COUNTS = FileLimit(
+    "repetitions in a pattern of a profile",
+    1_000,
+    "repetitions",
+    "the product of all counts in braces: 8 for `\\d{4}-\\d{2}`",
+    "write smaller counts, or `*` and `+`",
+)
 PATTERN_SECONDS = FileLimit(
     "time of the patterns of a profile",
     2,
     "seconds",
     "for one export, and 0.1 ms more for each of its lines",
-    "write a pattern without a repetition inside a repetition, such as `(a+)+`",
 )
 NAME_LENGTH = FileLimit(
     "length of a name",
@@ -224,9 +237,11 @@ LIMITS: tuple[FileLimit, ...] = (
     TABLE_COLUMNS,
     LINE_LENGTH,
     PATTERN_LENGTH,
+    PATTERN_COUNTS,
     PATTERN_SECONDS,
     PROGRAM_SIZE,
     JSON_DEPTH,
+    XML_JOINTS,
     XML_ELEMENTS,
     XML_DEPTH,
     ARRAYS_SIZE,

@@ -27,6 +27,7 @@ from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import NAME_COLUMNS, format_row, read_table
+from loopcal.io.core.limits import PATTERN_SECONDS
 from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.read_back import require_same
@@ -40,6 +41,7 @@ from loopcal.io.exports.export_lines import (
     find_unusual_lines,
     read_lines,
 )
+from loopcal.io.exports.patterns import Pattern, PatternClock
 from loopcal.io.exports.profile import ColumnSource, Place, Profile, strip_target
 from loopcal.plain_text import quote
 
@@ -192,20 +194,29 @@ class Conversion:
         return len(self.table) - 1
 
 
-def convert_export(path: str | Path, profile: Profile) -> Conversion:
+def convert_export(
+    path: str | Path, profile: Profile, pattern_seconds: float = PATTERN_SECONDS.most
+) -> Conversion:
     """Convert an export by means of a profile.
+
+    Parameters
+    ----------
+    path : the export. pattern_seconds : limit of the time of the profile's patterns.
 
     Raises
     ------
-    FileError : unreadable, without the header that the profile needs, or no line fits.
+    FileError
+        Unreadable, without the header that the profile needs, no line fits, or the patterns of the
+        profile take too long.
     """
     path = as_path(path, "export")
-    lines, skipped = read_lines(path, profile)
+    clock = PatternClock(profile.file, pattern_seconds)
+    lines, skipped = read_lines(path, profile, clock)
     fitting, misfits = [], []
     for line in lines:
         try:
             check_count(line, profile.delimiter)
-            fitting.append((line, _parse_row(line, profile)))
+            fitting.append((line, _parse_row(line, profile, clock)))
         except Misfit as error:
             misfits.append((line.number, str(error)))
     rows, others, findings = _join_rows(fitting, profile)
@@ -242,7 +253,7 @@ def save_conversion(conversion: Conversion, path: str | Path) -> None:
     write_text(path, conversion.text, check)
 
 
-def _parse_row(line: Line, profile: Profile) -> Row:
+def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:
     """Return column -> cell of one line, with `target` where the name states it; raise Misfit."""
     row: Row = {}
     for name, source in profile.columns.items():
@@ -253,7 +264,7 @@ def _parse_row(line: Line, profile: Profile) -> Row:
             continue
         text = " ".join("" if cell in profile.missing else cell for cell in cells).strip()
         if source.pattern is not None:
-            row |= _match_name(text, source.pattern)
+            row |= _match_name(text, source.pattern, clock)
         else:
             row[name] = make_name(text) if name.startswith(NOTE) else text
             row[name] = _parse_time(text, source) if name == TIME else row[name]
@@ -310,13 +321,12 @@ def _scale_sigma(text: str, source: ColumnSource, name: str) -> str:
     return text if source.factor == 1.0 else f"{scaled.normalize():.17g}"
 
 
-def _match_name(name: str, pattern: re.Pattern[str]) -> Row:
+def _match_name(name: str, pattern: Pattern, clock: PatternClock) -> Row:
     """Return the pose, and the target, in a name."""
-    match = pattern.fullmatch(name)
-    if match is None:
+    groups = clock.match_all(pattern, name, ("columns", "pose", "match"))
+    if groups is None:
         raise Misfit(f"the name {quote(name)} does not match {pattern.pattern}")
-    groups = match.groupdict().items()
-    return {key: (value or "").strip() for key, value in groups if key in {"pose", "target"}}
+    return {key: (groups[key] or "").strip() for key in ("pose", "target") if key in groups}
 
 
 def _parse_time(text: str, source: ColumnSource) -> str:

@@ -16,8 +16,9 @@ from typing import NoReturn
 
 from loopcal.errors import FileError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.io.core.limits import TABLE_SIZE
+from loopcal.io.core.limits import LINE_LENGTH, TABLE_ROWS, TABLE_SIZE
 from loopcal.io.core.text_file import read_bytes
+from loopcal.io.exports.patterns import PatternClock
 from loopcal.io.exports.profile import Profile, normalize_name
 from loopcal.plain_text import quote
 
@@ -43,7 +44,7 @@ class Line:
     header: Header | None
 
 
-def read_lines(path: Path, profile: Profile) -> tuple[list[Line], int]:
+def read_lines(path: Path, profile: Profile, clock: PatternClock) -> tuple[list[Line], int]:
     """Return the lines of an export that may be rows, and the number of lines without data.
 
     Headers and lines that the profile skips have no data.
@@ -58,9 +59,12 @@ def read_lines(path: Path, profile: Profile) -> tuple[list[Line], int]:
     lines: list[Line] = []
     header, nearest, skipped = None, None, 0
     text = _decode(path, profile).replace("\r\n", "\n").replace("\r", "\n")
+    TABLE_ROWS.check(text.count("\n"), "export", path)
     for number, line in enumerate(text.split("\n"), 1):
+        LINE_LENGTH.check(len(line), "export", path, number)
         is_comment = record.comment is not None and line.lstrip().startswith(record.comment)
-        is_ignored = profile.ignored is not None and profile.ignored.search(line)
+        ignored = profile.ignored
+        is_ignored = ignored is not None and clock.search(ignored, line, ("ignore",))
         if number <= record.skip or not line.strip() or is_comment or is_ignored:
             skipped += bool(line.strip())
             continue

@@ -14,7 +14,6 @@ names of the poses. `profile_reader` reads and checks profiles.
 from __future__ import annotations
 
 import codecs
-import re
 import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from loopcal.io.core.numbers import format_scaled, parse_finite
 from loopcal.io.core.yaml_file import YamlFile
 from loopcal.io.data.columns import MEASURED
+from loopcal.io.exports.patterns import Pattern, compile_pattern
 from loopcal.units import find_unit, parse_quantity
 
 if TYPE_CHECKING:
@@ -89,9 +89,9 @@ class ColumnSource:
         return format_scaled(parse_quantity(str(self.floor), unit.dimension), unit.factor_to_si)
 
     @cached_property
-    def pattern(self) -> re.Pattern[str] | None:
+    def pattern(self) -> Pattern | None:
         """The compiled `match`."""
-        return None if self.match is None else re.compile(self.match)
+        return None if self.match is None else compile_pattern(self.match)
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,9 @@ class Profile:
         return "utf-8-sig" if name == "utf-8" else name
 
     @cached_property
-    def ignored(self) -> re.Pattern[str] | None:
+    def ignored(self) -> Pattern | None:
         """The compiled `ignore`."""
-        return None if self.record.ignore is None else re.compile(self.record.ignore)
+        return None if self.record.ignore is None else compile_pattern(self.record.ignore)
 
     @cached_property
     def columns(self) -> Mapping[str, ColumnSource]:

@@ -27,6 +27,7 @@ from loopcal.io.data.columns import (
 )
 from loopcal.io.data.kind_rows import POSE_SETTINGS, SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind
+from loopcal.io.exports.patterns import refuse_pattern
 from loopcal.io.exports.profile import (
     DECIMALS,
     DELIMITERS,
@@ -82,7 +83,7 @@ def read_profile(path: str | Path) -> Profile:
     if record.comment == "":
         raise file.error("'comment' is empty; write the start of a comment line", ("comment",))
     if record.ignore is not None:
-        _check_pattern(file, record.ignore, ("ignore",))
+        refuse_pattern(file, record.ignore, ("ignore",))
     _check_encoding(file, record.encoding)
     profile = Profile(file, record, kind)
     _check_matrix(profile)
@@ -195,7 +196,7 @@ def _check_source(
             sentence = f"{key!r} belongs to {owner!r}, not to {name!r}; remove it"
             raise file.error(sentence, (*place, key))
     if source.match is not None:
-        _check_pattern(file, source.match, (*place, "match"))
+        refuse_pattern(file, source.match, (*place, "match"))
         if source.pattern is None or "pose" not in source.pattern.groupindex:
             sentence = "this pattern finds no pose; put its part of the name in (?P<pose>..)"
             raise file.error(sentence, (*place, "match"))
@@ -278,15 +279,6 @@ def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -
     if not places:
         sentence = "no column is named; write a name in the export's header or a place from 1"
         raise file.error(sentence, location)
-
-
-def _check_pattern(file: YamlFile, text: str, place: Location) -> None:
-    """Raise FileError for text that is not a regular expression."""
-    try:
-        re.compile(text)
-    except re.error as error:
-        sentence = f"{text!r} is not a regular expression ({error}); correct it"
-        raise file.error(sentence, place) from None
 
 
 def _check_encoding(file: YamlFile, name: str) -> None:

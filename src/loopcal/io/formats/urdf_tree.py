@@ -23,6 +23,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import FileError, MechanismError
+from loopcal.io.core.limits import XML_DEPTH, XML_ELEMENTS, XML_JOINTS
 from loopcal.io.core.names import find_fault
 from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
@@ -30,6 +31,7 @@ from loopcal.io.formats.program_format import parse_number
 from loopcal.mechanism.joint_graph import GraphJoint, JointGraph, find_home
 from loopcal.typing import FloatArray
 
+WHAT = "URDF file"
 KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
 
 
@@ -130,6 +132,7 @@ class _Parser:
         self.links: list[str] = []
         self.joints: dict[str, UrdfJoint] = {}
         self._stack: list[str] = []
+        self._count = 0
         self._joint: _OpenJoint | None = None
         self._expat = expat.ParserCreate()
         self._expat.StartElementHandler = self._start
@@ -146,7 +149,12 @@ class _Parser:
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._stack.append(name)
+        self._count += 1
         line = self._expat.CurrentLineNumber
+        if self._count > XML_ELEMENTS.count:
+            raise XML_ELEMENTS.make_error(WHAT, self.path, line=line)
+        if len(self._stack) > XML_DEPTH.count:
+            raise XML_DEPTH.make_error(WHAT, self.path, line=line)
         if len(self._stack) < 3 and (fault := find_fault(attributes.get("name", ""))) is not None:
             raise FileError(fault, self.path, line)
         if self._stack == ["robot", "link"]:
@@ -165,6 +173,7 @@ class _Parser:
             if joint.name in self.joints:
                 sentence = f"duplicate joint {joint.name!r}; rename one"
                 raise FileError(sentence, self.path, joint.line)
+            XML_JOINTS.check(len(self.joints) + 1, WHAT, self.path, joint.line)
             self.joints[joint.name] = _build_joint(joint, self.raw, self.path)
         self._stack.pop()
 
@@ -175,7 +184,7 @@ class _Parser:
 
 def read(path: Path) -> Urdf:
     """Read a URDF; FileError where it is not one."""
-    return parse(read_text(path, "URDF file"), path)
+    return parse(read_text(path, WHAT), path)
 
 
 def parse(text: str, path: Path) -> Urdf:
@@ -229,9 +238,10 @@ def _parse_three(text: str, what: str, path: Path, line: int) -> FloatArray:
 def _build_tree(text: str, path: Path, links: list[str], joints: dict[str, UrdfJoint]) -> Urdf:
     """Return the tree of links and joints; FileError where they are not one tree."""
     carrier: dict[str, UrdfJoint] = {}
+    known = set(links)
     for joint in joints.values():
         for link in (joint.parent, joint.child):
-            if link not in links:
+            if link not in known:
                 sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
                 raise FileError(f"{sentence}; correct it", path, joint.line)
         if joint.child in carrier:
@@ -243,7 +253,26 @@ def _build_tree(text: str, path: Path, links: list[str], joints: dict[str, UrdfJ
     if len(roots) != 1:
         sentence = f"this URDF has {len(roots)} root links ({', '.join(roots[:4])}), but one is"
         raise FileError(f"{sentence} needed; join them", path)
+    _refuse_cycles(path, links, roots[0], carrier)
     return Urdf(path, text, joints, roots[0], carrier)
+
+
+def _refuse_cycles(
+    path: Path, links: list[str], root: str, carrier: Mapping[str, UrdfJoint]
+) -> None:
+    """Raise FileError for a link that is not carried by the root, but by itself."""
+    carried = {root}
+    for start in links:
+        chain: dict[str, None] = {}
+        link = start
+        while link not in carried and link not in chain:
+            chain[link] = None
+            link = carrier[link].parent
+        if link in chain:
+            joint = carrier[link]
+            sentence = f"joint {joint.name!r} closes a circle of links: {joint.child!r} is carried"
+            raise FileError(f"{sentence} by itself; correct its parent", path, joint.line)
+        carried |= chain.keys()
 
 
 PARALLEL = 1e-9
