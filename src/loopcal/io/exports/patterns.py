@@ -20,6 +20,7 @@ import regex
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import PATTERN_COUNTS, PATTERN_LENGTH, PATTERN_SECONDS
 from loopcal.io.core.yaml_file import Location, YamlFile
+from loopcal.plain_text import quote
 
 SECONDS_PER_LINE = 1e-4
 """Time that each line of an export adds to the limit [s]."""
@@ -76,7 +77,7 @@ def refuse_pattern(file: YamlFile, text: str, location: Location) -> None:
         re.compile(text)
         compile_pattern(text)
     except (re.error, regex.error) as error:
-        sentence = f"{text!r} is not a regular expression ({error}); correct it"
+        sentence = f"{_name_pattern(text)} is not a regular expression ({error}); correct it"
         raise file.error(sentence, location) from None
     except (RecursionError, OverflowError):
         sentence = f"the pattern {_name_pattern(text)} is too deeply nested; simplify it"
@@ -85,7 +86,7 @@ def refuse_pattern(file: YamlFile, text: str, location: Location) -> None:
 
 def _name_pattern(text: str) -> str:
     """Return a pattern in quotes, shortened for messages."""
-    return repr(text if len(text) <= 40 else f"{text[:40]}..")
+    return quote(text if len(text) <= 40 else f"{text[:40]}..")
 
 
 def _multiply_counts(text: str) -> int:
