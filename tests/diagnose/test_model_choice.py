@@ -11,9 +11,10 @@ import pytest
 from loopcal.diagnose import choose_model, cross_validate, nest_parameter_sets
 from loopcal.diagnose.cross_validation import draw_folds
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import FitOptions, LeastSquares, identify
+from loopcal.estimate import FitOptions, LeastSquares, StepControl, identify
 from loopcal.io import load_robot
 from loopcal.measure import simulate
+from loopcal.workflow import CalibrationOptions, calibrate
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, tracker
 
@@ -108,3 +109,35 @@ def test_nuisance_parameters_of_all_rows_are_refused_in_folds():
     options = FitOptions(nuisance=data.nuisance_parameters)
     with pytest.raises(EstimationError, match="does not support the option nuisance"):
         cross_validate(hexapod(), data, options=options)
+
+
+def test_first_fit_that_does_not_converge_ends_a_comparison():
+    options = FitOptions(method=LeastSquares(), control=StepControl(iterations=1))
+    folds = []
+    with pytest.raises(EstimationError, match="without fold 1 of 5 did not converge") as refusal:
+        cross_validate(
+            hexapod(),
+            hexapod_data(30),
+            options=options,
+            must_converge=True,
+            progress=lambda done, *_: folds.append(done),
+        )
+    assert refusal.value.code == "model.fold-not-converged"
+    assert folds == [0]
+    choice = choose_model(hexapod(), hexapod_data(30), options=options)
+    assert choice.finding.data["not_compared"] == ("lengths", "ideal")
+    assert "Not compared: lengths and ideal. Without a fold" in str(choice.finding)
+
+
+def test_parameters_are_not_chosen_by_rows_that_are_far_off():
+    data = hexapod_data(30)
+    wrong = replace(data, observations=(_shift_row(data.observations[0], 4, 1000.0),))
+    with pytest.raises(DataError, match=r"Pose 5 is far off the others and alone would decide"):
+        calibrate(hexapod(), wrong, CalibrationOptions(choose_model=True))
+
+
+def _shift_row(rows, row: int, length: float):
+    """Return rows with one position that is wrong by a length [m]."""
+    measured = rows.measured.copy()
+    measured[row, 3:] += length
+    return replace(rows, measured=measured)

@@ -81,9 +81,8 @@ def test_aliases_count_as_what_they_stand_for(tmp_path) -> None:
 
 def test_alias_within_its_own_value_is_refused(tmp_path) -> None:
     for text in ("a: &a [*a]\n", "a: &a {b: {c: *a}}\n", "a: &a {<<: *a}\n"):
-        text = f"format: 1\n{text}"
         with pytest.raises(FileError, match=r"alias 'a' stands for a value that contains"):
-            read_yaml(write(tmp_path, text), "robot file")
+            read_yaml(write(tmp_path, f"format: 1\n{text}"), "robot file")
 
 
 def test_reused_anchor_counts_its_latest_value(tmp_path) -> None:

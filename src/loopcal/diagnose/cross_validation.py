@@ -28,6 +28,7 @@ from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adap
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.problem_construction import problem_of
+from loopcal.findings import report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import decompose
@@ -134,6 +135,7 @@ def cross_validate(
     options: FitOptions | None = None,
     count: int = 5,
     seed: int = 1,
+    must_converge: bool = False,
     progress: Progress = report_no_progress,
 ) -> CrossValidation:
     """Fit `count` times without one fold, and predict the held-out fold.
@@ -143,11 +145,14 @@ def cross_validate(
     robot, data, method, options : as for `identify`. A robot without free parameters is only used
         to predict. Excluded poses are neither fitted nor predicted.
     count : number of folds. seed : of their choice. progress : receives the folds that are done.
+    must_converge : whether the first fit that does not converge ends the comparison. A fit that
+        will never converge takes all iterations, and so do those without the other folds.
 
     Raises
     ------
     DataError, EstimationError
-        As `draw_folds` and `identify`; or the options have nuisance parameters, which belong to all
+        As `draw_folds` and `identify`; a fit does not converge (code `model.fold-not-converged`,
+        with `must_converge`); or the options have nuisance parameters, which belong to all
         rows together.
     """
     check_types(robot, data)
@@ -168,6 +173,9 @@ def cross_validate(
         if robot.parameters.free.any():
             remaining = data.take(np.setdiff1d(np.arange(data.n_poses), places))
             fit = identify(robot, remaining, options=options)
+            if must_converge and not fit.converged:
+                finding = report_finding("model.fold-not-converged", fold=done + 1, count=count)
+                raise EstimationError(finding)
             fitted, converged = fit.robot, converged and fit.converged
         if held_out.n_rows:  # readings alone, of redundant actuators, have a score but no errors
             comparison = compare_predictions(robot, fitted, held_out)

@@ -44,8 +44,10 @@ NOTHING = "nothing"
 CONTROLLER = "controller"
 """Name of the set that the controller of the machine stores."""
 
-FEW = "fit.too-few-equations"
-"""Code of the refusal to fit a set of which the data have too few equations."""
+NOT_COMPARED = ("fit.too-few-equations", "model.fold-not-converged")
+"""Codes of the reasons why a set is not compared: the data have too few equations for it, or its
+fit without a fold does not converge.
+"""
 
 
 class Conditioning(NamedTuple):
@@ -64,7 +66,8 @@ class Candidate:
     Attributes
     ----------
     name : of the set. parameters : their names.
-    validation : cross-validation; None where too few equations remain without a fold.
+    validation : cross-validation; None where without a fold too few equations remain, or the fit
+        does not converge.
     conditioning : by all data, at the values before calibration.
     """
 
@@ -209,7 +212,8 @@ def choose_model(
     Raises
     ------
     EstimationError
-        The stated sets are not nested. Sets with too few equations are listed, but not compared.
+        The stated sets are not nested. Sets with too few equations, and those that do not converge,
+        are listed, but not compared.
     """
     check_types(robot, data)
     if nested is not None:
@@ -225,10 +229,16 @@ def choose_model(
         only = free_only(robot, names)
         try:
             return cross_validate(
-                only, data, options=options, count=count, seed=seed, progress=count_fits
+                only,
+                data,
+                options=options,
+                count=count,
+                seed=seed,
+                must_converge=True,
+                progress=count_fits,
             )
         except EstimationError as error:
-            if error.code != FEW:
+            if error.code not in NOT_COMPARED:
                 raise
             return None
 

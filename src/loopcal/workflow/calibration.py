@@ -110,6 +110,7 @@ def calibrate(
         allow_still=options.allow_still,
         allow_implausible=not options.check_conventions,
     )
+    _refuse_far_rows(conventions, options)
     redundant = robot.program.sigma is not None  # then readings are measurements, too
     if not split.fitted.n_rows and not redundant:
         raise DataError(report_finding("data.no-measured-value"))
@@ -120,6 +121,17 @@ def calibrate(
     count.begin("testing the residuals for patterns and slow errors")
     result = replace(result, fit=adjust_uncertainty(result.fit, split.fitted))
     return _report(result, split, conventions, options, count)
+
+
+def _refuse_far_rows(conventions: ConventionCheck, options: CalibrationOptions) -> None:
+    """Refuse to choose parameters by held-out poses of which a few are far off all others.
+
+    Every fold without them would be fitted well and predict them badly, and every fit with them
+    takes all of its iterations.
+    """
+    found = conventions.finding
+    if options.choose_model and found is not None and found.code == "conventions.rows-far-off":
+        raise DataError(report_finding("model.rows-far-off", poses=found.data["poses"]))
 
 
 @dataclass(frozen=True, eq=False)

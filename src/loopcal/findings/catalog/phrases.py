@@ -219,8 +219,8 @@ def sets_not_compared(data: Data) -> str:
     if not data["not_compared"]:
         return ""
     return fill_template(
-        " Without a fold of the poses too few equations remain to compare {not_compared:list}; "
-        "measure more poses.",
+        " Not compared: {not_compared:list}. Without a fold of the poses too few equations remain, "
+        "or the fit does not converge; measure more poses and check their rows.",
         **data,
     )
 

@@ -130,7 +130,7 @@ LINE_LENGTH = FileLimit(
 )
 PROGRAM_SIZE = FileLimit(
     "size of a file of another program",
-    10,
+    5,
     "MB",
     "files that `loopcal import` and `loopcal export` read",
     "check that this is the file that was meant, or remove what does not belong there",
