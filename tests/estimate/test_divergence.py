@@ -10,6 +10,7 @@ from loopcal.diagnose import StartVerdict, check_start_values
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.inference.prior import prior_from
 from loopcal.estimate.minimization.descent import StepControl
+from loopcal.mechanism import batch_kinematics
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, get_finding, list_codes
 
@@ -61,3 +62,23 @@ def test_estimate_far_outside_its_tolerance_is_reported():
         identify(robot, data, LeastSquares()).findings + identify(wrong, data, MAP()).findings
     )
     assert "fit.beyond-tolerance" not in list_codes(findings)
+
+
+def test_hopeless_fit_follows_no_paths_to_poses_that_its_steps_do_not_reach(monkeypatch):
+    """Such a step is shortened. Paths from its own readings took most of the time of these fits."""
+    followed = []
+    follow = batch_kinematics._follow_path
+
+    def count(robot, e, joints, begin, state, wrong):
+        followed.append(int(wrong.sum()))
+        return follow(robot, e, joints, begin, state, wrong)
+
+    data = hexapod_data(12)
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    measured[4, 3:] += 1000.0  # [m]
+    wrong = replace(data, observations=(replace(rows, measured=measured),))
+    monkeypatch.setattr(batch_kinematics, "_follow_path", count)
+    fit = identify(hexapod(), wrong, LeastSquares())
+    assert not fit.converged
+    assert followed == []

@@ -138,7 +138,8 @@ class ExactPoses:
     def solve_single_block(self, z: FloatArray, trials: IntArray, start: Start) -> PoseSolution:
         """Solve and linearize the poses of the only block at deviations z (a | 1, p)."""
         first = start.take(np.arange(len(z))) if len(z) < len(start) else start
-        linearized, state = self._linearize(self.blocks[0], z, trials, first.predict_states(z))
+        begin, is_near = first.predict_states(z), first.motion is not None
+        linearized, state = self._linearize(self.blocks[0], z, trials, begin, not is_near)
         return PoseSolution(None, linearized, PoseStates(state, np.zeros(0)))
 
     def iterate_rows(
@@ -221,16 +222,26 @@ class ExactPoses:
         return solve_for_nuisance(nuisance, values, fold_at, control)
 
     def _linearize(
-        self, block: PoseBlock, z: FloatArray, trials: IntArray, begin: engine.State | None
+        self,
+        block: PoseBlock,
+        z: FloatArray,
+        trials: IntArray,
+        begin: engine.State | None = None,
+        follow: bool = True,
     ) -> tuple[LinearizedPoses, engine.State]:
-        """Solve and linearize the poses of a block."""
+        """Solve and linearize the poses of a block.
+
+        Without `follow`, a pose that Newton's method does not reach from `begin` counts as not
+        reached. States that a step of the fit predicts have nearly the same readings, and no path
+        to follow: where a step is too long for Newton's method, a shorter one is tried.
+        """
         values = self.free.values(z)
         if self.located is not None:
             T = self.located if len(self.located) == 1 else self.located[trials]
             T = np.broadcast_to(T, (len(trials), *T.shape[1:]))[:, block.poses]
             poses = linearize_closure(self.free, values, block.readings, T)
             return poses, self.free.robot.home_state
-        state = forward_trials(self.free.robot, values, block.readings, begin)
+        state = forward_trials(self.free.robot, values, block.readings, begin, follow)
         poses = linearize_poses(self.free, values, block.readings, state, self.names)
         return poses, state
 
