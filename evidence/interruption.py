@@ -18,6 +18,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -171,12 +172,17 @@ class _Server:
             return None
         if not self.is_copy and not self.outcomes and frame.f_code.co_name in FIRST:
             sys.settrace(None)
-            self._serve()
+            try:
+                self._serve()
+            except Exception:  # noqa: BLE001 it must not reach the command
+                traceback.print_exc()
+                sys.stderr.flush()
+                os._exit(1)
             sys.settrace(self._trace)
         if event == "line" and self.is_copy:
             self.lines += 1
             if self.lines == self.fault.moment and not self.fault.is_slow:
-                _strike(os.getpid(), self.fault.how)
+                strike(os.getpid(), self.fault.how)
         return self._trace
 
     def _serve(self) -> None:
@@ -231,7 +237,7 @@ class _Server:
             return
         if fault.how and fault.is_slow:
             time.sleep(fault.moment)
-            _strike(copied, fault.how)
+            strike(copied, fault.how)
         os.waitpid(copied, 0)
 
     def _judge(self, fault: Fault, old: State, new: State) -> str:
@@ -301,7 +307,7 @@ def _at_exit_write(server: _Server) -> None:
     os._exit = note
 
 
-def _strike(process: int, how: str) -> None:
+def strike(process: int, how: str) -> None:
     """Kill or interrupt a process."""
     if how == INTERRUPT and process == os.getpid():
         signal.raise_signal(signal.SIGINT)

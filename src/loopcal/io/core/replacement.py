@@ -18,6 +18,7 @@ import os
 import re
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
@@ -32,6 +33,9 @@ except ImportError:  # Windows: no locks, so leftovers are never removed
 
 NEW, OLD = "new", "old"
 """States of a leftover: written beside its target, and set aside for its successor."""
+
+PATIENCE = 10.0
+"""Seconds to wait until another command has written the same folder."""
 
 _LEFTOVER = re.compile(r"\.loopcal-(new|old)-[0-9a-f]{16}-(.+)", re.DOTALL)
 _NAME_BYTES = 200
@@ -64,8 +68,10 @@ def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
         else:
             flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
             descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
-        if descriptor is None:
+        if descriptor is None and path.is_dir():
             return path, None
+        if descriptor is None:
+            continue
         if lock(descriptor) is not False and _is_open(path, descriptor):
             return path, descriptor
         os.close(descriptor)
@@ -91,21 +97,45 @@ def place_folder(
     sync_tree(temporary)
     note_output(path, target, temporary)
     while not _take_free_name(temporary, target):
-        if check is not None:
-            check(target)
-        with _hold(target):
-            try:
-                _exchange(temporary, target)
-            except FileNotFoundError:  # another program has removed the old folder
-                if temporary.is_dir():
-                    continue
-                raise
+        with _lock_folder(target) as is_locked:
+            if not is_locked:  # another program has replaced or removed the old folder
+                continue
+            if check is not None:
+                check(target)
+            _exchange(temporary, target)
             if check is not None:
                 _check_replaced(temporary, target, check)
             sync_folder(target.parent)
             _remove(temporary)
             return
     sync_folder(target.parent)
+
+
+@contextmanager
+def _lock_folder(path: Path) -> Iterator[bool]:
+    """Lock a folder that is to be replaced, so that no other command replaces it meanwhile.
+
+    Yields
+    ------
+    Whether the folder of this name is locked; if not, the name belongs to another folder now.
+
+    Raises
+    ------
+    OSError : another command has the lock for `PATIENCE` seconds.
+    """
+    descriptor = _open_folder(path)
+    if descriptor is None:
+        yield path.is_dir()  # without a lock, such as on Windows
+        return
+    try:
+        end = time.monotonic() + PATIENCE
+        while lock(descriptor) is False:
+            if time.monotonic() > end:
+                raise OSError(errno.EBUSY, "another command writes this folder", str(path))
+            time.sleep(0.01)
+        yield _is_open(path, descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _take_free_name(temporary: Path, target: Path) -> bool:

@@ -23,6 +23,7 @@ from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import replace_folder, resolve_folder
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
+from loopcal.output_record import identify
 
 FILES = "files"
 """Key of the list of files in the document."""
@@ -106,6 +107,21 @@ def _refuse_place(path: Path, target: Path) -> None:
 
 def refuse_other_content(path: Path, kind: FolderKind) -> None:
     """Raise FileError where a folder is not an unchanged result of this kind, and nothing else."""
+    target = path.resolve()
+    while True:
+        identity = identify(target)
+        try:
+            _check_content(path, kind)
+        except (FileError, OSError):
+            if identify(target) == identity:
+                raise
+        else:
+            return
+        # another command has replaced the folder meanwhile
+
+
+def _check_content(path: Path, kind: FolderKind) -> None:
+    """Raise FileError as `refuse_other_content`."""
     document = _read_document(path / kind.document)
     if document is None or any(key not in document for key in kind.keys):
         raise FileError(report_finding("files.folder-of-others", content=kind.content), path)
