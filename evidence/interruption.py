@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: one experiment, which reads from top to bottom
 """Every command that writes, killed and interrupted while it writes.
 
 A command runs in a process of its own up to the moment before it creates its first temporary file.
@@ -28,9 +29,9 @@ from types import FrameType
 from typing import Any
 
 from loopcal.cli import main
-from loopcal.io.core import outputs, replacement, result_folder, text_file
+from loopcal.io.core import descriptors, outputs, replacement, result_folder, text_file
 
-MODULES = (outputs, replacement, result_folder, text_file, shutil)
+MODULES = (descriptors, outputs, replacement, result_folder, text_file, shutil)
 TRACED = frozenset(str(module.__file__) for module in MODULES)
 FIRST = ("write_result_folder", "restore_files", "replace_file")
 """The functions that write; the first one that is called begins to write."""
@@ -38,6 +39,9 @@ FIRST = ("write_result_folder", "restore_files", "replace_file")
 LEFTOVER = re.compile(r"\.loopcal-(new|old)-[0-9a-f]{16}-.+")
 DELAY = 0.004
 """Before and after each file operation of a slow copy [s]."""
+
+MEMORY = Path("/dev/shm")
+"""A disk in memory, where hundreds of synchronized writes take no time."""
 
 KILL, INTERRUPT = "kill -9", "Ctrl-C"
 PRINTER = """[printer]
@@ -120,7 +124,7 @@ def examine(case: Case, inputs: Path, moments: int, slow: int) -> dict[str, Any]
     ----------
     inputs : folder of `prepare_inputs`. moments, slow : number of moments, and of times.
     """
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as place:
         folder, base, result = (Path(place).resolve() / name for name in ("work", "base", "result"))
         shutil.copytree(inputs, base)
         for output in case.outputs if case.old.endswith("\n") else ():

@@ -24,12 +24,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
-from loopcal.output_record import identify, note_output
-
-try:
-    import fcntl
-except ImportError:  # Windows: no locks, so leftovers are never removed
-    fcntl = None
+from loopcal.io.core.descriptors import is_open, lock, open_folder, sync_folder, sync_tree
+from loopcal.output_record import note_output
 
 NEW, OLD = "new", "old"
 """States of a leftover: written beside its target, and set aside for its successor."""
@@ -64,7 +60,7 @@ def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
         path = _name_beside(target, NEW)
         if is_folder:
             path.mkdir()
-            descriptor = _open_folder(path)
+            descriptor = open_folder(path)
         else:
             flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
             descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
@@ -72,7 +68,7 @@ def _create_locked(target: Path, is_folder: bool) -> tuple[Path, int | None]:
             return path, None
         if descriptor is None:
             continue
-        if lock(descriptor) is not False and _is_open(path, descriptor):
+        if lock(descriptor) is not False and is_open(path, descriptor):
             return path, descriptor
         os.close(descriptor)
 
@@ -123,7 +119,7 @@ def _lock_folder(path: Path) -> Iterator[bool]:
     ------
     OSError : another command has the lock for `PATIENCE` seconds.
     """
-    descriptor = _open_folder(path)
+    descriptor = open_folder(path)
     if descriptor is None:
         yield path.is_dir()  # without a lock, such as on Windows
         return
@@ -133,7 +129,7 @@ def _lock_folder(path: Path) -> Iterator[bool]:
             if time.monotonic() > end:
                 raise OSError(errno.EBUSY, "another command writes this folder", str(path))
             time.sleep(0.01)
-        yield _is_open(path, descriptor)
+        yield is_open(path, descriptor)
     finally:
         os.close(descriptor)
 
@@ -256,35 +252,6 @@ def _find_renameat2() -> Callable[[int, bytes, int, bytes, int], int] | None:
     return function
 
 
-def sync_tree(folder: Path) -> None:
-    """Write all files of a folder, and their names, to the disk."""
-    for place, _, names in os.walk(folder):
-        for name in names:
-            sync_file(Path(place, name))
-        sync_folder(Path(place))
-
-
-def sync_file(path: Path) -> None:
-    """Write the content of a file to the disk."""
-    descriptor = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def sync_folder(path: Path) -> None:
-    """Write the names in a folder to the disk, where the file system can."""
-    descriptor = _open_folder(path)
-    if descriptor is None:
-        return
-    try:
-        with suppress(OSError):  # the names are in place, even if not yet on the disk
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def list_leftovers(target: Path, state: str | None = None) -> list[Path]:
     """Return what killed writers have left of `target`, oldest first.
 
@@ -328,39 +295,9 @@ def _lock_leftover(path: Path) -> Iterator[bool]:
         yield False
         return
     try:
-        yield lock(descriptor) is True and _is_open(path, descriptor)
+        yield lock(descriptor) is True and is_open(path, descriptor)
     finally:
         os.close(descriptor)
-
-
-def _is_open(path: Path, descriptor: int) -> bool:
-    """Return whether a path still names the file or folder that a descriptor belongs to."""
-    status = os.fstat(descriptor)
-    return identify(path) == (status.st_dev, status.st_ino)
-
-
-def lock(descriptor: int) -> bool | None:
-    """Lock a file or folder until it is closed; return whether it is locked.
-
-    False where another process has the lock, None where locks are not supported.
-    """
-    if fcntl is None:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
-
-
-def _open_folder(path: Path) -> int | None:
-    """Return a descriptor of a folder; None where the system has none."""
-    try:
-        return os.open(path, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0))
-    except OSError:
-        return None
 
 
 def _remove(path: Path) -> None:

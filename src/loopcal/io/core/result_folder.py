@@ -18,12 +18,12 @@ from typing import Any
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
+from loopcal.io.core.descriptors import watch_folder
 from loopcal.io.core.json_text import read_json, to_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import replace_folder, resolve_folder
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
-from loopcal.output_record import identify
 
 FILES = "files"
 """Key of the list of files in the document."""
@@ -107,17 +107,13 @@ def _refuse_place(path: Path, target: Path) -> None:
 
 def refuse_other_content(path: Path, kind: FolderKind) -> None:
     """Raise FileError where a folder is not an unchanged result of this kind, and nothing else."""
-    target = path.resolve()
     while True:
-        identity = identify(target)
-        try:
-            _check_content(path, kind)
-        except (FileError, OSError):
-            if identify(target) == identity:
-                raise
-        else:
-            return
-        # another command has replaced the folder meanwhile
+        with watch_folder(path.resolve()) as is_same:
+            try:
+                return _check_content(path, kind)
+            except (FileError, OSError):
+                if is_same():
+                    raise  # otherwise another command has replaced the folder meanwhile
 
 
 def _check_content(path: Path, kind: FolderKind) -> None:

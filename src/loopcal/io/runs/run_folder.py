@@ -124,8 +124,7 @@ def write_run_folder(
     FileError : see `write_result_folder`.
     """
     path = as_path(path, "run folder")
-    stream = BytesIO()
-    np.savez(stream, allow_pickle=False, **arrays)
+    np.savez(stream := BytesIO(), allow_pickle=False, **arrays)
     files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
     write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force, read_back)
     return path
