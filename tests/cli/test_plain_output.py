@@ -3,6 +3,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 
@@ -75,6 +76,16 @@ def test_terminal_that_lacks_a_character_shows_its_escape(folder) -> None:
     done = subprocess.run(words, capture_output=True, check=False, env=latin)
     assert done.returncode == 0, done.stderr
     assert b"\\u2500" in done.stdout
+
+
+def test_command_to_copy_is_read_by_a_shell_as_it_is(folder, capsys) -> None:
+    assert main(["new", "five-bar", "-o", "$(reboot) a.yaml", "--measurements", "b;c.csv"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    following = [shlex.split(line) for line in lines if line.startswith("Next: ")]
+    assert following == [
+        ["Next:", "loopcal", "check", "$(reboot) a.yaml"],
+        ["Next:", "loopcal", "calibrate", "$(reboot) a.yaml", "b;c.csv", "-o", "run"],
+    ]
 
 
 def test_endless_message_is_cut(capsys) -> None:

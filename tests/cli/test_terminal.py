@@ -34,6 +34,8 @@ def test_hints_and_importance_use_codes_of_the_catalog():
 def test_hint_names_the_poses_of_its_finding():
     step = report_finding("workflow.next-check-outliers", poses=("pose 6", "pose 9"))
     assert hint_for(step) == "use --drop 6 --drop 9, or --loss huber"
+    step = report_finding("workflow.next-check-outliers", poses=("pose P1, left", "pose $(reboot)"))
+    assert hint_for(step) == "use --drop 'P1, left' --drop '$(reboot)', or --loss huber"
     assert hint_for(report_finding("workflow.next-use-result")) is None
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -303,7 +304,8 @@ def _view_import(
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")
     page += [f"note: {with_hint(finding, hint_for)}" for finding in noted]
-    following = f"Next: loopcal calibrate {document['robot']} {document['data'] or 'DATA'} -o run"
+    files = shlex.join((str(document["robot"]), str(document["data"] or "DATA")))
+    following = f"Next: loopcal calibrate {files} -o run"
     if correction is None:
         return [*page, following]
     page += [*view_fit(correction.report.identification), *correction.changes]

@@ -8,6 +8,8 @@ that names an option is only for commands that have the option.
 from __future__ import annotations
 
 import re
+import shlex
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import click
@@ -122,10 +124,15 @@ def hint_for(finding: Finding) -> str | None:
         return None
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
-        return f"use {' '.join(f'--drop {pose}' for pose in poses)}, or --loss huber"
+        return f"use {name_options('--drop', poses)}, or --loss huber"
     if finding.code == "validation.setup-moved":
-        return f"use {' '.join(f'--refit {name}' for name in finding.data['names'])}"
+        return f"use {name_options('--refit', finding.data['names'])}"
     return hint
+
+
+def name_options(option: str, values: Iterable[str]) -> str:
+    """Return an option with each of these values, to copy: a shell reads them as they are."""
+    return " ".join(f"{option} {shlex.quote(value)}" for value in values)
 
 
 def is_hint_useless(finding: Finding) -> bool:

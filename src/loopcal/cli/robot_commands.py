@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -58,12 +59,12 @@ def new(
         return
     page = [
         f"{output}: a complete robot. Replace its numbers with yours.",
-        f"Next: loopcal check {output}",
+        f"Next: loopcal check {shlex.quote(str(output))}",
     ]
     if measurements is not None:
         page += [
             f"{measurements}: columns without rows. Fill in your measurements.",
-            f"Next: loopcal calibrate {output} {measurements} -o run",
+            f"Next: loopcal calibrate {shlex.join(map(str, (output, measurements)))} -o run",
         ]
     terminal.print_page(page)
 
