@@ -31,6 +31,9 @@ from loopcal.cli.options import (
     verbose_option,
 )
 
+ALLOWED = ("allow_outside_stroke", "allow_duplicates")
+"""Options that accept doubtful measurements."""
+
 TAKEN_OPTIONS = (
     "limit_position",
     "limit_angle",
@@ -144,8 +147,7 @@ def calibrate(
         **{name: options[name] for name in TAKEN_OPTIONS},
     )
     refuse_run_folder(output, force, list(inputs.values()))
-    accepted = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
-    measurements = read_measurements(data, machine, **accepted)
+    measurements = read_measurements(data, machine, **{name: options[name] for name in ALLOWED})
     with terminal.ProgressBar() as progress:
         report = workflow.calibrate(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
@@ -155,8 +157,7 @@ def calibrate(
     if as_json:
         terminal.print_json(build_document(report, inputs, sys.argv))
     else:
-        names = f"result.json, arrays.npz, {name_robot_file(report, force)}"
-        written = f"Written to {output}: {names}"
+        written = f"Written to {output}: result.json, arrays.npz, {name_robot_file(report, force)}"
         terminal.print_page([*view_calibration(report, verbose, hint_for), "", written])
     terminal.print_failures(report.failures, shown=not as_json)
     return report.exit_code
