@@ -117,8 +117,8 @@ class NuisanceParameters:
         """
         if not is_sd(sd):
             raise DataError(
-                f"the standard deviation of {pattern!r} is {sd}; give a number above 0, "
-                f"{SD_RANGE}, or fix the parameter"
+                f"the standard deviation of {pattern!r} is {sd}; give a number above 0, or fix the "
+                f"parameter (allowed: {SD_RANGE})"
             )
         return self._changed(pattern, tolerance=sd)
 
