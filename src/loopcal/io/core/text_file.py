@@ -8,8 +8,9 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from loopcal.errors import ArgumentTypeError, FileError, LoopcalError
 from loopcal.findings import report_finding
@@ -82,7 +83,7 @@ def read_bytes(path: str | Path, what: str, limit: FileLimit = PROGRAM_SIZE) -> 
 
 
 @contextmanager
-def open_bytes(path: str | Path, what: str) -> Iterator[BinaryIO]:
+def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
     """Open an ordinary file to read it; raise FileError as `read_bytes` but for the size."""
     path = as_path(path, what)
     try:

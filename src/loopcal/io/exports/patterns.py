@@ -39,7 +39,9 @@ class PatternClock:
     """
 
     def __init__(self, file: YamlFile, seconds: float = PATTERN_SECONDS.most) -> None:
-        self.file, self.seconds, self.remaining = file, seconds, seconds
+        self.file: YamlFile = file
+        self.seconds: float = seconds
+        self.remaining: float = seconds
 
     def search(self, pattern: Pattern, text: str, location: Location) -> bool:
         """Return whether the pattern at `location` of the profile occurs; raise FileError."""
