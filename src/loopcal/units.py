@@ -166,6 +166,13 @@ def is_sd(value: Any) -> Any:
     return (value >= SMALLEST_SD) & (value <= LARGEST)
 
 
+def find_sd_fault(value: float) -> str | None:
+    """Return what to write in place of a standard deviation [SI]; None where it can be used."""
+    if is_sd(value):
+        return None
+    return "write a positive number" if not value > 0.0 else f"write a number {SD_RANGE}"
+
+
 def _is_number(text: str) -> bool:
     """Return whether Python reads `text` as a float."""
     try:

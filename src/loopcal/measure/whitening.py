@@ -52,7 +52,9 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
         ~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(is_sd(sd), axis=1),
         f"has a variance that is not above 0 (standard deviations {SD_RANGE})",
     )
-    correlation = C / (sd[:, :, None] * sd[:, None, :])
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        correlation = C / (sd[:, :, None] * sd[:, None, :])
+    _refuse(~np.all(np.isfinite(correlation), axis=(1, 2)), "is not positive definite")
     asymmetric = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > 1e-9
     _refuse(np.any(asymmetric, axis=(1, 2)), "is not symmetric")
     try:

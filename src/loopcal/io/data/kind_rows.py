@@ -32,7 +32,7 @@ from loopcal.io.data.shared_error_settings import SETTINGS as SHARED_ERRORS
 from loopcal.io.data.shared_error_settings import read_shared_errors
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import EXAMPLES
+from loopcal.units import EXAMPLES, SMALLEST_SD
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind, Observations
@@ -269,7 +269,8 @@ def _read_sigma(
     sigma = np.where(np.isnan(cells), entry.noise.get(column.name, np.nan), cells)
     if (positive := sigma[sigma > 0]).size:
         sigma = np.where(absent & np.isnan(sigma), positive[0], sigma)
-    for i in np.flatnonzero(~(sigma > 0)):
-        sentence = f"column {name!r} is not positive; write a standard deviation"
+    for i in np.flatnonzero(~(sigma >= SMALLEST_SD)):
+        size = "too small" if sigma[i] > 0.0 else "not positive"
+        sentence = f"column {name!r} is {size}; write a standard deviation"
         raise table.row_error(int(entry.rows[i]), sentence)
     return sigma

@@ -33,7 +33,7 @@ from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
 from loopcal.mechanism import PoseRecord
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, EXAMPLES, SI_SYMBOLS, Dimension
+from loopcal.units import DISPLAY_UNITS, EXAMPLES, SI_SYMBOLS, Dimension, find_sd_fault
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
@@ -47,9 +47,9 @@ NOISE_UNITS = {
 ASSUMED = "assumed"
 """Word for noise that a program assumed."""
 
-LENGTHS = Annotated[list[Any] | None, Dimension.LENGTH]
-LENGTH = Annotated[float | None, Dimension.LENGTH]
-NUMBERS = Annotated[list[Any] | None, Dimension.RATIO]
+LENGTHS = Annotated[list[Any], Dimension.LENGTH]
+LENGTH = Annotated[float, Dimension.LENGTH]
+NUMBERS = Annotated[list[Any], Dimension.RATIO]
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
@@ -77,6 +77,10 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     record = _make_record(kind)
     settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
     values = vars(read_record(file, settings, record, None, location))
+    for key, value in values.items():
+        if isinstance(value, list) and not _is_array(value):
+            sentence = f"{key!r} must be a list of numbers, or of lists of equal length; correct it"
+            raise file.error(sentence, (*location, key))
     given = {key: _to_setting(values[key], kind, key) for key in settings}
     try:
         return kind(**given)
@@ -113,9 +117,8 @@ def read_noise(
             refuse_unknown_keys(file, [name], list(dimensions), place)
         for column in matching:
             noise[column] = file.quantity(text, dimensions[column], (*place, name))
-            if not noise[column] > 0:
-                sentence = f"the noise of {name!r} is {text}; write a positive number"
-                raise file.error(sentence, (*place, name))
+            if fault := find_sd_fault(noise[column]):
+                raise file.error(f"the noise of {name!r} is {text}; {fault}", (*place, name))
     return noise
 
 
@@ -171,7 +174,7 @@ def format_quantity(value: float, dimension: Dimension) -> str:
 
 @cache
 def _make_record(kind: type[Kind]) -> type:
-    """Return a record of the settings of a kind (cached); all of them may be left out."""
+    """Return a record of the settings of a kind (cached); all may be left out."""
     types = {name: _setting_type(name, a) for name, a in list_kind_settings(kind).items()}
     fields = [(name, annotation, None) for name, annotation in types.items()]
     return dataclasses.make_dataclass(f"{kind.__name__}Settings", fields, frozen=True)
@@ -182,11 +185,19 @@ def _setting_type(name: str, annotation: Any) -> Any:
     text = str(annotation)
     if "ndarray" in text:
         if name.startswith("T_"):
-            return PoseRecord | None
+            return PoseRecord
         return NUMBERS if name in DIRECTIONS else LENGTHS
     if annotation is float:
         return LENGTH
-    return tuple[str, ...] | str | None if "tuple" in text else str | None
+    return tuple[str, ...] | str if "tuple" in text else str
+
+
+def _is_array(value: list[Any]) -> bool:
+    """Return whether a list holds numbers only, or lists of numbers of one length."""
+    if not any(isinstance(item, list) for item in value):
+        return all(isinstance(item, float | int) and not isinstance(item, bool) for item in value)
+    lengths = {len(item) if isinstance(item, list) else -1 for item in value}
+    return len(lengths) == 1 and all(_is_array(item) for item in value)
 
 
 def _to_setting(value: Any, kind: type[Kind], key: str) -> Any:

@@ -23,7 +23,7 @@ from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile
 from loopcal.io.core.yaml_text import format_flow_mapping
 from loopcal.io.data.kind_settings import format_quantity
-from loopcal.units import Angle, Dimension, Length, Ratio
+from loopcal.units import Angle, Dimension, Length, Ratio, find_sd_fault
 
 if TYPE_CHECKING:
     from loopcal.measure import Observations, StatedValue
@@ -142,8 +142,8 @@ def _read_one(
     stated = read_record(file, node, RECORDS[matching[0].dimension], None, place)
     if stated.fixed == ("sd" in node):
         raise file.error(f"state either 'sd' or '{FIXED}: true'; {EXAMPLE}", place)
-    if not stated.fixed and not (stated.sd or 0.0) > 0.0:
-        sentence = f"the standard deviation is {node['sd']}; write a positive number, or {FIXED}"
+    if not stated.fixed and (fault := find_sd_fault(stated.sd or 0.0)):
+        sentence = f"the standard deviation is {node['sd']}; {fault}, or {FIXED}"
         raise file.error(sentence, (*place, "sd"))
     sd = 0.0 if stated.fixed else stated.sd or 0.0
     return [StatedValue(entry.name, sd, stated.start) for entry in matching]

@@ -28,6 +28,7 @@ from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextCo
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
+from loopcal.units import SMALLEST_SD, find_sd_fault
 
 READING_NOISE = "reading_noise"
 RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
@@ -298,8 +299,9 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> 
         if name not in table.units:
             continue
         cells = known[name].parse(table)
-        for row in np.flatnonzero(cells < 0.0):
-            sentence = f"column {name!r} is negative; write a standard deviation, 0 where exact"
+        for row in np.flatnonzero((cells != 0.0) & (cells < SMALLEST_SD)):
+            size = "negative" if cells[row] < 0.0 else "too small"
+            sentence = f"column {name!r} is {size}; write a standard deviation, 0 where exact"
             raise table.row_error(int(row), sentence)
         sigma[:, i] = np.where(np.isnan(cells), sigma[:, i], cells)
         if actuator.sigma is None:
@@ -322,8 +324,8 @@ def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
     stated = {}
     for name, text in node.items():
         stated[name] = file.quantity(text, dimensions[name], places[name])
-        if not stated[name] >= 0.0:
-            sentence = f"the noise of readings is {text}; write a positive number, or 0 where exact"
+        if stated[name] != 0.0 and (fault := find_sd_fault(stated[name])):
+            sentence = f"the noise of readings is {text}; {fault}, or 0 where exact"
             raise file.error(sentence, places[name])
     return stated
 

@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, cast
 
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
-from loopcal.units import EXAMPLES
+from loopcal.units import EXAMPLES, find_sd_fault
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
@@ -68,7 +68,7 @@ def read_shared_errors(
                 if text == UNKNOWN:
                     continue
                 priors[parameter] = file.quantity(text, dimension, (*place, pattern))
-                if not priors[parameter] > 0.0:
-                    sentence = f"the standard deviation is {text}; write a positive number"
-                    raise file.error(f"{sentence}, or {UNKNOWN}", (*place, pattern))
+                if fault := find_sd_fault(priors[parameter]):
+                    sentence = f"the standard deviation is {text}; {fault}, or {UNKNOWN}"
+                    raise file.error(sentence, (*place, pattern))
     return kind, priors

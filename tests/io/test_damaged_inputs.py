@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mistyped values in robot files and settings are refused with their line, whatever they are."""
+
+import copy
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.errors import DataError, FileError, LoopcalError
+from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
+from loopcal.io.robot.robot_file import build_robot, find_robot_file
+from loopcal.measure import KINDS, Observations
+
+ROBOTS = ("hexapod-42", "linear-delta", "3-prs", "five-bar")
+WRONG = (..., {}, [], [None], {"rod": 1}, "x", 1e160, -1e308, None, True, [[1]], "*a")
+
+
+def list_places(node: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Return the places of all values, of lists those of the first entry."""
+    if place:
+        yield place
+    if isinstance(node, dict):
+        for key in node:
+            yield from list_places(node[key], (*place, key))
+    if isinstance(node, list) and node:
+        yield from list_places(node[0], (*place, 0))
+
+
+def replace(document: Any, place: tuple[str | int, ...], value: Any) -> Any:
+    """Return a document with another value at a place; without it for `...`."""
+    changed = copy.deepcopy(document)
+    node = changed
+    for step in place[:-1]:
+        node = node[step]
+    if value is ...:
+        del node[place[-1]]
+    else:
+        node[place[-1]] = value
+    return changed
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_wrong_value_in_a_robot_file_is_refused_or_builds_a_robot(name) -> None:
+    """Every place is tried with one wrong value, a different one at each."""
+    plain = make_round_trip_yaml().load(find_robot_file(name).read_text("utf-8"))
+    document = json.loads(json.dumps(plain))
+    refused = 0
+    for i, place in enumerate(list_places(document)):
+        text = json.dumps(replace(document, place, WRONG[i % len(WRONG)]))
+        refused += is_refused(text)
+    assert refused > 0.5 * i
+
+
+def is_refused(text: str) -> bool:
+    """Return whether the text of a robot file is refused; any other exception fails the test."""
+    try:
+        with np.errstate(all="raise", under="ignore"):
+            build_robot(parse_yaml(text, "robot.yaml", "robot file"))
+    except LoopcalError:
+        return True
+    return False
+
+
+DELTA = find_robot_file("linear-delta").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("readings: {}", "'readings' is"),
+        ("readings: [[]]", "'readings' is"),
+        ("arms: {rod: 1}", "'arms' is a mapping, but"),
+        ("radius: 1.0e+160", r"'radius'.*1e\+160 mm is beyond"),
+        ("angles: &a [*a]", "not valid YAML|more than|nest"),
+        ('name: "\\ud800"', "name"),
+    ],
+)
+def test_a_mistyped_line_of_a_robot_file_is_named(tmp_path, line, sentence) -> None:
+    key = line.partition(":")[0]
+    lines = [text for text in DELTA.splitlines() if not text.startswith(f"{key}:")]
+    path = tmp_path / "robot.yaml"
+    path.write_text("\n".join([*lines, line]) + "\n")
+    with pytest.raises(FileError, match=sentence) as caught:
+        lc.load_robot(path)
+    assert str(caught.value).startswith(f"{path}:")
+
+
+ROBOT = lc.load_robot("five-bar")
+HEADER = "pose,left [deg],right [deg],x [mm],y [mm],z [mm]"
+ROWS = [f"p{i},{100 + 3 * i},{40 - i},{i},{250 + i},0.0" for i in range(8)]
+SETTINGS = {
+    "kind": "position",
+    "places": "[[0 mm, 0 mm, 0 mm]]",
+    "noise": "{x: 1 um, y: 1 um, z: 1 um}",
+}
+
+
+def load(folder, settings: dict[str, str], columns: str = "", cells: str = "") -> lc.Measurements:
+    """Read a measurement file of the five-bar."""
+    lines = [f"# {key}: {value}" for key, value in settings.items()]
+    path = folder / "data.csv"
+    path.write_text("\n".join([*lines, HEADER + columns, *(row + cells for row in ROWS)]) + "\n")
+    return lc.load_measurements(path, ROBOT, allow_outside_stroke=True)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "sentence"),
+    [
+        ("places", "[[0 mm, 0 mm, 0 mm], [1 mm]]", "lists of equal length"),
+        ("places", "[null]", "lists of equal length"),
+        ("places", "[[1e160 m, 0 m, 0 m]]", "beyond 1e\\+09 m"),
+        ("places", "null", "'places' is empty, but a list is needed"),
+        ("kind", "[position]", "is not a kind of measurement"),
+        ("kind", "{a: 1}", "is not a kind of measurement"),
+        ("targets", "null", "'targets' is empty"),
+        ("unknown", "null", "'unknown' is empty"),
+        ("noise", "{x: 1e-30 um, y: 1 um, z: 1 um}", "from 1e-15"),
+        ("reading_noise", "1e-300 deg", "from 1e-15"),
+        ("session_bias", "{x: 1e-300 m}", "from 1e-15"),
+    ],
+)
+def test_a_wrong_setting_is_refused_with_its_line(tmp_path, key, value, sentence) -> None:
+    with pytest.raises(FileError, match=sentence) as caught:
+        load(tmp_path, SETTINGS | {key: value})
+    assert "data.csv:" in str(caught.value)
+
+
+def test_no_setting_of_any_type_ends_in_another_error(tmp_path) -> None:
+    keys = ["kinds", "unknowns", "session", "controller", "poses", "T_base_frame", "orientation"]
+    keys += ["along", "axis", "session_drift", "instrument", "robot", "format", *SETTINGS]
+    refused = 0
+    for key in keys:
+        for value in ("null", "[]", "true", "{p: 5}", "[1, [2]]"):
+            try:
+                load(tmp_path, SETTINGS | {key: value})
+            except LoopcalError:
+                refused += 1
+    assert refused > 50
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "sentence"),
+    [
+        (",cov.x.y [mm*mm]", ",-1e308", "beyond"),
+        (",sigma.x [mm]", ",1e-320", "too small"),
+        (",sigma.left [deg]", ",1e-320", "too small"),
+        (",sigma.x [mm]", ",-1", "not positive"),
+    ],
+)
+def test_a_wrong_cell_is_refused_with_its_line(tmp_path, columns, cells, sentence) -> None:
+    with pytest.raises(FileError, match=sentence) as caught:
+        load(tmp_path, SETTINGS, columns, cells)
+    assert "data.csv:5" in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [-1e308, 1e308, -1.0, 1e-10])
+def test_a_covariance_that_is_none_is_refused_before_it_is_inverted(value) -> None:
+    kind = KINDS["position"]().with_tool(np.eye(4))
+    covariance = np.tile(1e-10 * np.eye(3), (2, 1, 1))
+    covariance[1, 0, 1] = covariance[1, 1, 0] = value
+    with pytest.raises(DataError, match="covariance of row 2 is not positive definite"):
+        Observations(kind, np.arange(2)[:, None], np.zeros((2, 3)), covariance)
