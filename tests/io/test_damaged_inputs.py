@@ -12,6 +12,7 @@ import pytest
 import loopcal as lc
 from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
+from loopcal.io.formats.urdf_tree import read, read_joint_graph
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
 from loopcal.measure import KINDS, Observations
 
@@ -163,4 +164,27 @@ def test_a_covariance_that_is_none_is_refused_before_it_is_inverted(value) -> No
     covariance = np.tile(1e-10 * np.eye(3), (2, 1, 1))
     covariance[1, 0, 1] = covariance[1, 1, 0] = value
     with pytest.raises(DataError, match="covariance of row 2 is not positive definite"):
-        Observations(kind, np.arange(2)[:, None], np.zeros((2, 3)), covariance)
+        Observations(kind, np.arange(2), np.zeros((2, 3)), covariance)
+
+
+def test_an_anchor_that_is_used_twice_causes_no_warning(recwarn) -> None:
+    text = "a: &x [1]\nb: &x [2]\nc: *x\n"
+    assert parse_yaml(text, "robot.yaml", "robot file").content["c"] == [2]
+    assert not recwarn.list
+
+
+def test_a_kind_without_rows_is_accepted(tmp_path) -> None:
+    position = "{kind: position, places: [[0 mm, 0 mm, 0 mm]], noise: {x: 1 um, y: 1 um, z: 1 um}}"
+    settings = {"kinds": f"{{a: {position}, b: {position}}}"}
+    assert len(load(tmp_path, settings, ",kind", ",a").labels) == len(ROWS)
+
+
+def test_a_closure_that_is_no_name_is_refused(tmp_path) -> None:
+    urdf = (
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">'
+        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    (tmp_path / "r.urdf").write_text(urdf)
+    (tmp_path / "loops.yaml").write_text("closed_loop: [[[j], j]]\ntype: [6d]\nname_mot: [j]\n")
+    with pytest.raises(FileError, match=r"the closure \['j'\] is not a joint"):
+        read_joint_graph(read(tmp_path / "r.urdf"), tmp_path / "loops.yaml")

@@ -54,7 +54,7 @@ def format_report(error: BaseException, words: Sequence[str]) -> str:
         "loopcal stopped because of a defect. This report and the input files make it repeatable.",
         f"command: {shlex.join(['loopcal', *words])}",
         f"versions: {', '.join(versions)}, Python {platform.python_version()}",
-        f"system: {platform.platform()}",
+        f"system: {platform.system()} {platform.release()} {platform.machine()}",
         "",
         trace,
     )

@@ -48,6 +48,7 @@ class BoundedComposer(Composer):
         if self._level > YAML_DEPTH.count:
             raise LimitError(YAML_DEPTH, event.start_mark)
         self._sizes.pop(event.anchor, None)
+        self.anchors.pop(event.anchor, None)  # ruamel.yaml would warn of the second one
         node = super().compose_node(parent, index)
         self._level -= 1
         if event.anchor is not None:

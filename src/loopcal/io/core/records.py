@@ -27,6 +27,7 @@ from loopcal.io.core.yaml_file import (
     name_location,
     refuse_unknown_keys,
 )
+from loopcal.plain_text import quote
 from loopcal.units import Dimension, Unit, find_unit, list_symbols, to_si
 
 T = TypeVar("T")
@@ -228,7 +229,8 @@ def _translate(
     else:
         chosen = min(range(len(places)), key=lambda i: file.line((*location, *places[i][0])))
     complaint, (path, node) = complaints[chosen], places[chosen]
-    missing = [c["loc"][-1] for c in complaints if c["loc"][:-1] == complaint["loc"][:-1]]
+    parent = complaint["loc"][:-1]
+    missing = [c["loc"][-1] for c in complaints if c["loc"] and c["loc"][:-1] == parent]
     needed = max((step + 1 for step in missing if isinstance(step, int)), default=0)
     path = (*location, *path)
     return _word(complaint, path, node, needed), path
@@ -291,7 +293,7 @@ def _word(complaint: Any, location: Location, node: Any, needed: int) -> tuple[s
         expected = context["expected"].replace(" or ", ", ")
         names = [part.strip("' ") for part in expected.split(",")]
         hint = "" if str(node) in names else suggest_names(str(node), names)
-        return f"{name} is {node!r}{hint}; allowed: {expected}", ""
+        return f"{name} is {quote(node)}{hint}; allowed: {expected}", ""
     if kind == "value_error":
         return f"{name}: {context.get('error', complaint['msg'])}", ""
     reason = complaint["msg"][:1].lower() + complaint["msg"][1:]

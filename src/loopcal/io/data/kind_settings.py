@@ -32,6 +32,7 @@ from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
 from loopcal.mechanism import PoseRecord
+from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, EXAMPLES, SI_SYMBOLS, Dimension, find_sd_fault
 
@@ -71,7 +72,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         example = "write '# kind: pose' at the top, or 'kind: pose' in a .yaml file of this name"
         raise file.error(f"no kind of measurement is stated; {example} (kinds: {known})", location)
     if not isinstance(name, str) or name not in KINDS:
-        sentence = f"{name!r} is not a kind of measurement{suggest_names(str(name), KINDS)}"
+        sentence = f"{quote(name)} is not a kind of measurement{suggest_names(str(name), KINDS)}"
         raise file.error(f"{sentence}; allowed: {known}", (*location, "kind"))
     kind = KINDS[name]
     record = _make_record(kind)

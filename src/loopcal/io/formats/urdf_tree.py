@@ -29,6 +29,7 @@ from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.formats.program_format import parse_number
 from loopcal.mechanism.joint_graph import GraphJoint, JointGraph, find_home
+from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 
 WHAT = "URDF file"
@@ -314,9 +315,9 @@ def _read_names(file: YamlFile, urdf: Urdf) -> tuple[list[tuple[str, str]], tupl
         raise file.error(f"{sentence} 'name_mot:' as a list")
     for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
         for name in pair:
-            if name not in urdf.joints:
-                sentence = f"the closure {name!r} is not a joint of {urdf.path.name}; correct it"
-                raise file.error(sentence, ("closed_loop", i))
+            if not isinstance(name, str) or name not in urdf.joints:
+                sentence = f"the closure {quote(name)} is not a joint of {urdf.path.name}"
+                raise file.error(f"{sentence}; correct it", ("closed_loop", i))
         if str(kind).lower() != "6d":
             sentence = f"closure {pair[0]!r} is of type {kind!r}, but only '6d' is allowed"
             raise file.error(f"{sentence}, between two revolute joints", ("type", i))
