@@ -5,10 +5,16 @@ refused when they are read."""
 import csv
 import json
 import re
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
+from unicodedata import normalize
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from loopcal.cli import main
 from loopcal.errors import DataError, FileError
@@ -86,7 +92,7 @@ def test_a_plan_tells_readings_from_commands_of_the_same_name(tmp_path, monkeypa
 @pytest.mark.parametrize("label", ["", " a", "a ", "a;b", "a\nb"])
 def test_a_label_that_no_cell_can_contain_is_refused(tmp_path, label: str) -> None:
     robot = load_robot("five-bar")
-    with pytest.raises(DataError, match="rename it"):
+    with pytest.raises(DataError, match="rename it|remove it"):
         save_measurements(make_data(robot, labels=("1", label, "3")), tmp_path / "d.csv", robot)
     assert not list(tmp_path.iterdir())
 
@@ -99,6 +105,49 @@ def test_a_label_with_a_number_sign_survives_compensation(tmp_path, monkeypatch)
     text = (tmp_path / "readings.csv").read_text()
     assert '"#1",' in text
     assert '"a ""b"", c",' in text
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "simulate five-bar -o data.csv --kind position",
+        "new five-bar -o r.yaml --measurements data.csv",
+    ],
+)
+def test_measurements_are_not_written_beside_other_settings(
+    tmp_path, monkeypatch, capsys, command: str
+) -> None:
+    """The settings in data.yaml would contradict those at the top of data.csv."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data.yaml").write_text("kind: pose\n")
+    assert main(command.split()) == 1
+    assert "settings are at the top of this file and in data.yaml" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["data.yaml"]
+
+
+LABEL = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S", "Zs")), max_size=8)
+LABELS = LABEL | st.sampled_from(["#1", '"', 'a"b', "a,b", "'", "a\tb", "1e3", "yes", "-", "+x"])
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.lists(LABELS, min_size=3, max_size=3), LABELS, LABELS, st.booleans())
+def test_any_labels_are_read_back_or_refused(labels, session, group, is_held_out) -> None:
+    """`save_measurements` compares; whatever it accepts, `load_measurements` gives again."""
+    robot = load_robot("five-bar")
+    kind = Position().with_tool(robot.tool)
+    measured = np.array([[0.1, 1 / 3, np.nan], [1e-9, -0.0, 7.0], [np.pi, 1e3, 0.3]])
+    rows = Observations.from_sigma(kind, np.arange(3), measured, 1e-5, session, group)
+    held_out = [is_held_out, False, False]
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "data.csv"
+        try:
+            data = make_data(robot, labels=tuple(labels), is_held_out=np.array(held_out))
+            save_measurements(replace(data, observations=(rows,)), path, robot)
+        except DataError:  # refused before it is written; a defect is a FileError
+            return
+        read = load_measurements(path, robot, allow_outside_stroke=True)
+        assert sorted(read.labels) == sorted(normalize("NFC", label) for label in labels)
+        assert set(read.observations[0].session.tolist()) == {normalize("NFC", session)}
 
 
 BROKEN = {

@@ -36,6 +36,7 @@ def new(
       loopcal new linear-delta -o printer.yaml --measurements heights.csv \\
           --kind component --components z
     """  # noqa: D301
+    from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.names import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
@@ -50,6 +51,8 @@ def new(
     robot_text = format_new_robot(family, make_name(output.stem))
     robot = build_robot(parse_yaml(robot_text, output, "robot file"))
     template = format_template(robot, instrument)
+    if measurements is not None:
+        refuse_settings_beside(measurements)
     with restore_on_failure((output, measurements)):
         write_robot(output, robot_text, robot)
         if measurements is not None:

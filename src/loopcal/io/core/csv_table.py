@@ -266,6 +266,11 @@ def _read_settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
         raise FileError(f"{error.sentence} ({advice})", path, error.line) from None
 
 
+def refuse_settings_beside(path: Path) -> None:
+    """Raise FileError where a file with settings of its own would have others beside it."""
+    _read_sidecar(path, has_front_matter=True)
+
+
 def _read_sidecar(path: Path, has_front_matter: bool) -> YamlFile | None:
     """Return the settings file beside a measurement file, None without one."""
     beside = path.with_suffix(".yaml")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.io.core.csv_table import format_row
-from loopcal.io.core.names import format_comment
+from loopcal.io.core.csv_table import format_row, refuse_settings_beside
+from loopcal.io.core.names import find_fault, format_comment
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
 from loopcal.io.data.column_names import find_column_fault
@@ -71,9 +72,11 @@ def save_measurements(
 
     Raises
     ------
-    FileError : the file cannot be written. DataError : a name that a file cannot hold.
+    FileError : the file cannot be written, or a file of settings has its name.
+    DataError : a name that a file cannot hold.
     """
     text = format_measurements(data, robot, remark)
+    refuse_settings_beside(Path(path))
     write_text(path, text, lambda written: check_written_measurements(written, data, robot))
 
 
@@ -220,15 +223,18 @@ def _refuse_names(data: Measurements) -> None:
     for what in ("session", "group"):
         names += [(what, n) for rows in data.observations for n in getattr(rows, what).tolist()]
     for what, name in dict.fromkeys(names):
-        if any(ord(c) < 32 for c in name) or name != name.strip():
-            reason = "names must not begin or end with a blank or contain a line break"
+        if (fault := find_fault(name)) is not None:
+            raise DataError(fault)
+        if name != name.strip():
+            reason = "names must not begin or end with a blank"
         elif what == "pose" and (not name or LINK in name):
             reason = f"names of poses must not be empty or contain {LINK!r}"
         else:
             continue
         raise DataError(f"the {what} {name!r} cannot be written: {reason}; rename it")
-    if len(set(data.labels)) < len(data.labels):
-        name = next(name for name in data.labels if data.labels.count(name) > 1)
+    labels = [unicodedata.normalize("NFC", name) for name in data.labels]
+    if len(set(labels)) < len(labels):
+        name = next(name for name in labels if labels.count(name) > 1)
         raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
 
 

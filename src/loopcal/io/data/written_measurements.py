@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,12 +27,14 @@ ROUNDING = 1e-7
 def check_written_measurements(path: Path, data: Measurements, robot: Mechanism) -> None:
     """Read a measurement file; raise LoopcalError where it does not hold these measurements.
 
-    Poses may come in another order. Rows of weight 0 and weights are not written.
+    Poses may come in another order, names in Unicode normal form C. Rows of weight 0 and weights
+    are not written.
     """
     read = load_measurements(path, robot, allow_outside_stroke=True, allow_duplicates=True)
-    require_same("names of poses", sorted(data.labels), sorted(read.labels))
+    labels = [unicodedata.normalize("NFC", label) for label in data.labels]
+    require_same("names of poses", sorted(labels), sorted(read.labels))
     place = {label: i for i, label in enumerate(read.labels)}
-    order = np.array([place[label] for label in data.labels], dtype=int)
+    order = np.array([place[label] for label in labels], dtype=int)
     require_same_numbers("readings", data.readings, read.readings[order])
     require_same("use of poses", data.is_held_out.tolist(), read.is_held_out[order].tolist())
     blocks = dict(zip(data.block.tolist(), read.block[order].tolist(), strict=True))
@@ -68,7 +71,7 @@ def _check_rows(before: Observations, after: Observations, order: IntArray) -> N
     change = (after.covariance - before.covariance[kept]) / (sd[:, :, None] * sd[:, None, :])
     require_same(f"covariances of {name}", True, bool((np.abs(change) <= ROUNDING).all()))
     for what in ("session", "group"):
-        values = getattr(before, what)[kept].tolist()
+        values = [unicodedata.normalize("NFC", v) for v in getattr(before, what)[kept].tolist()]
         require_same(f"{what}s of {name}", values, getattr(after, what).tolist())
     for what, values in before.context.items():
         require_same_numbers(f"{what} of {name}", values[kept], after.context[what])

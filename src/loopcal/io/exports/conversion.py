@@ -26,7 +26,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import NAME_COLUMNS, format_row, read_table
+from loopcal.io.core.csv_table import NAME_COLUMNS, format_row, read_table, refuse_settings_beside
 from loopcal.io.core.limits import PATTERN_SECONDS
 from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
@@ -250,6 +250,7 @@ def save_conversion(conversion: Conversion, path: str | Path) -> None:
             require_same("row", before, after)
         require_same("columns", len(conversion.table[0]), len(table.names))
 
+    refuse_settings_beside(Path(path))
     write_text(path, conversion.text, check)
 
 
