@@ -140,6 +140,8 @@ def test_circular_and_broken_links_are_refused(run) -> None:
         code, out, err = run(f"simulate robot.yaml -o {name} --force")
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert sentence in err
+    code, out, err = run("compensate robot.yaml circle -o new.csv")
+    assert (code, out, err.count("\n")) == (1, "", 1)
 
 
 PRINTER = """[printer]
