@@ -76,7 +76,7 @@ def test_input_found_at_random_has_its_answer(tmp_path, monkeypatch, capsys, fin
 def test_link_to_itself_is_refused_as_an_output(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "loop.yaml").symlink_to("loop.yaml")
-    assert main("new limbs -o loop.yaml --measurements d.csv".split()) == 1
+    assert main(["new", "limbs", "-o", "loop.yaml"]) == 1
     assert "loop.yaml: this symbolic link has no target" in capsys.readouterr().err
 
 
