@@ -3,6 +3,7 @@
 smallest that shows it, and the right answer.
 """
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -53,6 +54,11 @@ FINDS = {
         {"d.csv": SEPARATION + "a,180,190,200,\nb,190,180,200,\n"},
         says="Fill in the measured values",
     ),
+    "anchor that is used again": Find(
+        "check robot.yaml",
+        {"robot.yaml": "a: &x 1\nb: &x 2\nc: *x\n"},
+        says="robot.yaml: this file states no format",
+    ),
     "closure of a list": Find(
         "import r.urdf --closures c.yaml -o new.yaml",
         {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
@@ -66,7 +72,9 @@ def test_input_found_at_random_has_its_answer(tmp_path, monkeypatch, capsys, fin
     monkeypatch.chdir(tmp_path)
     for name, text in find.files.items():
         (tmp_path / name).write_text(text, "utf-8")
-    code = main(find.command.split())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        code = main(find.command.split())
     printed = capsys.readouterr()
     assert find.says in " ".join((printed.out + printed.err).split())
     assert code == find.code

@@ -115,7 +115,8 @@ def _judge_files(case: Case, outcome: Outcome) -> Iterator[Find]:
 def _judge_success(case: Case, outcome: Outcome, folder: Path) -> Iterator[Find]:
     """Check what a command that succeeded printed and wrote."""
     command = case.words[0] if case.words else ""
-    said = " ".join([*case.words, *(str(content) for content in case.files.values())])
+    texts = (c.decode("utf-8", "replace") for c in case.files.values() if isinstance(c, bytes))
+    said = " ".join([*case.words, *texts])
     may_name = bool(NOT_FINITE.search(said))
     if JSON_NOT_FINITE.search(outcome.out) if "--json" in case.words else (
         not may_name and NOT_FINITE.search(outcome.out)

@@ -47,6 +47,8 @@ class BoundedComposer(Composer):
         self._level += 1
         if self._level > YAML_DEPTH.count:
             raise LimitError(YAML_DEPTH, event.start_mark)
+        # YAML allows an anchor again, for another value; ruamel.yaml warns where it is still known
+        self.anchors.pop(event.anchor, None)
         self._sizes.pop(event.anchor, None)
         self.anchors.pop(event.anchor, None)  # ruamel.yaml would warn of the second one
         node = super().compose_node(parent, index)
