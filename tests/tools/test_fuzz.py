@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fuzzer: inputs follow from their seed alone, and every command and option has its turn."""
 
+import json
+import os
+import subprocess
+import sys
 from random import Random
 
 import pytest
@@ -86,3 +90,22 @@ def test_traceback_is_known_by_its_innermost_function_of_loopcal(tmp_path) -> No
 
 def test_ranges_of_seeds_are_joined() -> None:
     assert join_ranges([[5, 6], [1, 2], [3, 4], [9, 9]]) == [[1, 6], [9, 9]]
+
+
+@pytest.mark.slow
+def test_three_hundred_random_inputs_have_their_answers(root) -> None:
+    """In a process of its own, because the workers are forks."""
+    command = [sys.executable, "-m", "tools.fuzz", "--count", "300", "--seed", "1"]
+    environment = os.environ | {"PYTHONPATH": f"{root / 'src'}{os.pathsep}{root}"}
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "300 inputs" in done.stdout
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("name", ["random_inputs", "random-inputs-long"])
+def test_no_random_input_of_the_evidence_broke_a_rule(root, name) -> None:
+    counts = json.loads((root / "docs" / "evidence" / f"{name}.json").read_text("utf-8"))
+    assert counts["finds"] == {}

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random inputs: damaged files of every kind and options of every command (tools/fuzz).
+
+Another 5,000 inputs in each run would only repeat old ones if the seeds did not change: they begin
+at SEED, beyond those of `make test`. `make fuzz` runs any number of others.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tools.fuzz.campaign import Summary, run_campaign
+from tools.fuzz.cases import Maker
+from tools.fuzz.corpus import build_corpus
+
+INPUTS, SEED = 5000, 1_000_001
+LONG_RUN = Path(__file__).resolve().parent.parent / "docs" / "evidence" / "random-inputs-long.json"
+"""Counts of the longest run of `make fuzz`, with the seeds."""
+
+
+def collect() -> dict[str, Any]:
+    """Return the counts of this run, and those of the longest one."""
+    summary = Summary()
+    run_campaign(Maker(build_corpus()), iter(range(SEED, SEED + INPUTS)), 1, summary, _ignore)
+    counts = summary.to_json()
+    long = json.loads(LONG_RUN.read_text("utf-8"))
+    return {
+        "seeds": counts["seeds"],
+        "finds": counts["finds"],
+        "tables": {
+            "counts": _table_counts(counts, long),
+            "commands": _table(counts["commands"], long["commands"], "command"),
+            "damage": _table(
+                _by_file(counts["damage"]), _by_file(long["damage"]), "what is damaged"
+            ),
+        },
+    }
+
+
+def _ignore(_answer: dict[str, Any], _new: list[dict[str, str]]) -> None:
+    """Take no notice of single answers."""
+
+
+def _by_file(damage: dict[str, int]) -> dict[str, int]:
+    """Return the counts of damages by kind of file."""
+    counts: dict[str, int] = {}
+    for name, count in damage.items():
+        kind = name.partition(": ")[0]
+        counts[kind] = counts.get(kind, 0) + count
+    return counts
+
+
+def _table(counts: dict[str, int], long: dict[str, int], first: str) -> dict[str, Any]:
+    """Return a table of two counts, the most frequent in the long run on top."""
+    names = sorted({*counts, *long}, key=lambda name: (-long.get(name, 0), name))
+    return {
+        "columns": [first, "inputs in `make evidence`", "inputs in the longest run"],
+        "formats": ["", "d", "d"],
+        "rows": [[name, counts.get(name, 0), long.get(name, 0)] for name in names],
+    }
+
+
+def _table_counts(counts: dict[str, Any], long: dict[str, Any]) -> dict[str, Any]:
+    """Return what came of the inputs, in numbers."""
+    rows: list[list[Any]] = []
+    codes = ("0", "1", "2")
+    rules = {
+        "inputs": lambda c: c["inputs"],
+        "answered (exit code 0)": lambda c: c["exit_codes"].get("0", 0),
+        "refused in a sentence (1)": lambda c: c["exit_codes"].get("1", 0),
+        "quality gate not met (2)": lambda c: c["exit_codes"].get("2", 0),
+        "any other end": lambda c: c["inputs"] - sum(c["exit_codes"].get(k, 0) for k in codes),
+        "tracebacks": lambda c: _count(c, ("traceback", "defect-message", "died")),
+        "more than ten seconds of processor time": lambda c: _count(c, ("slow",), "TimeIsUp"),
+        "success with a number that is not finite": lambda c: _count(c, ("non-finite",)),
+        "output that loopcal cannot read": lambda c: _count(c, ("unreadable", "missing-output")),
+        "file left, changed or deleted by a command that failed": lambda c: _count(
+            c, ("left-output", "changed-file", "deleted-file")
+        ),
+        "write outside of the folder": lambda c: _count(c, ("escape",)),
+        "warning of Python, or message of another form": lambda c: _count(
+            c, ("warning", "message-form", "no-message", "control-character", "internal-words")
+        ),
+        "processor time per input [ms]": lambda c: round(1e3 * c["cpu_seconds"] / c["inputs"]),
+    }
+    rows = [[name, rule(counts), rule(long)] for name, rule in rules.items()]
+    return {
+        "columns": ["", "`make evidence`", "longest run"],
+        "formats": ["", "d", "d"],
+        "rows": rows,
+    }
+
+
+def _count(counts: dict[str, Any], rules: tuple[str, ...], word: str | None = None) -> int:
+    """Return how many inputs broke one of some rules, or have a find with a word."""
+    return sum(
+        find["count"]
+        for signature, find in counts["finds"].items()
+        if (word is not None and word in signature)
+        or (signature.partition(":")[0] in rules and "TimeIsUp" not in signature)
+    )
