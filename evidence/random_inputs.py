@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random inputs: damaged files of every kind and options of every command (tools/fuzz).
 
-Another 5,000 inputs in each run would only repeat old ones if the seeds did not change: they begin
-at SEED, beyond those of `make test`. `make fuzz` runs any number of others.
+The seeds begin at SEED, beyond those of `make test` and of the longest run of `make fuzz`.
 """
 
 from __future__ import annotations
@@ -21,21 +20,21 @@ LONG_RUN = Path(__file__).resolve().parent.parent / "docs" / "evidence" / "rando
 
 
 def collect() -> dict[str, Any]:
-    """Return the counts of this run, and those of the longest one."""
+    """Return the counts of this run, and the tables of these and of the longest one."""
     summary = Summary()
     run_campaign(Maker(build_corpus()), iter(range(SEED, SEED + INPUTS)), 1, summary, _ignore)
     counts = summary.to_json()
+    return {"counts": counts, "finds": counts["finds"], "tables": make_tables(counts)}
+
+
+def make_tables(counts: dict[str, Any]) -> dict[str, Any]:
+    """Return the tables of the counts of a run beside those of the longest run."""
     long = json.loads(LONG_RUN.read_text("utf-8"))
+    damage, long_damage = (_by_file(c["damage"]) for c in (counts, long))
     return {
-        "seeds": counts["seeds"],
-        "finds": counts["finds"],
-        "tables": {
-            "counts": _table_counts(counts, long),
-            "commands": _table(counts["commands"], long["commands"], "command"),
-            "damage": _table(
-                _by_file(counts["damage"]), _by_file(long["damage"]), "what is damaged"
-            ),
-        },
+        "counts": _table_counts(counts, long),
+        "commands": _table(counts["commands"], long["commands"], "command"),
+        "damage": _table(damage, long_damage, "what is damaged"),
     }
 
 
@@ -64,7 +63,6 @@ def _table(counts: dict[str, int], long: dict[str, int], first: str) -> dict[str
 
 def _table_counts(counts: dict[str, Any], long: dict[str, Any]) -> dict[str, Any]:
     """Return what came of the inputs, in numbers."""
-    rows: list[list[Any]] = []
     codes = ("0", "1", "2")
     rules = {
         "inputs": lambda c: c["inputs"],

@@ -6,6 +6,7 @@ smallest that shows it, and the right answer.
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.diagnose.error_frames import fit_frames
 from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import find_robot_file
 
 DATA = """\
 # kind: {kind}
@@ -24,6 +26,8 @@ POSITION = DATA.format(
 )
 ROWS = "a,180,190,200,1,2,3\nb,190,180,200,1,2,3\n"
 SEPARATION = DATA.format(kind="separation", noise="{separation: 20 um}", columns="separation [mm]")
+TRIPOD = Path(find_robot_file("3-prs")).read_text("utf-8")
+SAMPLES = Path(__file__).parents[2] / "examples" / "cable-robot" / "samples.json"
 LIMB = '<link name="{0}"/><joint name="{0}j" type="revolute"><parent link="base"/><child link="{0}"/><axis xyz="0 0 1"/></joint>'  # noqa: E501
 URDF = f"<robot name='r'><link name='base'/>{LIMB.format('a')}{LIMB.format('b')}</robot>"
 
@@ -53,6 +57,19 @@ FINDS = {
         "validate linear-delta d.csv",
         {"d.csv": SEPARATION + "a,180,190,200,\nb,190,180,200,\n"},
         says="Fill in the measured values",
+    ),
+    "tilt beyond half a turn": Find(
+        "check robot.yaml",
+        {"robot.yaml": TRIPOD.replace("theta: [0, 35]", "theta: [650, 750]")},
+        says="the workspace of theta runs to 13.09 rad; a tilt is above 0 and at most 180 degrees",
+    ),
+    "known position of 1e308 mm": Find(
+        "import s.json --format hangprinter -o new.yaml",
+        {"s.json": SAMPLES.read_text("utf-8").replace("-0.72", "-1e308", 1)},
+        says="'xyz_of_samp' contains a number beyond 1e+09; correct it",
+    ),
+    "output of no study": Find(
+        "reproduce -o out", says="--output has no effect without the name of a study"
     ),
     "anchor that is used again": Find(
         "check robot.yaml",

@@ -290,7 +290,7 @@ def _build_sources() -> Iterator[Machine]:
             1 new limbs -o new.yaml --measurements new.csv --kind position,inclination
             1 new gough -o new.yaml
             0.5 reproduce
-            0.01 reproduce tsvd-2016 --trials 2 -o out
+            0.05 reproduce tsvd-2016 --trials 1 -o out
             """
         lines = [
             Line(tuple(line.split()[1:]), float(line.split()[0]))

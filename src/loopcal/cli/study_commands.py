@@ -20,6 +20,7 @@ from loopcal.cli.options import (
     json_option,
     leave_out_held_out,
     read_checked_measurements,
+    refuse_given,
     robot_argument,
     take_flags,
 )
@@ -75,6 +76,9 @@ def reproduce(
     from loopcal.papers import paper as find_paper
 
     if paper is None:
+        refuse_given(
+            ("output", "seed", "trials", "force"), "without the name of a study, which is repeated"
+        )
         _list_papers(as_json)
         return
     chosen = PAPERS[paper] if paper in PAPERS else find_paper(paper)

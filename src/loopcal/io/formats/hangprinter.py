@@ -29,6 +29,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.json_text import read_json
 from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -361,6 +362,8 @@ def _parse_numbers(
     has_shape = values.ndim == ndim and values.size and width in (None, *values.shape[-1:])
     if not has_shape or not np.isfinite(values).all():
         raise FileError(f"{key!r} is not {wanted}; correct it", path)
+    if not (np.abs(values) <= LARGEST).all():
+        raise FileError(f"{key!r} contains a number beyond {LARGEST:g}; correct it", path)
     return values
 
 

@@ -7,6 +7,7 @@ Numbers are in SI; `loopcal.io` converts them from the units of the file, by the
 from __future__ import annotations
 
 import fnmatch
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
@@ -181,6 +182,11 @@ class Workspace:
                     f"the workspace of {name} runs from {low:g} {unit} to {high:g} {unit}; the "
                     "first value must be smaller"
                 )
+        if "theta" in stated and not 0.0 < stated["theta"][1] <= math.pi:
+            raise MechanismError(
+                f"the workspace of theta runs to {stated['theta'][1]:g} rad; a tilt is above 0 and "
+                "at most 180 degrees"
+            )
         return stated
 
 
