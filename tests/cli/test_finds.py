@@ -51,7 +51,7 @@ FINDS = {
     "places of different length": Find(
         "identifiability linear-delta d.csv",
         {"d.csv": "# places: [[1 mm, 2 mm, 3 mm], [1 mm]]\n# targets: [a, b]\n" + POSITION + ROWS},
-        says="give an array of numbers of shape (2, 3)",
+        says="'places' must be a list of numbers, or of lists of equal length",
     ),
     "kind without a measured value": Find(
         "validate linear-delta d.csv",

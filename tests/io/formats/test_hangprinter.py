@@ -147,7 +147,7 @@ def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
             "'xyz_of_samp' has 9 poses, but 'motor_pos_samp' only 1",
         ),
         ({"xyz_of_samp": [[1, 2]]}, "row 1 of 'xyz_of_samp' has 2 numbers, but 3 are needed"),
-        ({"xyz_of_samp": [[1, 2, float("inf")]]}, "'xyz_of_samp' is not a list of rows of numbers"),
+        ({"xyz_of_samp": [[1, 2, float("inf")]]}, "the number Infinity is not finite"),
         (
             {"mechanical_advantage": [2, 2, 2]},
             "'mechanical_advantage' is not a list of numbers, 4 in all",
