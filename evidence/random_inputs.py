@@ -15,7 +15,7 @@ from tools.fuzz.cases import Maker
 from tools.fuzz.corpus import build_corpus
 
 INPUTS, SEED = 5000, 1_000_001
-LONG_RUN = Path(__file__).resolve().parent.parent / "docs" / "evidence" / "random-inputs-long.json"
+LONG_RUN = Path(__file__).with_name("random_inputs_longest.json")
 """Counts of the longest run of `make fuzz`, with the seeds."""
 
 

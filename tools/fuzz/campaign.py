@@ -181,8 +181,8 @@ def run_campaign(
 def _take_line(worker: Worker, document: dict[str, Any], summary: Summary, report: Report) -> None:
     """Note at which input a worker is, or count its answer."""
     if "begin" in document:
+        worker.seeds.remove(document["begin"])
         worker.at = document["begin"]
-        worker.seeds.remove(worker.at)
     else:
         worker.at = None
         _count(summary, document, report)

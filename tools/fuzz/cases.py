@@ -124,7 +124,7 @@ class Maker:
         self, name: str, machine: Machine, rng: Random, case: Case
     ) -> tuple[bytes, str] | None:
         """Return a file with damaged structure; None where its structure is not known."""
-        times = rng.choice([1, 1, 1, 2, 3])
+        times, mutation = rng.choice([1, 1, 1, 2, 3]), ""
         if name.endswith(".npz"):
             return mutate_arrays(machine.files[name], rng)
         if name in machine.trees:
