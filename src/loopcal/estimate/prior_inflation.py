@@ -160,7 +160,7 @@ class _FactorError(NamedTuple):
 def _estimate_factor_error(result: Identification, fit: Descent) -> _FactorError:
     """Return what the error of the factor on all tolerances does.
 
-    In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i, and deviations
+    In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i; deviations
     of the variance tau_i^2 cause the error (1 - f_i) tau_i.
     """
     method = result.method
