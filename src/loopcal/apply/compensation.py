@@ -196,8 +196,7 @@ def compensate(
     count = StepCounter(progress, PASSES + (steps if mode == "commands" else 0))
     count.begin(TASK)
     uncorrected = inverse(old, targets)
-    is_pose = np.shape(targets)[-2:] == (4, 4)
-    wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
+    wanted = _state_poses(targets, uncorrected)
     count.begin(TASK)
     best = inverse(robot, targets)
     count.begin(TASK)
@@ -233,6 +232,12 @@ def compensate(
         uncertainty=uncertainty,
         findings=_report_targets(robot, uncorrected, best, result, not_compensable),
     )
+
+
+def _state_poses(targets: ArrayLike, uncorrected: Solution) -> FloatArray:
+    """Return the wanted poses (n, 4, 4): the targets, or what the controller makes of them."""
+    is_pose = np.shape(targets)[-2:] == (4, 4)
+    return np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
 
 
 def _remove_unfixed_frames(
