@@ -72,7 +72,7 @@ def test_no_module_can_start_a_program_open_an_address_or_run_text(root: Path) -
 
 def test_arrays_are_never_pickled(root: Path) -> None:
     text = "".join(path.read_text("utf-8") for path in (root / "src").rglob("*.py"))
-    calls = re.findall(r"np\.(?:load|save|savez)\([^)]*\)", text)
+    calls = re.findall(r"np\.(?:load|save|savez)\(.*", text)
     assert calls
     assert [call for call in calls if "allow_pickle=False" not in call] == []
 

@@ -75,7 +75,10 @@ def test_towers_in_another_frame_are_named(run) -> None:
     ("rows", "message"),
     [
         (("name: radios, value: 1, unit: mm",), "'radios' is not a parameter"),
-        (("name: radius, value: 1, unit: deg",), "the unit of 'radius'"),
+        (
+            ("name: radius, value: 1, unit: deg",),
+            "'deg' is a unit of angle, but a length is needed",
+        ),
         (("name: radius, value: 105, unit: mm",) * 2, "duplicate parameter 'radius'"),
     ],
 )

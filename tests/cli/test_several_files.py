@@ -159,4 +159,4 @@ def test_stated_values_survive_split_take_and_save(data, tmp_path) -> None:
     fit, held_out = known.split(hold_out=0.5, seed=2)
     assert fit.stated_values == held_out.stated_values == known.stated_values
     save_measurements(known.take(np.arange(11)), tmp_path / "monday.csv", robot)
-    assert '# unknowns: {"monday.tracker.x": {sd: 1 mm}}' in (tmp_path / "monday.csv").read_text()
+    assert "# unknowns: {monday.tracker.x: {sd: 1 mm}}" in (tmp_path / "monday.csv").read_text()

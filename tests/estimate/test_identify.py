@@ -72,7 +72,7 @@ def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
     steps = []
     for seed in range(100):
         T = zoo.nategh_poses(np.random.default_rng(seed))
-        exact = simulate(robot.with_values(truth), T, tracker(1e-16, 5e-16), seed)
+        exact = simulate(robot.with_values(truth), T, tracker(1e-15, 5e-15), seed)
         fit = identify(robot, exact, LeastSquares(), options=FitOptions(begin="closure"))
         assert fit.converged
         errors = np.abs(fit.history.estimate - truth).max(axis=1) / MM

@@ -303,10 +303,10 @@ HELIOSTAT = {
         ("while 39 poses are held out: hold out fewer",),
         command=CALIBRATE.replace("0.25", "0.99"),
     ),
-    "the run folder exists": Mistake(
+    "the run folder is the working folder": Mistake(
         keep_files,
         1,
-        ("this folder is not empty", "--force"),
+        ("this folder is the working folder", "name a new folder"),
         command=CALIBRATE.replace("-o run", "-o ."),
     ),
 }

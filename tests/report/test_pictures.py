@@ -10,7 +10,7 @@ from loopcal.io.robot.robot_file import build_robot, find_robot_file
 from loopcal.report import draw, save_picture
 from loopcal.report.pictures import FORMATS
 
-NAMES = ["$\\frac{", "$x$", "<b>&amp;]]>", "100 % {0}"]
+NAMES = ["$\\frac{", "$x$", "<b>&amp;>", "100 % {0}"]
 
 
 def build(name: str):

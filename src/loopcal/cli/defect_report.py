@@ -50,11 +50,12 @@ def format_report(error: BaseException, words: Sequence[str]) -> str:
     """Return the text of a report: command, versions and traceback."""
     versions = [f"{name} {_find_version(name)}" for name in PACKAGES]
     trace = "".join(traceback.format_exception(error, limit=-100))
+    machine = platform.uname()
     lines = (
         "loopcal stopped because of a defect. This report and the input files make it repeatable.",
         f"command: {shlex.join(['loopcal', *words])}",
         f"versions: {', '.join(versions)}, Python {platform.python_version()}",
-        f"system: {platform.system()} {platform.release()} {platform.machine()}",
+        f"system: {machine.system} {machine.release} {machine.machine}",
         "",
         trace,
     )
