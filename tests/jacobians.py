@@ -36,7 +36,7 @@ _AUTOMATIC = 1e-11
 
 
 def central_difference(
-    function: Callable[[Array], ArrayLike], x: Array, scale: Array
+    function: Callable[[Array], ArrayLike], x: Array, scale: Array, is_batched: bool = False
 ) -> tuple[Array, Array]:
     """Derivative of a function by fourth-order central differences, with an error bound.
 
@@ -46,7 +46,7 @@ def central_difference(
     Parameters
     ----------
     function : callable
-        From (k,) to an array (...) of any shape.
+        From (k,) to an array (...) of any shape; from (m, k) to (m, ...) where it `is_batched`.
     x : (k,)
     scale : (k,)
         Change of each unknown over which the function bends noticeably (1 rad, the size of the
@@ -60,17 +60,20 @@ def central_difference(
     """
     columns, bounds = [], []
     for k, unit in enumerate(np.eye(x.size)):
-        tries, size = [], 0.0
-        for step in scale[k] * _LADDER:
-            far, near, back, behind = (
-                np.asarray(function(x + f * step * unit)) for f in (2.0, 1.0, -1.0, -2.0)
-            )
-            tries.append((8.0 * (near - back) - (far - behind)) / (12.0 * step))
-            size = max(size, float(np.max(np.abs(near))))
+        steps = scale[k] * _LADDER
+        points = x + np.multiply.outer(np.multiply.outer(steps, [2.0, 1.0, -1.0, -2.0]), unit)
+        flat = points.reshape(-1, x.size)
+        values = np.asarray(function(flat) if is_batched else [function(each) for each in flat])
+        far, near, back, behind = np.moveaxis(
+            values.reshape(*points.shape[:2], *values.shape[1:]), 1, 0
+        )
+        tall = (-1,) + (1,) * (far.ndim - 1)
+        tries = (8.0 * (near - back) - (far - behind)) / (12.0 * steps).reshape(tall)
+        size = float(np.max(np.abs(near)))
         errors = [
             float(np.max(np.abs(tries[i] - tries[i + 1])))
             + _ROUNDING * size / (scale[k] * _LADDER[i + 1])
-            for i in range(len(tries) - 1)
+            for i in range(len(steps) - 1)
         ]
         best = int(np.argmin(errors))
         columns.append(tries[best])
@@ -88,6 +91,7 @@ def check_jacobian(
     atol_reason: str = "none beyond the error of the reference itself",
     automatic: Callable[..., object] | None = None,
     package: str = "loopcal",
+    is_batched: bool = False,
 ) -> None:
     """Fail unless an analytic Jacobian agrees with central differences and, where given, with jax.
 
@@ -109,12 +113,14 @@ def check_jacobian(
         takes jax arrays.
     package : str
         Modules whose numpy is replaced while jax traces `automatic`.
+    is_batched : bool
+        Whether `function` takes many points (m, k) at once.
     """
     point = np.asarray(x, dtype=float)
     scales = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
     analytic = np.asarray(jacobian) * scales
     largest = max(float(np.max(np.abs(analytic))), float(np.finfo(float).tiny))
-    difference, bound = central_difference(function, point, scales)
+    difference, bound = central_difference(function, point, scales, is_batched)
     if analytic.shape != difference.shape:
         raise AssertionError(
             f"Jacobian of shape {analytic.shape}, differences of shape {difference.shape}"

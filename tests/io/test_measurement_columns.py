@@ -288,7 +288,7 @@ def test_invalid_times_and_temperatures_are_refused(tmp_path, robot, old, new, m
 @pytest.mark.parametrize("name", ["a;b", "two\nlines", " a", ""])
 def test_pose_name_that_cannot_be_written_is_refused_before_writing(tmp_path, robot, name) -> None:
     data = Measurements(robot.name, np.zeros((1, 6)), (), labels=(name,))
-    with pytest.raises(DataError, match="cannot be written: names|contains U\\+000A"):
+    with pytest.raises(DataError, match=r"cannot be written: names|contains U\+000A"):
         save_measurements(data, tmp_path / "data.csv", robot)
     twice = Measurements(robot.name, np.zeros((2, 6)), (), labels=("a", "a"))
     with pytest.raises(DataError, match="two poses are named 'a'"):

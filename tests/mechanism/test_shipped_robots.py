@@ -18,7 +18,7 @@ from loopcal.mechanism import Mechanism, Solution, Status, forward, inverse
 
 Array = NDArray[np.float64]
 ROBOTS = tuple(list_shipped_robots())
-ROWS, BLOCK = 100_000, 5_000
+ROWS, BLOCK = 20_000, 5_000
 SHARE = 0.999  # of rows that must return to the mode they came from
 FAR = 20.0  # times the workspace: no machine reaches all of it
 

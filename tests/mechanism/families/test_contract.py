@@ -90,11 +90,11 @@ def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> N
     known = differentiate_pose(machine, values[None], q, state)
 
     def by_value(x: np.ndarray) -> np.ndarray:
-        return geometry.pose_difference(forward_trials(machine, x[None], q, state).T[0], state.T[0])
+        return geometry.pose_difference(forward_trials(machine, x, q, state).T, state.T[0])
 
     def by_reading(x: np.ndarray) -> np.ndarray:
         return geometry.pose_difference(
-            forward_trials(machine, values[None], q + x, state).T[0], state.T[0]
+            forward_trials(machine, values[None], q + x[:, None], state).T, state.T[0]
         )
 
     # the difference of two rotations is a logarithm, whose slope at zero is the angular velocity
@@ -110,6 +110,7 @@ def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> N
         scale=scale,
         atol=1e-9 * machine.size,
         atol_reason=reason,
+        is_batched=True,
     )
     scale = np.array(
         [length if a.dimension is Dimension.LENGTH else angle for a in machine.actuators]
@@ -122,6 +123,7 @@ def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> N
         scale=scale,
         atol=1e-9 * machine.size,
         atol_reason=reason,
+        is_batched=True,
     )
 
 
