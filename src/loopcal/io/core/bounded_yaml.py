@@ -10,55 +10,69 @@ from __future__ import annotations
 
 from typing import Any
 
-from ruamel.yaml.composer import Composer
-from ruamel.yaml.error import MarkedYAMLError
-from ruamel.yaml.events import AliasEvent
-
 from loopcal.io.core.limits import YAML_DEPTH, YAML_NODES, FileLimit
 
 
-class LimitError(MarkedYAMLError):
-    """A document beyond `limit`, at `problem_mark`."""
+class LimitError(Exception):
+    """A document beyond `limit`, at a line that is counted from 0."""
 
-    def __init__(self, limit: FileLimit, mark: Any) -> None:
-        super().__init__(problem=limit.of, problem_mark=mark)
+    def __init__(self, limit: FileLimit, line: int) -> None:
+        super().__init__(limit.of)
         self.limit = limit
+        self.line = line
 
 
-class BoundedComposer(Composer):
-    """A composer that counts; it raises LimitError as soon as a limit is exceeded."""
+def make_bounded_composer(loader: Any) -> Any:
+    """Return a composer of ruamel.yaml that counts values and levels.
 
-    def __init__(self, loader: Any = None) -> None:
-        super().__init__(loader)
-        self._level = self._count = 0
-        self._sizes: dict[str, int] = {}
+    Parameters
+    ----------
+    loader : of ruamel.yaml.
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Return the next node; count its values."""
-        event = self.parser.peek_event()
-        if isinstance(event, AliasEvent):
-            if event.anchor in self.anchors and event.anchor not in self._sizes:
-                problem = f"alias {event.anchor!r} stands for a value that contains the alias"
-                raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
-            self._add(self._sizes.get(event.anchor, 1), event)
-            return super().compose_node(parent, index)
-        before = self._count
-        self._add(1, event)
-        self._level += 1
-        if self._level > YAML_DEPTH.count:
-            raise LimitError(YAML_DEPTH, event.start_mark)
-        # YAML allows an anchor again, for another value; ruamel.yaml warns where it is still known
-        self.anchors.pop(event.anchor, None)
-        self._sizes.pop(event.anchor, None)
-        self.anchors.pop(event.anchor, None)  # ruamel.yaml would warn of the second one
-        node = super().compose_node(parent, index)
-        self._level -= 1
-        if event.anchor is not None:
-            self._sizes[event.anchor] = self._count - before
-        return node
+    Raises
+    ------
+    LimitError, MarkedYAMLError : while it composes, as soon as a limit is exceeded; or an alias
+        that stands for a value that contains it.
+    """
+    from ruamel.yaml.composer import Composer
+    from ruamel.yaml.error import MarkedYAMLError
+    from ruamel.yaml.events import AliasEvent
 
-    def _add(self, values: int, event: Any) -> None:
-        """Count values; raise LimitError where they are too many."""
-        self._count += values
-        if self._count > YAML_NODES.count:
-            raise LimitError(YAML_NODES, event.start_mark)
+    class BoundedComposer(Composer):
+        """A composer that counts."""
+
+        def __init__(self) -> None:
+            super().__init__(loader)
+            self._level = self._count = 0
+            self._sizes: dict[str, int] = {}
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            """Return the next node; count its values."""
+            event = self.parser.peek_event()
+            if isinstance(event, AliasEvent):
+                if event.anchor in self.anchors and event.anchor not in self._sizes:
+                    problem = f"alias {event.anchor!r} stands for a value that contains the alias"
+                    raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+                self._add(self._sizes.get(event.anchor, 1), event)
+                return super().compose_node(parent, index)
+            before = self._count
+            self._add(1, event)
+            self._level += 1
+            if self._level > YAML_DEPTH.count:
+                raise LimitError(YAML_DEPTH, event.start_mark.line)
+            # YAML allows an anchor again, for another value; ruamel.yaml warns where it is known
+            self.anchors.pop(event.anchor, None)
+            self._sizes.pop(event.anchor, None)
+            node = super().compose_node(parent, index)
+            self._level -= 1
+            if event.anchor is not None:
+                self._sizes[event.anchor] = self._count - before
+            return node
+
+        def _add(self, values: int, event: Any) -> None:
+            """Count values; raise LimitError where they are too many."""
+            self._count += values
+            if self._count > YAML_NODES.count:
+                raise LimitError(YAML_NODES, event.start_mark.line)
+
+    return BoundedComposer()

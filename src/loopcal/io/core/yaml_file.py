@@ -142,8 +142,7 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         line = error.problem_mark.line + first_line if error.problem_mark else None
         raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
     except LimitError as error:
-        line = error.problem_mark.line + first_line
-        raise error.limit.make_error(what, path, line=line) from None
+        raise error.limit.make_error(what, path, line=error.line + first_line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = _shorten(error.problem or error.context or "not YAML")
@@ -158,10 +157,10 @@ def make_round_trip_yaml() -> Any:
     """Return ruamel.yaml's round-trip reader and writer with the settings of this project."""
     from ruamel.yaml import YAML
 
-    from loopcal.io.core.bounded_yaml import BoundedComposer
+    from loopcal.io.core.bounded_yaml import make_bounded_composer
 
     yaml = YAML(typ="rt", pure=True)
-    yaml.Composer = BoundedComposer
+    yaml.Composer = make_bounded_composer
     yaml.preserve_quotes = True
     yaml.width = 120
     return yaml
