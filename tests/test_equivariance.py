@@ -8,6 +8,7 @@ A new file in src/loopcal/robots is included automatically.
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_units_of_the_file_do_not_matter(name: str, tmp_path: Path) -> None:
     head = {"format": 1, "units": {"length": "m", "angle": "rad"}, "family": family.family}
     path = tmp_path / "robot.yaml"
     with path.open("w") as stream:
-        YAML().dump({**head, **_restore_keys(si)}, stream)
+        YAML().dump(head | _restore_keys(si), stream)
     other = load_robot(path)
     assert other.parameters.names == robot.parameters.names
     assert_allclose(other.values, robot.values, rtol=1e-15, atol=0)
@@ -106,7 +107,7 @@ def test_units_of_the_file_do_not_matter(name: str, tmp_path: Path) -> None:
     assert_allclose(inverse(other, forward(robot, q).T).q, q, rtol=0, atol=1e-10)
 
 
-def _restore_keys(node: object) -> object:
+def _restore_keys(node: Any) -> Any:
     """Return a record with the keys of a file: `from` for `from_`."""
     if isinstance(node, dict):
         return {key.removesuffix("_"): _restore_keys(value) for key, value in node.items()}

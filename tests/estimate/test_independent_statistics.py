@@ -81,6 +81,7 @@ def test_inflated_tolerances_have_the_degrees_of_freedom_of_their_factor():
     data = measure(case, 1).measurements[0]
     options = FitOptions(method=MAP(InflatedTolerances(by="global")), sigma_uncertainty=0.0)
     fit = identify(ROBOT, data, options=options)
+    assert fit.prior_conflict is not None
     factor = fit.prior_conflict.inflation
     assert factor > 1.5
     dense = fit_densely(data, COARSE, 1.0 / factor**2)

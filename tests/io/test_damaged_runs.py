@@ -88,7 +88,7 @@ def write_result(run: Path, result: Any) -> None:
 def write_arrays(run: Path, arrays: dict[str, np.ndarray]) -> None:
     """Replace arrays.npz by an intact one with other arrays, as result.json names it."""
     with (run / "arrays.npz").open("wb") as stream:
-        np.savez(stream, **arrays)
+        np.savez(stream, allow_pickle=False, **arrays)
     result = json.loads((run / "result.json").read_text())
     content = (run / "arrays.npz").read_bytes()
     result["files"]["arrays.npz"] = hashlib.sha256(content).hexdigest()
@@ -231,7 +231,7 @@ CONTRADICTIONS = {
     "frames_names": lambda a: np.repeat(a, 2),
     "frames_by_parameters": lambda a: a[:, :, :-1],
     "posterior_source": lambda a: np.frombuffer(
-        np.uint32([0x110000] * len(a)).tobytes(), dtype="<U1"
+        np.array([0x110000] * len(a), dtype=np.uint32).tobytes(), dtype="<U1"
     ),
     "fitted_0_position": lambda a: np.full(a.shape, np.nan),
     "initial": lambda a: a[:-1],

@@ -145,7 +145,7 @@ def test_table_is_limited_in_rows_columns_and_length_of_lines(tmp_path) -> None:
 # arrays of a run folder
 
 
-def archive(folder: Path, compression: int = zipfile.ZIP_STORED, **members: bytes) -> Path:
+def archive(folder: Path, members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
     path = folder / "arrays.npz"
     with zipfile.ZipFile(path, "w", compression) as file:
         for name, content in members.items():
@@ -178,13 +178,13 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path) -> None:
 def test_zip_bomb_is_refused_before_it_is_expanded(tmp_path) -> None:
     bomb = npy(np.zeros(10**6))
     with pytest.raises(ValueError, match=r"'x\.npy' is compressed"):
-        read_arrays(archive(tmp_path, zipfile.ZIP_DEFLATED, x=bomb))
+        read_arrays(archive(tmp_path, {"x": bomb}, zipfile.ZIP_DEFLATED))
     limit = limits.FileLimit("", 1, "MB", "", "repeat the calibration", 10**6)
     with pytest.raises(FileError, match=r"8\.01 MB, but the limit is 1"):
-        read_arrays(archive(tmp_path, zipfile.ZIP_DEFLATED, x=bomb), size=limit)
+        read_arrays(archive(tmp_path, {"x": bomb}, zipfile.ZIP_DEFLATED), size=limit)
     many = {f"m{i}": b"" for i in range(1001)}
     with pytest.raises(FileError, match="has 1,001 arrays, but the limit is 1,000"):
-        read_arrays(archive(tmp_path, **many))
+        read_arrays(archive(tmp_path, many))
 
 
 @pytest.mark.parametrize("shape", ["(100000000000,)", "(2, 10000000000)", "(5,)", "(-1,)"])
@@ -193,11 +193,11 @@ def test_header_that_states_another_size_than_the_file_has_is_refused(tmp_path, 
     length = len(member) - 10 - 32
     member = member[:8] + length.to_bytes(2, "little") + member[10:]
     with pytest.raises(ValueError, match="another size than its header states"):
-        read_arrays(archive(tmp_path, x=member))
+        read_arrays(archive(tmp_path, {"x": member}))
 
 
 def test_damaged_archives_are_refused_with_a_reason(tmp_path) -> None:
-    whole = archive(tmp_path, x=npy(np.arange(100.0))).read_bytes()
+    whole = archive(tmp_path, {"x": npy(np.arange(100.0))}).read_bytes()
     path = tmp_path / "damaged.npz"
     for content in (b"", whole[:-30], whole[: len(whole) // 2], b"PK" + whole[2:500] + whole[501:]):
         path.write_bytes(content)
@@ -209,9 +209,9 @@ def test_damaged_archives_are_refused_with_a_reason(tmp_path) -> None:
     with pytest.raises(ValueError, match="CRC"):
         read_arrays(path)
     with pytest.raises(ValueError, match="neither numbers nor text"):
-        read_arrays(archive(tmp_path, x=npy(np.array([object()], dtype=object))))
+        read_arrays(archive(tmp_path, {"x": npy(np.array([object()], dtype=object))}))
     with pytest.raises(ValueError, match="magic"):
-        read_arrays(archive(tmp_path, x=b"not an array"))
+        read_arrays(archive(tmp_path, {"x": b"not an array"}))
 
 
 def test_documentation_lists_every_limit() -> None:

@@ -2,13 +2,13 @@
 """Files and folders take a name only when they are complete; what exists stays until then."""
 
 import os
+import secrets
 import stat
 from pathlib import Path
 
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.core import replacement
 from loopcal.io.core.outputs import replace_folder
 from loopcal.io.core.text_file import write_text
 
@@ -70,7 +70,7 @@ def test_temporary_names_are_unpredictable_and_created_exclusively(tmp_path, mon
     assert len(set(names)) == 50
     victim = tmp_path / "victim"
     victim.write_text("mine")
-    monkeypatch.setattr(replacement.secrets, "token_hex", lambda _: "0" * 16)
+    monkeypatch.setattr(secrets, "token_hex", lambda _: "0" * 16)
     planted = tmp_path / f".loopcal-new-{'0' * 16}-a"
     planted.symlink_to(victim)
     with pytest.raises(FileError, match="file exists"):

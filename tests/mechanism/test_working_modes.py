@@ -97,6 +97,7 @@ def test_shifted_commands_called_reached_lead_to_their_targets(name: str) -> Non
     robot = load_cached_robot(name)
     true = robot.with_values(robot.values + 1e-5)
     result = compensate(true, draw_targets(robot, 1.5, 15), "commands", steps=5)
+    assert result.commands is not None
     back = forward(true, inverse(robot, result.commands[result.usable]).q)
     assert result.usable.sum() > 3
     assert measure_gap(robot, back, result.reached[result.usable]).max() < ROUNDING

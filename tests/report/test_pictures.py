@@ -4,6 +4,7 @@
 import xml.etree.ElementTree as ET
 
 import pytest
+from matplotlib.text import Text
 
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
@@ -22,11 +23,8 @@ def build(name: str):
 def test_names_are_shown_as_they_are_written(name, tmp_path) -> None:
     robot = build(name)
     figure = draw(robot)
-    assert [
-        text.get_text()
-        for text in figure.findobj(lambda a: hasattr(a, "get_parse_math"))
-        if name in text.get_text() and not text.get_parse_math()
-    ]
+    texts = [artist for artist in figure.findobj(Text) if isinstance(artist, Text)]
+    assert [text for text in texts if name in text.get_text() and not text.get_parse_math()]
     figure.canvas.draw()
     save_picture(tmp_path / "a.svg", robot)
     ET.parse(tmp_path / "a.svg")
