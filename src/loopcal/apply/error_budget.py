@@ -22,7 +22,6 @@ from loopcal.apply.covariance_sources import (
     READINGS,
     REPEATABILITY,
     SETUP,
-    TOLERANCES,
     CovarianceSplit,
     Source,
     halve_sigma,
@@ -35,6 +34,7 @@ from loopcal.errors import MechanismError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.frame_freedoms import find_measured_frames
+from loopcal.estimate.inference.covariance_parts import TOLERANCES
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding

@@ -77,7 +77,7 @@ def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[
     of_row = [
         {i for label in poses.split("/") for i in owners.get(label, ())} for poses in errors.poses
     ]
-    nothing = {"quantity": "", "target": "", "error": ""}
+    nothing: dict[str, str | Quantity] = {"quantity": "", "target": "", "error": ""}
     worst, results = [0.0] * len(blunders), [nothing] * len(blunders)
     for quantity, of_rows in errors.after.quantities.items():
         floor, unit = errors.noise_floor.rms[quantity], errors.units[quantity]

@@ -170,7 +170,8 @@ def _word(value: Any, spec: str) -> str:
     if spec == "factor":
         return f"{value:.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"
     if spec == "sentence":
-        return f"{value[0].upper()}{value[1:].rstrip('.')}."
+        text = str(value)
+        return f"{text[0].upper()}{text[1:].rstrip('.')}."
     if spec.startswith("count "):
         singular, _, plural = spec.removeprefix("count ").partition("/")
         return f"{value} {singular if value == 1 else plural or singular + 's'}"

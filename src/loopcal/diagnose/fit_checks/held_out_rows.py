@@ -89,7 +89,8 @@ class HeldOutBlocks:
     def combine(self, excluded: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the factor R (k, k) and solution y (k,) of the blocks that are not excluded."""
         k = self.groups[0][1].shape[2]
-        stacked, count = [np.column_stack([np.eye(k), np.zeros(k)])], 0
+        count = 0
+        stacked: list[FloatArray] = [np.column_stack([np.eye(k), np.zeros(k)])]
         for numbers, H, residual, _ in self.groups:
             kept = ~excluded[numbers]
             rows = np.concatenate([H[kept], residual[kept][..., None]], axis=2)
@@ -258,7 +259,7 @@ def compare_blocks(
     b, m, k = H.shape
     half = H
     if H.size:  # one system for all blocks
-        half = solve_triangular(triangle, H.reshape(b * m, k).T, trans="T").T.reshape(H.shape)
+        half = solve_triangular(triangle, H.reshape(b * m, k).T, trans=1).T.reshape(H.shape)
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 

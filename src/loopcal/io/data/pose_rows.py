@@ -154,7 +154,7 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
             table, columns, rows, begin, several, hint if controller is None else ""
         )
     _refuse_other_readings(table, names, rows, begin)
-    is_unread = np.isnan(rows).all(axis=1).tolist()
+    is_unread = np.asarray(np.isnan(rows).all(axis=1))
     unread = frozenset(name for name, row in first.items() if is_unread[row])
     read = frozenset(first) - unread
     if controller is not None:
