@@ -97,7 +97,7 @@ class HeldOutBlocks:
             stacked.append(rows.reshape(-1, k + 1))
             count += len(stacked[-1])
             if count > FOLDED:
-                stacked, count = [np.linalg.qr(np.concatenate(stacked), mode="r")], 0
+                stacked, count = [np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))], 0
         triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
         R = triangle[:k, :k]
         return R, -np.linalg.solve(R, triangle[:k, k])
