@@ -155,10 +155,7 @@ MISSED = {
         "a batch 4.0 tolerances off",
         "a batch 6.0 tolerances off",
     },
-    "hexapod-42": {
-        "one parameter 5.0 tolerances off",
-        "one parameter 10.0 tolerances off",
-    },
+    "hexapod-42": {"one parameter 5.0 tolerances off", "one parameter 10.0 tolerances off"},
 }
 """Cases whose requirement is not reached; the page on evidence has their figures. Errors of
 parameters that these measurements hardly determine are covered by too few intervals, and rarely
