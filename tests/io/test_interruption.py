@@ -41,7 +41,7 @@ def test_first_run_folder_is_absent_or_complete(inputs) -> None:
     assert sorted(FIVE_BAR) == ["data.csv", "run", "targets.csv"]
 
 
-@pytest.mark.skipif(not RESULT.is_file(), reason="made by `make evidence`")
+@pytest.mark.evidence
 def test_all_writing_commands_were_stopped_at_fifty_moments() -> None:
     document = json.loads(RESULT.read_text())
     rows = document["tables"]["outcomes"]["rows"]
