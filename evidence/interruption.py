@@ -84,13 +84,18 @@ CASES = {
     "simulate": Case(
         "simulate five-bar -o out.csv --truth out.yaml --force", ("out.csv", "out.yaml")
     ),
-    "bootstrap": Case("bootstrap run -o out.csv --resamples 50 --force", ("out.csv",)),
+    "bootstrap": Case("bootstrap run -o out.csv --count 50 --force", ("out.csv",)),
     "sample": Case("sample run -o out.csv --force", ("out.csv",)),
     "identifiability": Case(
         "identifiability five-bar data.csv --reduce -o out.yaml --force", ("out.yaml",)
     ),
     "check": Case("check five-bar --plot out.png --force", ("out.png",)),
 }
+
+MOMENTS, TIMES = 50, 12
+"""Lines before which a copy is stopped, and times at which a slow one is; a slow copy takes up to a
+second.
+"""
 
 State = dict[str, dict[str, bytes] | None]
 """Output -> name -> content of its files; None where there is no output."""
@@ -384,14 +389,13 @@ def list_failures(outcomes: dict[str, dict[str, int]]) -> list[str]:
 
 def collect() -> dict[str, Any]:
     """Return the counts of all cases."""
-    moments = 50
     kinds = [KILL, INTERRUPT, f"{KILL}, slow", f"{INTERRUPT}, slow"]
     rows = []
     with tempfile.TemporaryDirectory() as place:
         inputs = Path(place)
         prepare_inputs(inputs)
         for name, case in CASES.items():
-            outcomes = examine(case, inputs, moments, moments)
+            outcomes = examine(case, inputs, MOMENTS, TIMES)
             for kind in kinds:
                 counts = Counter(outcomes[kind])
                 failed = sum(
@@ -414,6 +418,7 @@ def collect() -> dict[str, Any]:
         "failed",
     ]
     return {
-        "moments": moments,
+        "moments": MOMENTS,
+        "times": TIMES,
         "tables": {"outcomes": {"columns": columns, "formats": ["", "", *["d"] * 6], "rows": rows}},
     }
