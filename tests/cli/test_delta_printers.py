@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from loopcal.cli import main
+from loopcal.io.runs.run_folder import load_run
 from tests.cli.delta_printers import (
     list_stored_geometry,
     read_records,
@@ -304,3 +305,11 @@ def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["fit"]["rank"] == 7
     assert [cure["cures"][0]["words"] for cure in result["remedies"]] == [suggestion, suggestion]
+
+
+def test_run_of_a_chosen_set_of_parameters_is_read_back_and_exported(tmp_path, root) -> None:
+    heights, run = root / "examples" / "delta-printer" / "heights.csv", tmp_path / "run"
+    assert main(f"calibrate linear-delta {heights} -o {run} --choose-model".split()) == 0
+    stated = json.loads((run / "result.json").read_text("utf-8"))["fit"]["parameters"]
+    assert len(stated) < sum(load_run(run).robot.parameters.free)
+    assert main(f"export {run} -o {tmp_path / 'printer.cfg'}".split()) == 0
