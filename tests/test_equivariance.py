@@ -30,17 +30,12 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.mechanism import FAMILIES, Mechanism, build, forward, inverse, sample_workspace
-from tests.zoo import move_base
+from tests.zoo import load_cached_robot, move_base
 
 Array = NDArray[np.float64]
 ROBOTS = tuple(list_shipped_robots())
 POSES = 20
 CORNERS = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02], [-0.05, -0.08, 0.1]])
-
-
-@cache
-def load_cached_robot(name: str) -> Mechanism:
-    return load_robot(name)
 
 
 @cache

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
+from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import (
     AXES,
     Actuator,
@@ -103,6 +104,12 @@ NATEGH_TRUE_PLATFORM = np.array(
     ]
 ).T
 NATEGH_TRUE_LENGTHS = np.array((604.4299, 607.2473, 600.4441, 605.9031, 604.5251, 600.0616))
+
+
+@cache
+def load_cached_robot(name: str) -> Mechanism:
+    """Return a shipped robot, read once."""
+    return load_robot(name)
 
 
 @cache

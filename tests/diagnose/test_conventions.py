@@ -25,7 +25,6 @@ from loopcal.diagnose.conventions.judgement import BETTER
 from loopcal.diagnose.conventions.selection import ALLOWED
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import (
     KINDS,
@@ -46,15 +45,11 @@ from loopcal.measure import (
 from loopcal.mechanism import sample_workspace
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
+from tests.zoo import load_cached_robot
 
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
 FULL = Pose()
 PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
-
-
-@cache
-def load_cached_robot(name: str):
-    return load_robot(name)
 
 
 @cache

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mistyped values in robot files and settings are refused with their line, whatever they are."""
 
-import copy
 import json
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,33 +12,10 @@ from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
 from loopcal.io.formats.urdf_tree import read, read_joint_graph
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
 from loopcal.measure import KINDS, Observations
+from tests.io.changed_documents import change_value, list_places
 
 ROBOTS = ("hexapod-42", "linear-delta", "3-prs", "five-bar")
 WRONG = (..., {}, [], [None], {"rod": 1}, "x", 1e160, -1e308, None, True, [[1]], "*a")
-
-
-def list_places(node: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Return the places of all values, of lists those of the first entry."""
-    if place:
-        yield place
-    if isinstance(node, dict):
-        for key in node:
-            yield from list_places(node[key], (*place, key))
-    if isinstance(node, list) and node:
-        yield from list_places(node[0], (*place, 0))
-
-
-def replace(document: Any, place: tuple[str | int, ...], value: Any) -> Any:
-    """Return a document with another value at a place; without it for `...`."""
-    changed = copy.deepcopy(document)
-    node = changed
-    for step in place[:-1]:
-        node = node[step]
-    if value is ...:
-        del node[place[-1]]
-    else:
-        node[place[-1]] = value
-    return changed
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -51,7 +25,7 @@ def test_a_wrong_value_in_a_robot_file_is_refused_or_builds_a_robot(name) -> Non
     document = json.loads(json.dumps(plain))
     refused, places = 0, list(list_places(document))
     for i, place in enumerate(places):
-        text = json.dumps(replace(document, place, WRONG[i % len(WRONG)]))
+        text = json.dumps(change_value(document, place, WRONG[i % len(WRONG)]))
         refused += is_refused(text)
     assert refused > 0.5 * len(places)
 

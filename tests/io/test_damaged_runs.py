@@ -32,6 +32,7 @@ from loopcal.io.runs.run_arrays import (
 from loopcal.io.runs.run_folder import Run
 from loopcal.io.runs.run_result import read_result
 from loopcal.report.budget_view import view_budget
+from tests.io.changed_documents import change_value, list_places
 
 DATA = """# kind: position
 # places: [[20 mm, 10 mm, 5 mm]]
@@ -248,30 +249,6 @@ def test_arrays_that_contradict_each_other_or_the_result_are_refused(run, name) 
         lc.load_run(run)
 
 
-def list_places(node: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Return the places of all values, of lists those of the first entry."""
-    if place:
-        yield place
-    if isinstance(node, dict):
-        for key in node:
-            yield from list_places(node[key], (*place, key))
-    if isinstance(node, list) and node:
-        yield from list_places(node[0], (*place, 0))
-
-
-def replace(document: Any, place: tuple[str | int, ...], value: Any) -> Any:
-    """Return a document with another value at a place; without it for `...`."""
-    changed = copy.deepcopy(document)
-    node = changed
-    for step in place[:-1]:
-        node = node[step]
-    if value is ...:
-        del node[place[-1]]
-    else:
-        node[place[-1]] = value
-    return changed
-
-
 READ = ("format", "made_by", "verdict", "passed", "reasons", "split", "nulls", "files")
 OF_FIT = ("parameters", "local", "status", "dropped", "sigma_scale")
 WRONG = (..., -1.5, "{x}", [], {}, None, True, [[1]], {"a": 1}, 10**30)
@@ -296,7 +273,7 @@ def test_every_wrong_value_of_a_result_is_refused_or_harmless(run) -> None:
     sentences, tried = [], 0
     for place in list_places(whole):
         for value in WRONG:
-            write_result(run, replace(whole, place, value))
+            write_result(run, change_value(whole, place, value))
             tried += 1
             sentence, result = read_or_refuse(run / "result.json")
             if sentence is None:

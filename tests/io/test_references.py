@@ -4,12 +4,14 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from loopcal.cli import main
 from loopcal.errors import FileError
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.robot.robot_file import find_robot_file
+from loopcal.measure import Measurements
 
 HEAD = "# kind: component\n# components: [x]\n# noise: {x: 1 um}\n"
 READINGS = "pose,left [deg],right [deg]\na,100,30\nb,101,31\n"
@@ -34,7 +36,7 @@ def folders(tmp_path, monkeypatch) -> Path:
     return inside
 
 
-def load(folder: Path, text: str, name: str) -> object:
+def load(folder: Path, text: str, name: str) -> Measurements:
     (folder / "data.csv").write_text(text.replace("NAME", name))
     return load_measurements(folder / "data.csv", load_robot("five-bar"))
 
@@ -43,7 +45,7 @@ def load(folder: Path, text: str, name: str) -> object:
     "name", ["poses.csv", "deeper/poses.csv", "in.csv", "./deeper/../poses.csv"]
 )
 def test_path_inside_the_folder_is_read(folders, name) -> None:
-    load(folders, MEASURED, name)
+    assert np.isfinite(load(folders, MEASURED, name).readings).all()
 
 
 OUTSIDE = ["../poses.csv", "deeper/../../poses.csv", "out/poses.csv", "out.csv"]

@@ -6,26 +6,21 @@ A new file in src/loopcal/robots is included automatically.
 """
 
 from collections.abc import Iterator
-from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.mechanism import Mechanism, Solution, Status, forward, inverse
+from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
 ROBOTS = tuple(list_shipped_robots())
 ROWS, BLOCK = 20_000, 5_000
 SHARE = 0.999  # of rows that must return to the mode they came from
 FAR = 20.0  # times the workspace: no machine reaches all of it
-
-
-@cache
-def load_cached_robot(name: str) -> Mechanism:
-    return load_robot(name)
 
 
 def draw_coordinates(

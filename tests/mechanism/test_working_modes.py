@@ -5,8 +5,6 @@ robot, in its workspace and far beyond it.
 A new file in src/loopcal/robots is included automatically.
 """
 
-from functools import cache
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from loopcal import geometry
 from loopcal.apply.compensation import Reach, compensate
 from loopcal.errors import DataError
-from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import solve_commanded_poses
 from loopcal.mechanism import (
     Mechanism,
@@ -30,17 +28,13 @@ from loopcal.mechanism import (
 )
 from loopcal.mechanism.analysis.modes import find_working_modes
 from loopcal.mechanism.analysis.singularities import trace_singularity
+from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
 ROBOTS = tuple(list_shipped_robots())
 ROWS = 40
 WIDE = (1.0, 2.5, 6.0)  # times the ranges of the workspace
 ROUNDING = 1e-9  # of the size, or in radians
-
-
-@cache
-def load_cached_robot(name: str) -> Mechanism:
-    return load_robot(name)
 
 
 def draw_targets(robot: Mechanism, wide: float, n: int = ROWS) -> Array:

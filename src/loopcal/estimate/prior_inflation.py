@@ -125,7 +125,7 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     factor = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     if factor <= 1.0 and not method.components:
         return result
-    errors = [_estimate_factor_error(result, fit)] if factor > 1.0 else []
+    errors = [_estimate_factor_error(result, fit, factor)] if factor > 1.0 else []
     errors += _estimate_component_errors(fit, method, factor)
     scale = result.tolerance[:, None]
     parts = tuple(component.to_row(result.names) for component in method.components)
@@ -157,7 +157,7 @@ class _FactorError(NamedTuple):
         return 0.5 / self.spread**2
 
 
-def _estimate_factor_error(result: Identification, fit: Descent) -> _FactorError:
+def _estimate_factor_error(result: Identification, fit: Descent, factor: float) -> _FactorError:
     """Return what the error of the factor on all tolerances does.
 
     In the coordinates y of the decomposition the estimate changes by 2 (1 - f_i) y_i; deviations
@@ -166,8 +166,7 @@ def _estimate_factor_error(result: Identification, fit: Descent) -> _FactorError
     method = result.method
     assert isinstance(method, MAP)
     d, penalty = fit.decomposition, np.where(np.isfinite(fit.penalty), fit.penalty, 0.0)
-    factor = method.read_inflation(d, fit.penalty)
-    spread = float(estimate_factor_spread(_divide(d, method), factor)[0])
+    spread = float(estimate_factor_spread(_divide(d, method), np.array([factor]))[0])
     change = 2.0 * (1.0 - d.filter_factors(penalty)) * d.solution(fit.penalty)
     change = np.where(penalty > 0.0, change, 0.0)
     test, free = result.residual_test, result.free_parameters

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contract of every shipped robot. A new file in src/loopcal/robots is included automatically."""
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.mechanism import (
-    Mechanism,
     compare_coordinates,
     compute_readings,
     differentiate_pose,
@@ -22,13 +20,9 @@ from loopcal.mechanism import (
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 from tests.mechanism.families.ranks import random_coordinates
+from tests.zoo import load_cached_robot
 
 ROBOTS = tuple(list_shipped_robots())
-
-
-@cache
-def load_cached_robot(name: str) -> Mechanism:
-    return load_robot(name)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import (
     Mechanism,
     PoseRecord,
@@ -30,13 +29,9 @@ from loopcal.mechanism.families.limb_records import (
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from tests.mechanism.families.ranks import random_coordinates
+from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
-
-
-@cache
-def load_cached_robot(name: str) -> Mechanism:
-    return load_robot(name)
 
 
 @cache

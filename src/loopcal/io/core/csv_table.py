@@ -204,8 +204,9 @@ def _check_size(path: Path, numbered: Sequence[tuple[int, str]]) -> None:
     TABLE_ROWS.check(len(numbered) - 1, WHAT, path)
     for number, line in numbered:
         LINE_LENGTH.check(len(line), WHAT, path, number)
-    for number, line in numbered[:1]:
-        TABLE_COLUMNS.check(line.count(",") + 1, WHAT, path, number)
+    if numbered:
+        number, header = numbered[0]
+        TABLE_COLUMNS.check(header.count(",") + 1, WHAT, path, number)
 
 
 def require_columns(table: Table, needed: Sequence[str], why: str) -> None:

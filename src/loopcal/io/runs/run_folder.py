@@ -41,7 +41,13 @@ from loopcal.io.robot.robot_file import (
     load_robot,
 )
 from loopcal.io.runs.run_arrays import read_run_arrays
-from loopcal.io.runs.run_result import FORMAT, read_result, report_damage
+from loopcal.io.runs.run_result import (
+    FORMAT,
+    RESULT,
+    read_result,
+    refuse_other_parameters,
+    report_damage,
+)
 from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
     ROBOT,
@@ -57,7 +63,7 @@ if TYPE_CHECKING:
     from loopcal.measure import FittedRows, Measurements
     from loopcal.workflow import CalibrationReport
 
-RESULT, ARRAYS = "result.json", "arrays.npz"
+ARRAYS = "arrays.npz"
 RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))
 
 MADE_BY: Mapping[str, str] = {
@@ -340,7 +346,7 @@ def load_run(path: str | Path) -> Run:
     result, arrays = read_run_folder(path)
     robot = load_robot(_find_robot_file(path))
     before = arrays.get("initial", robot.parameters.nominal)
-    _refuse_other_parameters(result, len(before), robot, _find_robot_file(path))
+    refuse_other_parameters(result, len(before), robot, _find_robot_file(path))
     initial = robot.with_values(before)
     names = [row["name"] for row in result["fit"].get("local", ())]
     values, initial_values = (
@@ -348,23 +354,6 @@ def load_run(path: str | Path) -> Run:
         for key in ("local_estimate", "local_start")
     )
     return Run(path, result, robot, initial, values, initial_values, arrays)
-
-
-def _refuse_other_parameters(
-    result: Mapping[str, Any], count: int, robot: Mechanism, path: Path
-) -> None:
-    """Raise FileError where the robot file of a run has other parameters than its result, which
-    states those that were identified, and other ones than the `count` before the calibration.
-    """
-    stated = [row["name"] for row in result["fit"]["parameters"]]
-    table = robot.parameters
-    names = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
-    if [name for name in names if name in set(stated)] == stated and count == len(table):
-        return  # `--choose-model` identifies some of the free ones
-    different = sorted(set(stated) - set(names)) or names
-    raise FileError(
-        report_finding("files.run-robot-changed", result=RESULT, name=different[0]), path
-    )
 
 
 def load_run_or_robot(path: str | Path) -> Run:

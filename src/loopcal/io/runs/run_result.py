@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -20,7 +21,9 @@ from loopcal.io.core.json_text import read_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import YamlFile
+from loopcal.mechanism import Mechanism
 
+RESULT = "result.json"
 FORMAT = 2
 """Format of result.json; runs of format 1 lack `files`, and may lack keys that came later."""
 
@@ -179,6 +182,32 @@ def read_result(path: Path) -> dict[str, Any]:
     if problem := _find_contradiction(stated):
         raise report_damage(path, problem)
     return content
+
+
+def refuse_other_parameters(
+    result: Mapping[str, Any], count: int, robot: Mechanism, path: Path
+) -> None:
+    """Refuse a robot file of a run that lacks identified parameters.
+
+    Parameters
+    ----------
+    result : of `read_result`, which states the identified parameters. count : number of all
+        parameters before the calibration. robot : read from the file `path`; others may be free,
+        too, because `--choose-model` identifies some of them.
+
+    Raises
+    ------
+    FileError : `files.run-robot-changed`.
+    """
+    stated = [row["name"] for row in result["fit"]["parameters"]]
+    identified, table = set(stated), robot.parameters
+    names = [name for name, is_free in zip(table.names, table.free, strict=True) if is_free]
+    if [name for name in names if name in identified] == stated and count == len(table):
+        return
+    different = sorted(identified - set(names)) or names
+    raise FileError(
+        report_finding("files.run-robot-changed", result=RESULT, name=different[0]), path
+    )
 
 
 def report_damage(path: Path, problem: str) -> FileError:
