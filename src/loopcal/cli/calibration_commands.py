@@ -169,7 +169,7 @@ def _list_inputs(
     """Return role -> file of everything that is read."""
     from loopcal.io.data.measurement_file import list_measurement_files
     from loopcal.io.robot.robot_file import find_robot_file
-    from loopcal.io.runs.run_folder import RESULT
+    from loopcal.io.runs.run_result import RESULT
 
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
     if prior is not None:
