@@ -89,22 +89,45 @@ class Uniform(Noise):
         return generator.uniform(-1.0, 1.0, (n, len(self.limit))) * self.limit
 
 
-def make_random_stream(seed: int, trial: int, purpose: int = 0) -> np.random.Generator:
+@dataclass(frozen=True)
+class BlockStream:
+    """The random stream of a block of trials, in place of a seed.
+
+    It is that of the counter-based generator Philox, of which each trial and purpose uses a part of
+    its own; Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11 (2011), doi
+    10.1145/2063384.2063405.
+
+    Parameters
+    ----------
+    key : 128 bits of the study. block : number of the block.
+    """
+
+    key: int
+    block: int
+
+
+Seed = int | BlockStream
+
+
+def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Generator:
     """Return the generator of one trial of a study, a function of these three numbers only.
 
     Parameters
     ----------
-    seed : int
-        Of the study.
+    seed : int or BlockStream
+        Of the study, or of a block of its trials.
     trial : int
         Counted from 0. A trial gets the same numbers for any number of trials.
     purpose : int
-        Separates what one trial draws: 0 noise, 1 true values, 2 noise of readings.
+        Separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3 effects.
 
     Returns
     -------
     generator : numpy.random.Generator
     """
+    if isinstance(seed, BlockStream):
+        counter = np.array([0, purpose, trial, seed.block], dtype=np.uint64)
+        return np.random.Generator(np.random.Philox(key=seed.key, counter=counter))
     check_seed(seed)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(trial, purpose)))
 

@@ -7,6 +7,7 @@ the true machine turns readings into true poses. The instrument measures these p
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
-from loopcal.measure.instrument import Instrument, Sensor, make_random_stream
+from loopcal.measure.instrument import Instrument, Seed, Sensor, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -89,7 +90,12 @@ class Trials:
         )
 
 
-def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
+def sample_truth(
+    robot: Mechanism,
+    n_trials: int,
+    seed: Seed,
+    distribution: Literal["normal", "uniform"] = "normal",
+) -> FloatArray:
     """Draw true parameter values from the tolerances: `nominal + tolerance * standard normal`.
 
     A common error of several parameters is drawn once and added to each of them.
@@ -99,8 +105,11 @@ def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
     robot : Mechanism
         Parameters that are fixed or have no tolerance stay nominal.
     n_trials : int
-    seed : int
+    seed : int or BlockStream
         Trial i gets the same values for any number of trials.
+    distribution : "normal" or "uniform"
+        Of the errors. The tolerances are their standard deviations in both: uniform errors lie
+        within sqrt(3) of them.
 
     Returns
     -------
@@ -110,9 +119,13 @@ def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
     table = robot.parameters
     own = np.array([entry.tolerance or 0.0 for entry in table.entries])
     effects = np.column_stack([np.diag(own), table.common_effects]) * table.free[:, None]
+    streams = (make_random_stream(seed, trial, TRUTH) for trial in range(n_trials))
+    limit = np.sqrt(3.0)
     draws = [
-        make_random_stream(seed, trial, TRUTH).standard_normal(effects.shape[1])
-        for trial in range(n_trials)
+        stream.standard_normal(effects.shape[1])
+        if distribution == "normal"
+        else stream.uniform(-limit, limit, effects.shape[1])
+        for stream in streams
     ]
     return table.nominal + np.array(draws).reshape(n_trials, effects.shape[1]) @ effects.T
 
@@ -122,7 +135,7 @@ def simulate_trials(
     truth: ArrayLike,
     poses: ArrayLike,
     instrument: Instrument,
-    seed: int,
+    seed: Seed,
     controller: Mechanism | None = None,
     nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
@@ -138,7 +151,7 @@ def simulate_trials(
     poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
         As commanded.
     instrument : Instrument
-    seed : int
+    seed : int or BlockStream
         Trial i draws the same noise for any number of trials.
     controller : Mechanism, optional
         The geometry that turns poses into readings; default: the robot at its nominal values.
@@ -310,7 +323,7 @@ def _close_all_limbs(
 
 
 def record_readings(
-    robot: Mechanism, true: FloatArray, sigma: ArrayLike | None, trials: int, seed: int
+    robot: Mechanism, true: FloatArray, sigma: ArrayLike | None, trials: int, seed: Seed
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return recorded readings (t, n, a) of true ones (t | 1, n, a), and their sigma (n, a); None
     for the readings where all are exact.

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scores of trials: what each column of the results of a block contains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopcal.studies.specification import Scores
+
+
+@dataclass(frozen=True)
+class ScoreColumn:
+    """A column of the results of trials. `unit` : "m", "rad" or "1"."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+COLUMNS = (
+    ScoreColumn("outcome", "1", "0 for a trial that converged, else the number of a code"),
+    ScoreColumn("position_before", "m", "held-out position error before calibration, rms"),
+    ScoreColumn("position_before_max", "m", "held-out position error before calibration, largest"),
+    ScoreColumn("position", "m", "held-out position error after calibration, rms"),
+    ScoreColumn("position_max", "m", "held-out position error after calibration, largest"),
+    ScoreColumn("orientation_before", "rad", "held-out rotation error before calibration, rms"),
+    ScoreColumn(
+        "orientation_before_max", "rad", "held-out rotation error before calibration, largest"
+    ),
+    ScoreColumn("orientation", "rad", "held-out rotation error after calibration, rms"),
+    ScoreColumn("orientation_max", "rad", "held-out rotation error after calibration, largest"),
+    ScoreColumn("parameters", "1", "error of the parameters over their tolerances, rms"),
+    ScoreColumn("parameters_max", "1", "error of the parameters over their tolerances, largest"),
+    ScoreColumn("lengths", "m", "error of the parameters that are lengths, rms"),
+    ScoreColumn("angles", "rad", "error of the parameters that are angles, rms"),
+    ScoreColumn("covered_parameters", "1", "share of the parameters in their 95 % intervals"),
+    ScoreColumn("covered_position", "1", "share of held-out poses with position error below U95"),
+    ScoreColumn(
+        "covered_orientation", "1", "share of held-out poses with rotation error below U95"
+    ),
+    ScoreColumn("rank", "1", "number of combinations of parameters that the data determine"),
+    ScoreColumn("condition", "1", "condition number of the scaled rows"),
+    ScoreColumn("iterations", "1", "steps of the fit"),
+    ScoreColumn("noise", "1", "residuals over stated noise"),
+)
+"""Columns of every study."""
+
+VERDICT_COLUMNS = (
+    ScoreColumn("verdict", "1", "0 calibrated, 1 with reservations, 2 undecided, 3 not calibrated"),
+)
+"""Further columns of a study that calibrates every trial in full."""
+
+
+def list_columns(scores: Scores) -> tuple[ScoreColumn, ...]:
+    """Return the columns of the results of trials."""
+    return (*COLUMNS, *(VERDICT_COLUMNS if scores.verdict else ()))
