@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scores of a block: draw machines, measure them, calibrate them, compare them with the truth."""
+"""The scores of a block: draw machines, measure and calibrate them, compare with the truth."""
 
 from __future__ import annotations
 

@@ -7,7 +7,8 @@ study file ──> Study ──> cells (product of the levels of all factors) �
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -85,7 +86,7 @@ class Study:
         return compute_key(describe_block(self, cell, block))
 
     def list_tasks(
-        self, cells: Sequence[int] | None = None, finished: Set[str] = frozenset()
+        self, cells: Sequence[int] | None = None, finished: AbstractSet[str] = frozenset()
     ) -> Iterator[BlockTask]:
         """Yield the blocks of some cells, or of all, whose keys are not finished.
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from loopcal.studies.block import OUTCOMES as OUTCOMES
 from loopcal.studies.block import compute_scores
 from loopcal.typing import FloatArray
 
