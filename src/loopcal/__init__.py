@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from loopcal.errors import FileError as FileError
     from loopcal.errors import LoopcalError as LoopcalError
     from loopcal.errors import MechanismError as MechanismError
+    from loopcal.errors import StudyError as StudyError
     from loopcal.errors import UnitError as UnitError
     from loopcal.estimate import GCV as GCV
     from loopcal.estimate import MAP as MAP
@@ -155,7 +156,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
-            UnitError
+            StudyError UnitError
         """,
         "loopcal.estimate": """
             Combination DescentStatus FitOptions GCV Huber Identification IdentifiedTrials

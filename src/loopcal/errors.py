@@ -59,6 +59,10 @@ class EstimationError(LoopcalError):
     """An estimate that cannot be made from these data with this method."""
 
 
+class StudyError(LoopcalError):
+    """A study that cannot be computed as asked, such as without workers."""
+
+
 class ArgumentTypeError(LoopcalError, TypeError):
     """An argument of the wrong type; the text says what to pass."""
 

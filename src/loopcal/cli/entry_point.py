@@ -25,6 +25,7 @@ from loopcal.cli.time_limit import TimeLimitError, add_time_limit
 from loopcal.errors import LoopcalError, suggest_names
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
+from loopcal.threads import THREADS
 
 SECTIONS = {
     "Describe the robot": {
@@ -63,24 +64,9 @@ MODULES = {
     "plan_command": ("plan",),
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
     "sampling_commands": ("bootstrap", "sample", "region"),
-    "study_commands": ("reproduce", "per-leg"),
+    "paper_commands": ("reproduce", "per-leg"),
 }
 """Modules of this package, and the commands in each; they are imported when they run."""
-
-THREADS = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "GOTO_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "BLIS_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
-"""Variables by which libraries of linear algebra choose their threads, before numpy is imported.
-
-One thread makes the last digits of results independent of the machine's settings. It is also the
-fastest, because the matrices are small and threads wait for each other (5000 poses on two cores:
-0.3 s with one thread, 5 s and more with two).
-"""
 
 
 class SectionedGroup(click.Group):

@@ -36,6 +36,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "apply": ("validation", "accuracy", "compensation"),
     "sampling": ("sampling",),
     "plan": ("plan",),
+    "study_folders": ("store", "workers"),
     "files": ("files",),
 }
 """Files of this folder, in the order of docs/findings.md, and the subjects of their codes."""

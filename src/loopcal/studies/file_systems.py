@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""On which file system a folder is: SQLite's write-ahead log needs memory that all its users share,
+which network file systems do not have.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+MOUNTS = Path("/proc/self/mountinfo")
+"""Where Linux lists what is mounted."""
+
+NETWORK = frozenset(
+    "9p acfs afs afpfs beegfs ceph cephfs cifs coda davfs fhgfs gfs gfs2 glusterfs gpfs lustre "
+    "mmfs ncpfs nfs nfs3 nfs4 ocfs2 orangefs panfs pvfs2 quobyte smb3 smbfs vboxsf virtiofs wekafs "
+    "webdav".split()
+)
+"""Types of network and cluster file systems, and of folders that a virtual machine shares."""
+
+NETWORK_IN_USER_SPACE = re.compile(
+    r"fuse\.(?!ext|ntfs|exfat|overlay|fuse-overlayfs|bindfs|portal|gvfsd|lxcfs|gocryptfs|encfs)"
+)
+"""File systems of user programs, but for those that are known to use a local disk."""
+
+_OCTAL = re.compile(r"\\([0-7]{3})")
+
+
+def find_network_file_system(folder: Path) -> str | None:
+    """Return the type of the network file system that a folder is on, such as `nfs4`.
+
+    None where it is on a local disk, or where the system does not say it. Of a folder that does not
+    exist, the place where it would be made counts.
+    """
+    path = folder.resolve()
+    if sys.platform == "win32":
+        return _find_network_drive(path)
+    if not MOUNTS.exists():
+        return None
+    kind = find_type(MOUNTS.read_text("utf-8", errors="surrogateescape"), path)
+    return kind if is_network(kind) else None
+
+
+def is_network(kind: str) -> bool:
+    """Return whether a type of file system is one of a network."""
+    return kind in NETWORK or NETWORK_IN_USER_SPACE.match(kind) is not None
+
+
+def find_type(mounts: str, path: Path) -> str:
+    """Return the type of the file system of an absolute path; empty where there is none.
+
+    Parameters
+    ----------
+    mounts : text of the form of /proc/self/mountinfo; the last one of equal mounts counts.
+
+    Examples
+    --------
+    >>> mounts = "1 0 8:1 / / rw - ext4 /dev/a rw\\n2 1 0:40 / /home rw shared:1 - nfs4 host:/b rw"
+    >>> find_type(mounts, Path("/home/user/study")), find_type(mounts, Path("/tmp"))
+    ('nfs4', 'ext4')
+    """
+    kind, depth = "", -1
+    for line in mounts.splitlines():
+        before, _, after = line.partition(" - ")
+        place = Path(_OCTAL.sub(lambda match: chr(int(match[1], 8)), before.split(" ")[4]))
+        if path.is_relative_to(place) and len(place.parts) >= depth:
+            kind, depth = after.split(" ")[0], len(place.parts)
+    return kind
+
+
+def _find_network_drive(path: Path) -> str | None:
+    """Return "network drive" for a path of Windows on one."""
+    import ctypes
+
+    remote = 4  # DRIVE_REMOTE
+    kind = ctypes.windll.kernel32.GetDriveTypeW(path.anchor)  # type: ignore[attr-defined]
+    return "network drive" if kind == remote or path.anchor.startswith("\\\\") else None

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Workers of every kind give the same results, and a lost worker costs only its tasks."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import dask
+import distributed
+import numpy as np
+import pytest
+
+from loopcal.errors import FileError, StudyError
+from loopcal.studies.execution import Answer, Dask, Executor, Processes, Ray, Serial
+from loopcal.studies.execution.interface import MOST_LOSSES
+from tests.findings.expectations import expect_refusal
+from tests.studies.block_functions import (
+    NumberTask,
+    count_threads,
+    die_always,
+    die_once,
+    draw_numbers,
+    list_tasks,
+    refuse_third,
+)
+
+ROOT = str(Path(__file__).parents[2])
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[distributed.LocalCluster]:
+    """Return a real scheduler and two real worker processes of dask."""
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "2s"}),  # to a worker that was killed
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
+    ):
+        yield cluster
+
+
+@pytest.fixture(params=["serial", "processes", "dask"])
+def executor(request) -> Executor:
+    match request.param:
+        case "serial":
+            return Serial()
+        case "processes":
+            return Processes(2)
+        case _:
+            return Dask(request.getfixturevalue("cluster").scheduler_address)
+
+
+def collect(answers) -> dict[int, Answer]:
+    """Return answers by the number of their task; each task has one."""
+    collected = list(answers)
+    by_number = {answer.task.number: answer for answer in collected}
+    assert len(by_number) == len(collected)
+    return by_number
+
+
+def check_numbers(answers: dict[int, Answer], count: int) -> None:
+    assert sorted(answers) == list(range(count))
+    for number, answer in answers.items():
+        assert np.array_equal(answer.result, draw_numbers(NumberTask(number)))
+
+
+def test_every_kind_of_worker_gives_the_same_results(executor) -> None:
+    answers = collect(executor.map_blocks(draw_numbers, list_tasks(20, pause=0.01)))
+    check_numbers(answers, 20)
+    assert all(answer.seconds >= 0.01 for answer in answers.values())
+    assert all(answer.losses == 0 for answer in answers.values())
+
+
+def test_no_task_gives_no_answer(executor) -> None:
+    assert list(executor.map_blocks(draw_numbers, [])) == []
+
+
+def test_tasks_may_be_endless_because_few_are_in_flight(executor, tmp_path) -> None:
+    tasks = list_tasks(sys.maxsize, tmp_path)
+    with closing(executor.map_blocks(draw_numbers, tasks)) as answers:
+        first = list(itertools.islice(answers, 10))
+    assert len(first) == 10
+    assert len(list(tmp_path.glob("taken-*"))) <= 10 + 5
+
+
+def test_error_of_the_library_reaches_the_caller_with_its_place(executor) -> None:
+    with pytest.raises(FileError) as caught:
+        collect(executor.map_blocks(refuse_third, list_tasks(6)))
+    assert str(caught.value) == "study.yaml:7: task 3 is refused"
+
+
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+def test_lost_workers_cost_only_their_tasks(kind, request, tmp_path) -> None:
+    chosen = Processes(2)
+    if kind == "dask":
+        chosen = Dask(request.getfixturevalue("cluster").scheduler_address)
+    answers = collect(chosen.map_blocks(die_once, list_tasks(8, tmp_path)))
+    check_numbers(answers, 8)
+    if kind == "processes":  # the scheduler of dask does not say which tasks it repeated
+        assert [n for n, answer in sorted(answers.items()) if answer.losses] == [0, 3, 6]
+
+
+def test_task_that_stops_every_worker_is_given_up() -> None:
+    answers = collect(Processes(2).map_blocks(die_always, list_tasks(5)))
+    lost = answers.pop(2)
+    assert (lost.result, lost.losses) == (None, MOST_LOSSES)
+    assert sorted(answers) == [0, 1, 3, 4]
+
+
+def test_processes_have_one_thread_of_linear_algebra_each(monkeypatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    answers = list(Processes(2).map_blocks(count_threads, list_tasks(8)))
+    assert len({answer.result[0] for answer in answers} - {os.getpid()}) == 2
+    assert all(answer.result[1] == ["1", "1", "1"] for answer in answers)
+    assert (os.environ["OMP_NUM_THREADS"], os.environ.get("MKL_NUM_THREADS")) == ("7", None)
+
+
+def test_closed_iteration_leaves_no_process() -> None:
+    with closing(Processes(2).map_blocks(draw_numbers, list_tasks(50, pause=0.2))) as answers:
+        next(answers)
+        workers = [p for p in multiprocessing.active_children() if "Dask" not in p.name]
+        assert len(workers) == 2
+    assert not any(worker.is_alive() for worker in workers)
+
+
+UNGUARDED = """
+from loopcal.studies.execution import Processes
+from tests.studies.block_functions import draw_numbers, list_tasks
+list(Processes(1).map_blocks(draw_numbers, list_tasks(2)))
+"""
+
+
+def test_script_without_guard_gets_a_sentence_instead_of_endless_processes(tmp_path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, check=False
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1
+    assert last.startswith("loopcal.errors.StudyError: worker processes end while they start")
+
+
+ORPHAN = """
+from loopcal.studies.execution import Processes
+from tests.studies.block_functions import count_threads, list_tasks
+if __name__ == "__main__":
+    for answer in Processes(2).map_blocks(count_threads, list_tasks(10_000)):
+        print(answer.result[0], flush=True)
+"""
+
+
+def test_workers_end_when_their_driver_is_killed(tmp_path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(ORPHAN)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    with subprocess.Popen(
+        [sys.executable, script], env=environment, stdout=subprocess.PIPE, text=True
+    ) as driver:
+        assert driver.stdout is not None
+        workers = {int(driver.stdout.readline()) for _ in range(8)}
+        driver.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 10.0
+    while any(is_running(worker) for worker in workers):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert len(workers) == 2
+
+
+def is_running(process: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+
+
+def test_dask_without_scheduler_or_workers_is_refused() -> None:
+    with expect_refusal("workers.cluster-not-reached", StudyError):
+        list(Dask("tcp://127.0.0.1:1", patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address=None) as empty,
+        expect_refusal("workers.cluster-without-workers", StudyError),
+    ):
+        address = empty.scheduler_address
+        list(Dask(address, patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
+
+
+def test_scheduler_that_ends_is_reported() -> None:
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
+    answers = Dask(cluster.scheduler_address).map_blocks(draw_numbers, list_tasks(500, pause=0.05))
+    next(answers)
+    cluster.close()
+    with expect_refusal("workers.cluster-lost", StudyError):
+        list(answers)
+
+
+def test_missing_package_is_named(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with expect_refusal("workers.package-missing", StudyError, package="ray", extra="ray"):
+        list(Ray().map_blocks(draw_numbers, list_tasks(1)))
