@@ -13,6 +13,9 @@ FORBIDDEN_MODULES = {
     "poplib", "pty", "runpy", "shelve", "smtplib", "socket", "socketserver", "ssl", "subprocess",
     "telnetlib", "urllib", "webbrowser", "xmlrpc",
 }  # fmt: skip
+ALLOWED = {"studies/execution/processes.py": {"multiprocessing", "multiprocessing.connection",
+                                             "multiprocessing.process"}}  # fmt: skip
+"""The workers of a study are processes of this program."""
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "system", "popen", "spawnl", "execv"}
 
 WATCH = """
@@ -66,6 +69,8 @@ def test_no_module_can_start_a_program_open_an_address_or_run_text(root: Path) -
                 name = getattr(function, "attr", getattr(function, "id", ""))
                 names += [name] if name in FORBIDDEN_CALLS and not is_pattern else []
             wrong = FORBIDDEN_MODULES | FORBIDDEN_CALLS
+            allowed = ALLOWED.get(path.relative_to(root / "src" / "loopcal").as_posix(), set())
+            names = [name for name in names if name not in allowed]
             found += [f"{path.name}: {name}" for name in names if name.split(".")[0] in wrong]
     assert found == []
 

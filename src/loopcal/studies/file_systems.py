@@ -12,10 +12,11 @@ from pathlib import Path
 MOUNTS = Path("/proc/self/mountinfo")
 """Where Linux lists what is mounted."""
 
-NETWORK = frozenset(
-    "9p acfs afs afpfs beegfs ceph cephfs cifs coda davfs fhgfs gfs gfs2 glusterfs gpfs lustre "
-    "mmfs ncpfs nfs nfs3 nfs4 ocfs2 orangefs panfs pvfs2 quobyte smb3 smbfs vboxsf virtiofs wekafs "
-    "webdav".split()
+NETWORK = (
+    *("9p", "acfs", "afpfs", "afs", "beegfs", "ceph", "cephfs", "cifs", "coda", "davfs", "fhgfs"),
+    *("gfs", "gfs2", "glusterfs", "gpfs", "lustre", "mmfs", "ncpfs", "nfs", "nfs3", "nfs4"),
+    *("ocfs2", "orangefs", "panfs", "pvfs2", "quobyte", "smb3", "smbfs", "vboxsf", "virtiofs"),
+    *("wekafs", "webdav"),
 )
 """Types of network and cluster file systems, and of folders that a virtual machine shares."""
 
@@ -56,7 +57,9 @@ def find_type(mounts: str, path: Path) -> str:
 
     Examples
     --------
-    >>> mounts = "1 0 8:1 / / rw - ext4 /dev/a rw\\n2 1 0:40 / /home rw shared:1 - nfs4 host:/b rw"
+    >>> disk = "1 0 8:1 / / rw - ext4 /dev/a rw"
+    >>> server = "2 1 0:40 / /home rw shared:1 - nfs4 host:/b rw"
+    >>> mounts = chr(10).join([disk, server])
     >>> find_type(mounts, Path("/home/user/study")), find_type(mounts, Path("/tmp"))
     ('nfs4', 'ext4')
     """

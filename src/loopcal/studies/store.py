@@ -5,7 +5,7 @@ Only the driver of a study writes it, one transaction for each block. What was c
 driver that is killed (write-ahead log). The lock of a driver is one of the folder, which the
 operating system releases when the driver ends in whatever way. Others can read meanwhile.
 
-Tables: `study` (name -> value), `cells` (levels as JSON) and `blocks` (key, cell, block, trials, the
+Tables: `study` (name -> value), `cells` (levels as JSON) and `blocks` (key, cell, block, trials,
 scores as float64 of little end, seconds of computation).
 """
 
@@ -19,7 +19,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -134,7 +133,7 @@ class StudyStore:
         ------
         FileError : it cannot be written, as on a full disk. Then nothing of it is stored.
         """
-        assert scores.ndim == 2 and scores.shape[1] == self.width, scores.shape
+        assert scores.shape == (len(scores), self.width), scores.shape
         content = np.ascontiguousarray(scores, dtype="<f8").tobytes()
         with _report_errors(self.path), self.connection:
             row = (key, self._find_cell(levels), block, len(scores), content, seconds)
@@ -158,6 +157,17 @@ class StudyStore:
         )
         with _report_errors(self.path):
             return CellCount(*self.connection.execute(question, (_name_cell(levels),)).fetchone())
+
+    def count_blocks(self, levels: Levels, blocks: range) -> int:
+        """Return how many of these blocks of a cell are stored."""
+        question = (
+            "SELECT count(*) FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?) "
+            "AND block >= ? AND block < ? AND (block - ?) % ? = 0"
+        )
+        bounds = (blocks.start, blocks.stop, blocks.start, blocks.step)
+        with _report_errors(self.path):
+            row = self.connection.execute(question, (_name_cell(levels), *bounds)).fetchone()
+        return int(row[0])
 
     def read_blocks(self, levels: Levels) -> Iterator[tuple[int, FloatArray]]:
         """Yield the blocks of a cell with their numbers, in this order: (number, (B, s) scores)."""
@@ -222,7 +232,7 @@ def make_store(folder: Path, header: StoreHeader) -> None:
     """
     path = folder / NAME
     refuse_network(folder)
-    with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
+    with _report_errors(path), closing(_connect(path)) as connection:
         connection.executescript(TABLES)
         StudyStore(path, connection).set_header(header)
 
@@ -242,7 +252,7 @@ def open_store(folder: Path) -> Iterator[StudyStore]:
     try:
         if descriptor is not None and lock(descriptor) is False:
             raise FileError(report_finding("store.other-driver"), folder)
-        with _report_errors(path), closing(sqlite3.connect(path, PATIENCE)) as connection:
+        with _report_errors(path), closing(_connect(path)) as connection:
             _refuse_format(path, connection)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
@@ -267,10 +277,9 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
     is_copy = is_still and find_network_file_system(folder) is not None
     mode = "immutable=1" if is_copy else "mode=ro"
     address = f"{path.resolve().as_uri()}?{mode}"
-    with _report_errors(path):
-        with closing(sqlite3.connect(address, PATIENCE, uri=True)) as connection:
-            _refuse_format(path, connection)
-            yield StudyStore(path, connection)
+    with _report_errors(path), closing(_connect(address, uri=True)) as connection:
+        _refuse_format(path, connection)
+        yield StudyStore(path, connection)
 
 
 def is_driven(folder: Path) -> bool:
@@ -289,6 +298,11 @@ def refuse_network(folder: Path) -> None:
     kind = find_network_file_system(folder)
     if kind is not None:
         raise FileError(report_finding("store.network-file-system", kind=kind), folder)
+
+
+def _connect(place: Path | str, uri: bool = False) -> sqlite3.Connection:
+    """Open an SQLite file."""
+    return sqlite3.connect(place, PATIENCE, uri=uri)
 
 
 def _find_store(folder: Path) -> Path:
@@ -329,7 +343,7 @@ def _report_errors(path: Path) -> Iterator[None]:
             raise  # a defect: two blocks of one number
         if number in FULL:
             finding = report_finding("store.disk-full", reason=reason)
-        elif number in UNREADABLE or isinstance(error, sqlite3.DatabaseError) and not number:
+        elif number in UNREADABLE or (isinstance(error, sqlite3.DatabaseError) and not number):
             finding = report_finding("store.damaged")
         else:
             finding = report_finding("store.not-accessible", reason=reason)

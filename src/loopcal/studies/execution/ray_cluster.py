@@ -11,14 +11,7 @@ from typing import Any
 
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
-from loopcal.studies.execution.interface import (
-    MOST_LOSSES,
-    Answer,
-    R,
-    T,
-    TaskQueue,
-    compute_timed,
-)
+from loopcal.studies.execution.interface import MOST_LOSSES, Answer, R, T, TaskQueue, compute_timed
 from loopcal.studies.execution.optional_packages import import_optional
 
 QUEUED = 2
