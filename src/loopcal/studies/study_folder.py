@@ -19,8 +19,15 @@ from loopcal.io.core.outputs import replace_folder, resolve_folder
 from loopcal.io.core.text_file import read_bytes
 from loopcal.studies.changes import list_conflicts
 from loopcal.studies.keys import NUMERICS
-from loopcal.studies.store import NAME, StoreHeader, StudyStore, make_store, open_store, read_store
-from loopcal.studies.store import refuse_network as refuse_network
+from loopcal.studies.store import (
+    NAME,
+    StoreHeader,
+    StudyStore,
+    make_store,
+    open_store,
+    read_store,
+    refuse_network,
+)
 from loopcal.studies.study import Study
 
 STUDY_FILE = "study.yaml"
