@@ -118,12 +118,12 @@ class PoseUncertainty:
     @property
     def expanded_position(self) -> FloatArray:
         """(n,) length that 95 % of the displacements of the point do not exceed [m]."""
-        return _expand_length(self.covariance[:, 3:, 3:], self.degrees.position)
+        return expand_length(self.covariance[:, 3:, 3:], self.degrees.position)
 
     @property
     def expanded_orientation(self) -> FloatArray:
         """(n,) angle that 95 % of the rotations of the platform do not exceed [rad]."""
-        return _expand_length(self.covariance[:, :3, :3], self.degrees.orientation)
+        return expand_length(self.covariance[:, :3, :3], self.degrees.orientation)
 
     @property
     def position(self) -> FloatArray:
@@ -217,33 +217,61 @@ def _covariance(
     D = list_error_twists(posterior, solution.T, S.parameters[0][:, :, posterior.places])
     size = np.linalg.norm(D[..., :p] * twist_weights(robot)[:, None], axis=(1, 2))
     D, by_discrepancy = np.split(H @ frame.relate(D, solution.T), [p], axis=2)
-    rest = [by_discrepancy]
+    of_frame = H @ frame.own_errors(solution.T)
+    rest = [of_frame, by_discrepancy]
     slow = posterior.discrepancy
     if slow is not None:
         rest.append(H @ slow.errors.rest(solution.T))
         posterior = posterior.without_discrepancy
-    is_infinite = np.isinf(posterior.variance)
-    known = posterior.directions[:, ~is_infinite] * np.sqrt(posterior.variance[~is_infinite])
-    of_frame = H @ frame.own_errors(solution.T)
-    factors = [D @ known, of_frame, *rest]
     if robot.stated_sigma.any():
-        factors.append(H @ (S.readings[0] * robot.stated_sigma))
-    root = np.concatenate(factors, axis=2)
-    # such as at the pose to which errors are relative
-    is_rounding = np.linalg.norm(root, axis=2) < ROUNDING * twist_weights(robot)[[3, 3, 3, 0, 0, 0]]
-    root[is_rounding] = 0.0
-    covariance = root @ root.swapaxes(1, 2)
-    if is_infinite.any():
-        unknown = posterior.directions[:, is_infinite]
-        moved = np.linalg.norm(D @ unknown, axis=2) * twist_weights(robot)
-        lost = moved > NO_MOTION * size[:, None]
-        covariance[lost[:, :, None] | lost[:, None, :]] = np.nan
-        pose, component = np.nonzero(lost)
-        covariance[pose, component, component] = np.inf
+        rest.append(H @ (S.readings[0] * robot.stated_sigma))
+    covariance = combine_errors(
+        robot,
+        D[None],
+        posterior.directions[None],
+        posterior.variance[None],
+        size[None],
+        tuple(part[None] for part in rest),
+    )[0]
     covariance[~solution.converged] = np.nan
     squares = [] if slow is None else slow.split_squares(by_discrepancy)
     degrees = _count_degrees(posterior, covariance, D, of_frame, squares)
     return covariance, degrees.components, degrees.position, degrees.orientation
+
+
+def combine_errors(
+    robot: Mechanism,
+    D: FloatArray,
+    directions: FloatArray,
+    variance: FloatArray,
+    size: FloatArray,
+    others: tuple[FloatArray, ...] = (),
+) -> FloatArray:
+    """Return the covariance (t, n, 6, 6) of the errors of n poses of t machines; infinite on the
+    diagonal (and NaN beside it) where the data do not determine a component.
+
+    Parameters
+    ----------
+    D : (t, n, 6, p) errors by the parameters in their units, of a point in a frame.
+    directions, variance : (t, p, p), (t, p) as in `Posterior`.
+    size : (t, n) of the effect of all parameters, rotations times the robot's size.
+    others : (t, n, 6, k) effects of other independent errors of variance 1.
+    """
+    is_infinite = np.isinf(variance)
+    known = directions * np.sqrt(np.where(is_infinite, 0.0, variance))[:, None, :]
+    root = np.concatenate([D @ known[:, None], *others], axis=3)
+    # such as at the pose to which errors are relative
+    is_rounding = np.linalg.norm(root, axis=3) < ROUNDING * twist_weights(robot)[[3, 3, 3, 0, 0, 0]]
+    root[is_rounding] = 0.0
+    covariance = root @ root.swapaxes(2, 3)
+    if is_infinite.any():
+        unknown = np.where(is_infinite[:, None, :], directions, 0.0)
+        moved = np.linalg.norm(D @ unknown[:, None], axis=3) * twist_weights(robot)
+        lost = moved > NO_MOTION * size[..., None]
+        covariance[lost[..., :, None] | lost[..., None, :]] = np.nan
+        trial, pose, component = np.nonzero(lost)
+        covariance[trial, pose, component, component] = np.inf
+    return covariance
 
 
 def _count_degrees(
@@ -280,7 +308,7 @@ def _count_degrees(
     )
 
 
-def _expand_length(covariance: FloatArray, left: FloatArray) -> FloatArray:
+def expand_length(covariance: FloatArray, left: FloatArray) -> FloatArray:
     """Return lengths (n,) that a vector of covariance (n, 3, 3) exceeds in 5 % of cases.
 
     The square of a normal vector is a sum of weighted chi-square variables; its distribution is

@@ -9,6 +9,7 @@ from loopcal.measure.data_checks import check_targets_move as check_targets_move
 from loopcal.measure.data_checks import describe_outside_strokes as describe_outside_strokes
 from loopcal.measure.data_checks import find_outside_strokes as find_outside_strokes
 from loopcal.measure.data_checks import has_static_targets as has_static_targets
+from loopcal.measure.disturbances import Disturbance as Disturbance
 from loopcal.measure.evaluation import EvaluatedRows as EvaluatedRows
 from loopcal.measure.evaluation import evaluate_measurements as evaluate_measurements
 from loopcal.measure.evaluation import whiten_rows as whiten_rows
@@ -19,9 +20,11 @@ from loopcal.measure.initial_values import guess_nuisance_values as guess_nuisan
 from loopcal.measure.initial_values import (
     guess_nuisance_values_batch as guess_nuisance_values_batch,
 )
+from loopcal.measure.instrument import BlockStream as BlockStream
 from loopcal.measure.instrument import Gaussian as Gaussian
 from loopcal.measure.instrument import Instrument as Instrument
 from loopcal.measure.instrument import Noise as Noise
+from loopcal.measure.instrument import Seed as Seed
 from loopcal.measure.instrument import Sensor as Sensor
 from loopcal.measure.instrument import Uniform as Uniform
 from loopcal.measure.instrument import make_random_stream as make_random_stream

@@ -12,16 +12,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
+from loopcal.measure.disturbances import NO_DISTURBANCE, Disturbance, reach_poses
 from loopcal.measure.instrument import Instrument, Seed, Sensor, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import broadcast_reading_sigma, resolve_reading_sigma
 from loopcal.measure.readings import list_sensed_joints, select_joint_values, solve_commanded_poses
-from loopcal.mechanism import Mechanism, Status, forward, forward_trials, solve_at_pose
+from loopcal.mechanism import Mechanism, Status, forward
 from loopcal.typing import BoolArray, FloatArray
 
 NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
@@ -139,6 +139,7 @@ def simulate_trials(
     controller: Mechanism | None = None,
     nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
+    disturbance: Disturbance = NO_DISTURBANCE,
 ) -> Trials:
     """Measure the same commanded poses on t machines.
 
@@ -160,6 +161,8 @@ def simulate_trials(
     reading_sigma : number, (a,) or (n, a) [SI], optional
         Standard deviation of the recorded readings, which are the true ones plus normal noise; 0 is
         exact, infinity is missing. Default: as the robot states for its actuators.
+    disturbance : Disturbance, optional
+        What happens at each pose although the model does not contain it.
 
     Returns
     -------
@@ -181,25 +184,19 @@ def simulate_trials(
     nuisance = collect_nuisance_parameters(assigned.sensors, labels)
     nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
-    state = forward_trials(robot, values, readings[None], commanded.state)
+    true, state = reach_poses(robot, values, readings, commanded.state, disturbance)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
     reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]))
-    # Redundant actuators of a wrong geometry contradict each other: their true readings are those
-    # of the reached pose.
-    true = (
-        readings[None]
-        if robot.program.sigma is None
-        else _close_all_limbs(robot, values, readings, state)
-    )
     joints = select_joint_values(
         robot, list_sensed_joints(s.kind for s in assigned.sensors), true, state
     )
     noise = [_draw_noise(assigned, make_random_stream(seed, i, NOISE)) for i in range(len(values))]
     measured = tuple(
-        _measure_sensor(k, sensor, T, reached, joints, noise, nuisance)
+        _measure_sensor(k, sensor, disturbance.displace(T), reached, joints, noise, nuisance)
         for k, sensor in enumerate(assigned.sensors)
     )
-    recorded, sigma = record_readings(robot, true, reading_sigma, len(values), seed)
+    shown = true if disturbance.readings is None else true - disturbance.readings
+    recorded, sigma = record_readings(robot, shown, reading_sigma, len(values), seed)
     return Trials(
         assigned, robot.name, readings, measured, values, T, reached, nuisance, recorded, sigma
     )
@@ -310,16 +307,6 @@ def _measure_sensor(
     measured = kind.measure(safe[:, rows], drawn, values, kind.stack_joints(joints, rows))
     complete = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
     return np.where(complete[..., None], measured, np.nan)
-
-
-def _close_all_limbs(
-    robot: Mechanism, values: FloatArray, readings: FloatArray, state: State
-) -> FloatArray:
-    """Return readings (t, n, a) that close every limb at the poses of a state; the commanded ones
-    where they do not exist.
-    """
-    closed = solve_at_pose(robot, values, state.T, state)[1]
-    return np.where(np.isfinite(closed), closed, readings)
 
 
 def record_readings(

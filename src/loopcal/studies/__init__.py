@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Studies: many simulated calibrations, described by a file, resumable and reproducible."""
 
-from loopcal.studies.block import OUTCOMES as OUTCOMES
 from loopcal.studies.cells import Cell as Cell
 from loopcal.studies.cells import list_factors as list_factors
 from loopcal.studies.cells import list_varied_factors as list_varied_factors
+from loopcal.studies.fits import OUTCOMES as OUTCOMES
 from loopcal.studies.scores import ScoreColumn as ScoreColumn
 from loopcal.studies.study import Study as Study
 from loopcal.studies.study_file import load_study as load_study

@@ -14,8 +14,7 @@ import numpy as np
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot
-from loopcal.measure import sample_truth
-from loopcal.measure.instrument import Seed
+from loopcal.measure import Seed, sample_truth
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import ParameterTable
 from loopcal.studies.specification import ErrorsLevel

@@ -35,6 +35,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "mechanism": ("kinematics", "limits", "singularity", "mechanism"),
     "apply": ("validation", "accuracy", "compensation"),
     "sampling": ("sampling",),
+    "studies": ("study",),
     "plan": ("plan",),
     "study_folders": ("store", "workers"),
     "files": ("files",),

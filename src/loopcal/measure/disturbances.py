@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of simulated machines that no fit knows of, and the true poses under them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.engine import State
+from loopcal.mechanism import Mechanism, forward_trials, solve_at_pose
+from loopcal.typing import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """What happens at each measured pose although the model does not contain it.
+
+    Attributes
+    ----------
+    values : (t | 1, n, p) [SI] added to the true parameter values, such as thermal growth; None
+        where these are the same at all poses.
+    readings : (t | 1, n, a) [SI] true joint values minus readings, such as backlash; None for 0.
+    motion : (t | 1, n, 3) [m] displacement of what is measured, in base axes, such as the drift of
+        an instrument; None for 0. It is no part of the true poses.
+    """
+
+    values: FloatArray | None = None
+    readings: FloatArray | None = None
+    motion: FloatArray | None = None
+
+    def displace(self, T: FloatArray) -> FloatArray:
+        """Return the poses (t, n, 4, 4) that are measured at true poses T."""
+        if self.motion is None:
+            return T
+        moved = np.array(T)
+        moved[..., :3, 3] += self.motion
+        return moved
+
+
+NO_DISTURBANCE = Disturbance()
+
+
+def reach_poses(
+    robot: Mechanism,
+    values: FloatArray,
+    readings: FloatArray,
+    start: State,
+    disturbance: Disturbance,
+) -> tuple[FloatArray, State]:
+    """Return the true readings (t | 1, n, a) and the states (t, n) of t machines.
+
+    Parameters
+    ----------
+    robot : structure of the machines. values : (t, p) [SI] of each of them.
+    readings : (n, a) [SI] of the controller. start : (1, n) state of the commanded poses.
+    """
+    true = readings[None]
+    if disturbance.readings is not None:
+        true = true + disturbance.readings
+    shape = (len(values), len(readings))
+    if disturbance.values is not None:  # every pose is a machine of its own
+        values = (values[:, None] + disturbance.values).reshape(-1, values.shape[1])
+        true = np.broadcast_to(true, (*shape, readings.shape[1]))
+        true = true.reshape(-1, 1, readings.shape[1])
+        start = _reshape_state(start, shape, (-1, 1))
+    state = forward_trials(robot, values, true, start)
+    # Redundant actuators of a wrong geometry contradict each other: their true readings are those
+    # of the reached pose.
+    if robot.program.sigma is not None:
+        closed = solve_at_pose(robot, values, state.T, state)[1]
+        true = np.where(np.isfinite(closed), closed, true)
+    if disturbance.values is not None:
+        true, state = true.reshape(*shape, -1), _reshape_state(state, (len(values), 1), shape)
+    return true, state
+
+
+def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]) -> State:
+    """Return a state, broadcast to `shape` of trials and poses, with another shape of these."""
+
+    def change(array: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(array, (*shape, *array.shape[2:])).reshape(*wanted, *array.shape[2:])
+
+    return State(
+        change(state.T),
+        tuple(change(joints) for joints in state.joints),
+        change(state.status),
+        change(state.residual),
+        change(state.iterations),
+        change(state.closure_sign),
+    )
