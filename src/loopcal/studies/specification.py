@@ -110,8 +110,10 @@ class MethodLevel:
 
     Parameters
     ----------
-    method : as the option `--method` of the command line. lam : for ridge, else chosen by
-        cross-validation. keep : for truncated-svd. loss, noise : as these options.
+    method : "auto" is the default of `identify`, see `loopcal.estimate.methods.penalties`.
+    lam : weight of the penalty of ridge. keep : directions of truncated-svd. Both are chosen by
+        cross-validation where they are not stated.
+    loss, noise : as in `FitOptions`.
     """
 
     PLAIN: ClassVar[str] = "method"
