@@ -6,8 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from loopcal.apply.accuracy import combine_errors, expand_length, pose_uncertainty, transport
+from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.error_frames import FITTED, ReferencePoses, refer_errors
 from loopcal.diagnose.frame_motions import twist_weights
 from loopcal.engine import State
@@ -83,16 +85,16 @@ class FittedTrials:
 def fit_trials(cell: PreparedCell, trials: Trials) -> FittedTrials:
     """Calibrate all trials."""
     options, scores = cell.fit_options, cell.scores
-    if scores.verdict or options.loss is not None or options.noise != "given":
-        return fit_each(cell, trials)
-    return fit_together(cell, trials)
+    is_batch = options.loss is None and options.noise == "given"
+    if is_batch and not scores.verdict and scores.intervals == "stated":
+        return fit_together(cell, trials)
+    return fit_each(cell, trials)
 
 
 def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
     """Calibrate all trials as one batch. The stated noise counts as known."""
     fits = identify_trials(cell.robot, trials, options=cell.fit_options)
     plain = fits.decomposition.plain()
-    degrees = np.maximum(plain.rows - plain.rank, 1)
     state, measured = solve_cell_poses(cell, fits.values)
     return FittedTrials(
         values=fits.values,
@@ -105,9 +107,15 @@ def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
         rank=plain.rank.astype(float),
         condition=plain.condition,
         iterations=fits.iterations.astype(float),
-        noise=np.sqrt(plain.unexplained / degrees),
+        noise=compute_noise(plain.unexplained, plain.rows - plain.rank),
         verdict=np.full(len(trials), np.nan),
     )
+
+
+def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
+    """Return the residuals over the stated noise; NaN where no degree of freedom is left."""
+    left = np.asarray(degrees, dtype=float)
+    return np.sqrt(np.asarray(chi_square) / np.where(left > 0.0, left, np.nan))
 
 
 def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State | None]:
@@ -227,6 +235,8 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         fit, verdict = report.identification, float(VERDICTS.index(report.verdict))
     else:
         fit = identify(cell.robot, data, options=cell.fit_options)
+        if cell.scores.intervals == "adjusted":
+            fit = adjust_uncertainty(fit, data)
     U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=cell.scores.frame)
     state, measured = solve_cell_poses(cell, fit.robot.values[None])
     test = fit.residual_test
@@ -241,6 +251,6 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         rank=np.array(float(fit.rank)),
         condition=np.array(fit.spectrum.condition),
         iterations=np.array(float(fit.history.iterations)),
-        noise=np.sqrt(test.chi_square / np.maximum(test.degrees, 1)),
+        noise=compute_noise(test.chi_square, test.degrees),
         verdict=np.array(verdict),
     )

@@ -4,8 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from loopcal.studies.specification import Scores
+from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.studies.specification import FACTORS, Question, Scores
+from loopcal.units import SI_SYMBOLS, Dimension, find_unit, parse_quantity
+
+if TYPE_CHECKING:
+    from loopcal.studies.study import Study
 
 
 @dataclass(frozen=True)
@@ -54,3 +60,31 @@ VERDICT_COLUMNS = (
 def list_columns(scores: Scores) -> tuple[ScoreColumn, ...]:
     """Return the columns of the results of trials."""
     return (*COLUMNS, *(VERDICT_COLUMNS if scores.verdict else ()))
+
+
+def check_question(study: Study, question: Question) -> float:
+    """Return the limit of a question [SI].
+
+    Raises
+    ------
+    DataError : a factor or a score that the study does not have, or a limit in another unit.
+    """
+    factors = tuple(FACTORS.values())
+    if question.factor not in factors:
+        raise DataError(
+            f"factor is {question.factor!r}{suggest_names(question.factor, factors)}; it must be "
+            f"one of {', '.join(factors)}"
+        )
+    columns = {column.name: column for column in list_columns(study.scores)[1:]}
+    if question.score not in columns:
+        raise DataError(
+            f"score is {question.score!r}{suggest_names(question.score, columns)}; it must be one "
+            f"of {', '.join(columns)}"
+        )
+    unit = columns[question.score].unit
+    if unit == SI_SYMBOLS[Dimension.RATIO] and isinstance(question.limit, float | int):
+        return float(question.limit)
+    try:
+        return parse_quantity(str(question.limit), find_unit(unit).dimension)
+    except UnitError as error:
+        raise DataError(f"limit: {error}") from None

@@ -24,6 +24,9 @@ FACTORS: Mapping[str, str] = {
 }
 """Key of a factor in a study file -> its name in cells and tables."""
 
+MOST_POSES = 10_000
+"""Largest number of measured or held-out poses of a trial."""
+
 Distribution = Literal["normal", "uniform"]
 MethodName = Literal["auto", "map", "least-squares", "ridge", "truncated-svd"]
 
@@ -55,6 +58,10 @@ class InstrumentLevel:
     unknown_frames: tuple[str, ...] = ()
     distribution: Distribution = "normal"
 
+    def __post_init__(self) -> None:
+        _require(self.sigma_position > 0.0, "sigma_position", self.sigma_position, "above 0 m")
+        _require(self.sigma_angle > 0.0, "sigma_angle", self.sigma_angle, "above 0 rad")
+
 
 @dataclass(frozen=True)
 class NoiseLevel:
@@ -62,6 +69,9 @@ class NoiseLevel:
 
     PLAIN: ClassVar[str] = "factor"
     factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require(self.factor > 0.0, "factor", self.factor, "above 0")
 
 
 @dataclass(frozen=True)
@@ -79,6 +89,10 @@ class PosesLevel:
     count: int = 40
     choice: Literal["random", "planned"] = "random"
     seed: int | None = None
+
+    def __post_init__(self) -> None:
+        _require(1 <= self.count <= MOST_POSES, "count", self.count, f"from 1 to {MOST_POSES}")
+        _require(self.seed is None or self.seed >= 0, "seed", self.seed, "0 or more")
 
 
 @dataclass(frozen=True)
@@ -103,6 +117,16 @@ class ErrorsLevel:
     tolerances: Mapping[str, str] = field(default_factory=dict)
     deviations: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        _require(self.tolerance_factor > 0, "tolerance_factor", self.tolerance_factor, "above 0")
+        _require(self.error_factor >= 0, "error_factor", self.error_factor, "0 or more")
+        is_drawn = self.error_factor != 1.0 or self.distribution != "normal"
+        if self.deviations and is_drawn:
+            raise ValueError(
+                "deviations are the same in all trials, so error_factor and distribution have no "
+                "effect beside them; remove these"
+            )
+
 
 @dataclass(frozen=True)
 class MethodLevel:
@@ -123,6 +147,18 @@ class MethodLevel:
     loss: Literal["none", "huber", "tukey"] = "none"
     noise: Literal["given", "estimated"] = "given"
 
+    def __post_init__(self) -> None:
+        for key, value, method in (
+            ("lam", self.lam, "ridge"),
+            ("keep", self.keep, "truncated-svd"),
+        ):
+            if value is not None and self.method != method:
+                raise ValueError(
+                    f"{key} belongs to the method {method}, not to {self.method}; remove it, or "
+                    "change the method"
+                )
+            _require(value is None or value >= 0, key, value, "0 or more")
+
 
 @dataclass(frozen=True)
 class Outliers:
@@ -130,6 +166,9 @@ class Outliers:
 
     share: float = 0.05
     size: float = 20.0
+
+    def __post_init__(self) -> None:
+        _require(0.0 <= self.share <= 1.0, "share", self.share, "from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -177,6 +216,12 @@ class EffectsLevel:
     thermal: ThermalGrowth | None = None
     backlash: Backlash | None = None
 
+    def __post_init__(self) -> None:
+        _require(self.noise >= 0.0, "noise", self.noise, "0 or more")
+        has_variance = self.degrees is None or self.degrees > 2.0
+        _require(has_variance, "degrees", self.degrees, "above 2, so that a sigma exists")
+        _require(abs(self.correlation) < 1.0, "correlation", self.correlation, "between -1 and 1")
+
 
 @dataclass(frozen=True)
 class Scores:
@@ -186,25 +231,51 @@ class Scores:
     ----------
     held_out : number of poses at which the errors are computed; they are drawn from the workspace
         and are not measured. frame : in which the errors are stated, "fitted" or "base".
-    verdict : calibrate every trial as `loopcal calibrate` does, with all its checks, and record its
-        verdict; this takes much longer. limit_position, limit_angle : limits of the verdict.
+    intervals : "stated" computes them from the stated noise, for all trials of a block at once.
+        "adjusted" computes them as a calibration does, which also uses what the residuals say about
+        the noise; trials are then fitted one by one, which takes longer.
+    verdict : calibrate every trial as `loopcal calibrate` does, with all its checks and with its
+        held-out poses measured, and record the verdict. It takes much longer, and the intervals are
+        adjusted ones. limit_position, limit_angle : limits of the verdict.
     """
 
     held_out: int = 20
     frame: Literal["fitted", "base"] = "fitted"
+    intervals: Literal["stated", "adjusted"] = "stated"
     verdict: bool = False
     limit_position: Length | None = None
     limit_angle: Angle | None = None
 
+    def __post_init__(self) -> None:
+        _require(1 <= self.held_out <= MOST_POSES, "held_out", self.held_out, f"1 to {MOST_POSES}")
+        if (self.limit_position or self.limit_angle) and not self.verdict:
+            raise ValueError("a limit needs 'verdict: true'; add it, or remove the limit")
+
 
 @dataclass(frozen=True)
 class Question:
-    """A question that the summary answers: the smallest or largest level of a factor that reaches
-    a limit of a score on a share of the machines.
+    """A question that the summary answers: which is the smallest or the largest level of a factor
+    with which a score stays within a limit on a share of the machines.
+
+    Parameters
+    ----------
+    factor : name of the factor, such as "poses" or "noise". score : name of a score, such as
+        "position". limit : of the score, with its unit where it has one. share : of the machines.
+    wanted : "smallest" or "largest" level that reaches it.
     """
 
     factor: str
     score: str
-    limit: str
+    limit: str | float
     share: float = 0.95
     wanted: Literal["smallest", "largest"] = "smallest"
+
+    def __post_init__(self) -> None:
+        _require(0.0 < self.share < 1.0, "share", self.share, "between 0 and 1")
+
+
+def _require(is_allowed: bool, key: str, value: object, allowed: str) -> None:
+    """Raise ValueError with what is allowed; the reader of records adds the line."""
+    if not is_allowed:
+        shown = f"{value:g}" if isinstance(value, float) else str(value)
+        raise ValueError(f"{key} is {shown}; it must be {allowed}")

@@ -29,8 +29,8 @@ from loopcal.studies.specification import (
 )
 from loopcal.studies.work import BlockTask
 
-BLOCK = 50
-"""Trials of a block by default."""
+BLOCK, REPLICATES = 50, 1000
+"""Trials of a block, and of a cell, by default."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Study:
     title: str
     robots: Mapping[str, Robot]
     seed: int = 1
-    replicates: int = 1000
+    replicates: int = REPLICATES
     block: int = BLOCK
     instruments: Mapping[str, InstrumentLevel] = field(
         default_factory=lambda: {"pose": InstrumentLevel()}

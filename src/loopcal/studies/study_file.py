@@ -3,14 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 from loopcal.errors import LoopcalError
 from loopcal.io.core.records import read_record
+from loopcal.io.core.references import find_file_beside
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
 from loopcal.io.robot.robot_file import check_format, find_robot_file, get_source, load_robot
+from loopcal.mechanism import Mechanism
+from loopcal.studies.instruments import make_instrument
+from loopcal.studies.machines import resolve_patterns
+from loopcal.studies.methods import make_fit_options
+from loopcal.studies.scores import check_question
 from loopcal.studies.specification import (
     FACTORS,
     EffectsLevel,
@@ -23,13 +30,13 @@ from loopcal.studies.specification import (
     Robot,
     Scores,
 )
-from loopcal.studies.study import BLOCK, Study
+from loopcal.studies.study import BLOCK, REPLICATES, Study
 
 T = TypeVar("T")
 
 WHAT, FORMAT = "study file", 1
 
-LEVELS: dict[str, type] = {
+LEVELS: Mapping[str, type] = {
     "instruments": InstrumentLevel,
     "noise": NoiseLevel,
     "poses": PosesLevel,
@@ -41,23 +48,51 @@ LEVELS: dict[str, type] = {
 
 
 @dataclass(frozen=True)
-class StudyHead:
-    """The keys of a study file that are no factor."""
+class StudySettings:
+    """The settings of a study file beside its factors.
+
+    Parameters
+    ----------
+    title : what the study is about. seed : of all random numbers, 0 or more.
+    replicates : trials of each cell. block : trials of a block, the unit of work; at most 10000.
+    scores : what is computed of every trial. questions : name -> what the summary answers.
+    """
 
     title: str
     seed: int = 1
-    replicates: int = 1000
+    replicates: int = REPLICATES
     block: int = BLOCK
     scores: Scores = field(default_factory=Scores)
     questions: dict[str, Question] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        for key, lowest, highest in (
+            ("seed", 0, 2**63),
+            ("replicates", 1, 10**9),
+            ("block", 1, 10**4),
+        ):
+            value = getattr(self, key)
+            if not lowest <= value <= highest:
+                raise ValueError(f"{key} is {value}; it must be from {lowest} to {highest}")
+
+
+SETTINGS = ("title", "seed", "replicates", "block", "scores", "questions")
+QUICK = "quick"
+
 
 @dataclass(frozen=True)
-class QuickTier:
-    """What the quick tier replaces: numbers, and whole factors of the same form."""
+class StudyContent:
+    """The content of a study file, and where each of its keys was read.
 
-    replicates: int = 100
-    block: int = BLOCK
+    Attributes
+    ----------
+    file : for lines. values : key -> content. places : key -> its location in the file, which for
+        replacements of the quick tier is below `quick`.
+    """
+
+    file: YamlFile
+    values: Mapping[str, Any]
+    places: Mapping[str, Location]
 
 
 def load_study(path: str | Path, quick: bool = False) -> Study:
@@ -65,8 +100,9 @@ def load_study(path: str | Path, quick: bool = False) -> Study:
 
     Parameters
     ----------
-    path : the file; robots are shipped ones, or files beside it.
-    quick : whether to apply the replacements of its `quick:` part, or a tenth of the replicates.
+    path : the file; its robots are shipped ones, or files beside it.
+    quick : make the replacements that the file states under `quick:`; where it states none, each
+        cell has one block.
 
     Raises
     ------
@@ -74,81 +110,140 @@ def load_study(path: str | Path, quick: bool = False) -> Study:
     """
     file = read_yaml(path, WHAT)
     check_format(file, FORMAT)
-    content = dict(file.content)
-    head_keys = ("title", "seed", "replicates", "block", "scores", "questions")
-    refuse_unknown_keys(file, list(content), ["format", *head_keys, *FACTORS, "quick"])
-    head = read_record(
-        file, {key: content[key] for key in head_keys if key in content}, StudyHead, None
-    )
+    refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
+    full = {key: value for key, value in file.content.items() if key not in ("format", QUICK)}
+    whole = StudyContent(file, full, {key: (key,) for key in full})
+    study, short = build_study(whole), build_study(_apply_quick_tier(whole))
+    return short if quick else study
+
+
+def _apply_quick_tier(content: StudyContent) -> StudyContent:
+    """Return the content of a study file with the replacements of its quick tier."""
+    file, stated = content.file, content.file.content.get(QUICK)
+    if stated is None:
+        block = content.values.get("block", BLOCK)
+        return StudyContent(file, {**content.values, "replicates": block}, content.places)
+    if not isinstance(stated, dict):
+        raise file.error(
+            "'quick' must state the settings that it replaces; write for example "
+            "'quick: {replicates: 50}'",
+            (QUICK,),
+        )
+    allowed = [key for key in SETTINGS if key != "title"]
+    refuse_unknown_keys(file, list(stated), [*allowed, *FACTORS], (QUICK,))
+    places = {key: (QUICK, key) for key in stated}
+    return StudyContent(file, {**content.values, **stated}, {**content.places, **places})
+
+
+def build_study(content: StudyContent) -> Study:
+    """Return the study of the content of a file; raise as `load_study`."""
+    file, values, places = content.file, content.values, content.places
+    parts = {key: value for key, value in values.items() if key in SETTINGS}
+    location = places["replicates"][:-1] if "replicates" in places else ()
+    settings = read_record(file, parts, StudySettings, None, location)
+    robots = read_robots(content)
     factors: dict[str, Any] = {
-        key: read_levels(file, content[key], LEVELS[key], (key,))
-        for key in FACTORS
-        if key in content and key != "robots"
+        key: read_levels(content, key, LEVELS[key]) for key in LEVELS if key in values
     }
-    robots = read_robots(file, content.get("robots"))
-    order = tuple(FACTORS[key] for key in content if key in FACTORS)
-    return Study(
-        head.title,
-        robots,
-        head.seed,
-        head.replicates,
-        head.block,
-        order=order,
-        scores=head.scores,
-        questions=head.questions,
+    study = Study(
+        title=settings.title,
+        robots={name: robot for name, (robot, _) in robots.items()},
+        seed=settings.seed,
+        replicates=settings.replicates,
+        block=settings.block,
+        order=tuple(FACTORS[key] for key in values if key in FACTORS),
+        scores=settings.scores,
+        questions=settings.questions,
         **factors,
     )
+    check_levels(study, {name: robot for name, (_, robot) in robots.items()}, content)
+    return study
 
 
-def read_levels(file: YamlFile, node: Any, record: type[T], location: Location) -> dict[str, T]:
+def read_levels(content: StudyContent, key: str, record: type[T]) -> dict[str, T]:
     """Return name -> level of a factor: a mapping of records, or a list of plain values."""
-    plain = getattr(record, "PLAIN", None)
-    if isinstance(node, dict):
-        items: list[tuple[str, Any, Location]] = [
-            (name, value, (*location, name)) for name, value in node.items()
-        ]
-    else:
-        nodes = node if isinstance(node, list) else [node]
-        items = [
-            (_name(value), value, (*location, i) if isinstance(node, list) else location)
-            for i, value in enumerate(nodes)
-        ]
-    levels: dict[str, T] = {}
-    for name, value, place in items:
-        content = value
-        if not isinstance(value, dict):
-            if plain is None:
-                raise file.error(f"{name!r} must be a mapping of settings", place)
-            content = {plain: value}
-        if name in levels:
-            raise file.error(f"two levels are named {name!r}; rename or remove one", place)
-        levels[name] = read_record(file, content, record, None, place)
-    if not levels:
-        raise file.error(f"{location[0]!r} has no level; give at least one", location)
+    plain, levels = getattr(record, "PLAIN", None), {}
+    for name, value, place in _list_items(content, key):
+        if isinstance(value, dict):
+            levels[name] = read_record(content.file, value, record, None, place)
+        elif plain is None:
+            raise content.file.error(
+                f"the level {name!r} of {key!r} must state its settings; write "
+                "'name: {setting: value}' lines",
+                place,
+            )
+        else:
+            levels[name] = read_record(content.file, {plain: value}, record, None, place)
     return levels
 
 
-def read_robots(file: YamlFile, node: Any) -> dict[str, Robot]:
-    """Return name -> robot of the key `robots`: shipped names or files beside the study file."""
-    if node is None:
+def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
+    """Return name -> robot of the key `robots`: shipped names, or files beside the study file."""
+    file = content.file
+    if "robots" not in content.values:
         raise file.error("this study names no robot; add for example 'robots: [hexapod-42]'")
-    if isinstance(node, dict):
-        items = [(name, value, ("robots", name)) for name, value in node.items()]
-    else:
-        nodes = node if isinstance(node, list) else [node]
-        items = [(Path(str(v)).stem, v, ("robots", i)) for i, v in enumerate(nodes)]
     robots = {}
-    for name, value, place in items:
-        beside = file.path.parent / str(value)
-        source = beside if beside.is_file() else value
+    for name, value, place in _list_items(content, "robots"):
+        if not isinstance(value, str):
+            raise file.error(f"the robot {name!r} must be a name or a file", place)
         try:
-            robot = load_robot(find_robot_file(source))
+            path = find_file_beside(file, value, place) or find_robot_file(value)
+            robot = load_robot(path)
         except LoopcalError as error:
-            raise file.error(str(error), place) from None
-        robots[name] = Robot(str(value), get_source(robot).file.text)
+            raise file.error(f"the robot {name!r} cannot be read: {error}", place) from None
+        robots[name] = (Robot(value, get_source(robot).file.text), robot)
     return robots
 
 
-def _name(value: Any) -> str:
-    """Return the name of a plain level."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
+def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Location]]:
+    """Yield name, content and location of the levels of a factor; a plain value is its own name."""
+    file, node, place = content.file, content.values[key], content.places[key]
+    if isinstance(node, dict):
+        items = [(name, value, (*place, name)) for name, value in node.items()]
+    else:
+        nodes = node if isinstance(node, list) else [node]
+        places = [(*place, i) for i in range(len(nodes))] if isinstance(node, list) else [place]
+        items = [(_name(file, v, p), v, p) for v, p in zip(nodes, places, strict=True)]
+    if not items:
+        raise file.error(f"{key!r} has no level; give at least one", place)
+    names = set()
+    for name, value, at in items:
+        if name in names:
+            raise file.error(f"two levels of {key!r} are named {name!r}; remove one", at)
+        names.add(name)
+        yield name, value, at
+
+
+def _name(file: YamlFile, value: Any, place: Location) -> str:
+    """Return the name of a level that is a plain value."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise file.error(
+            "a level without a name must be a number or a word; write 'name: {setting: value}'",
+            place,
+        )
+    return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
+
+
+def check_levels(study: Study, robots: Mapping[str, Mechanism], content: StudyContent) -> None:
+    """Refuse levels that no block could be computed with, at their lines."""
+    for key, check in (
+        ("instruments", lambda level: make_instrument(level, NoiseLevel())),
+        ("methods", make_fit_options),
+        ("errors", lambda level: _check_errors(level, robots)),
+        ("questions", lambda question: check_question(study, question)),
+    ):
+        for i, (name, level) in enumerate(getattr(study, key).items()):
+            place = content.places.get(key, ())
+            node = content.values.get(key)
+            step = (name,) if isinstance(node, dict) else (i,) if isinstance(node, list) else ()
+            try:
+                check(level)
+            except LoopcalError as error:
+                raise content.file.error(f"{name!r} of {key!r}: {error}", (*place, *step)) from None
+
+
+def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:
+    """Raise DataError where a robot has no parameter of a name, or one of another dimension."""
+    for robot in robots.values():
+        resolve_patterns(robot.parameters, level.tolerances)
+        resolve_patterns(robot.parameters, level.deviations)

@@ -233,6 +233,11 @@ def _translate(
     missing = [c["loc"][-1] for c in complaints if c["loc"] and c["loc"][:-1] == parent]
     needed = max((step + 1 for step in missing if isinstance(step, int)), default=0)
     path = (*location, *path)
+    if complaint["type"] == "value_error":  # its text begins with the key that is wrong
+        key, _, fact = str(complaint["ctx"]["error"]).partition(" ")
+        if has_child(node, key):
+            path = (*path, key)
+            return (f"{name_location(path)!r} {fact}", ""), path
     return _word(complaint, path, node, needed), path
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.yaml_file import YamlFile
+from loopcal.io.core.yaml_file import Location, YamlFile, name_location
 from loopcal.plain_text import escape
 
 KEYS = ("poses", "controller")
@@ -24,11 +24,21 @@ def find_reference(file: YamlFile, key: str) -> Path | None:
     ------
     FileError : the path leaves the folder of `file`; at its line.
     """
-    name = str(file.content[key])
+    return find_file_beside(file, str(file.content[key]), (key,))
+
+
+def find_file_beside(file: YamlFile, name: str, location: Location) -> Path | None:
+    """Return the file that `file` names at a location; None where there is no such file.
+
+    Raises
+    ------
+    FileError : the path leaves the folder of `file`; at its line.
+    """
     path = file.path.parent / name
     if not Path(name).is_absolute() and not _is_inside(path, file.path.parent):
+        key = name_location(location)
         finding = report_finding("files.reference-outside", key=key, path=escape(name))
-        raise file.error(finding, (key,))
+        raise file.error(finding, location)
     return path if path.is_file() else None
 
 

@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scores of blocks: against calibrations made by hand, their coverage, and their bits."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import loopcal as lc
+from loopcal.apply import pose_uncertainty
+from loopcal.estimate import FitOptions, LeastSquares, identify
+from loopcal.measure import Measurements, Observations, make_random_stream
+from loopcal.mechanism import forward, inverse
+from loopcal.studies import OUTCOMES, compute_block
+from loopcal.studies.block import make_stream
+from loopcal.studies.specification import (
+    EffectsLevel,
+    ErrorsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    NoiseLevel,
+    PosesLevel,
+    Scores,
+)
+from tests.studies.studies import CAMERA, SIGMA, compute_cells, make_study
+
+ROTATION_FREE = ("orientation", "covered_orientation", "angles")
+
+
+def test_scores_equal_calibrations_made_by_hand():
+    study = make_study()
+    (task,) = study.list_tasks()
+    (scores,) = compute_cells(study)
+    content = json.loads(task.content)
+    robot, stream = lc.load_robot("linear-delta"), make_stream(3, 0)
+    commanded, held_out = (inverse(robot, content[key]) for key in ("measured", "held_out"))
+    table = robot.parameters
+    tolerance = table.free * [entry.tolerance for entry in table.entries]
+    for i in range(study.block):
+        deviation = tolerance * make_random_stream(stream, i, 1).standard_normal(len(tolerance))
+        truth = robot.with_values(table.nominal + deviation)
+        noise = SIGMA * make_random_stream(stream, i, 0).standard_normal((12, 3))
+        measured = forward(truth, commanded.q).T[:, :3, 3] + noise
+        kind = lc.Component(("x", "y", "z")).with_tool(robot.tool)
+        rows = Observations.from_sigma(kind, np.arange(12), measured, np.full(3, SIGMA))
+        data = Measurements("linear-delta", commanded.q, (rows,))
+        fit = identify(robot, data, options=FitOptions(LeastSquares(), sigma_uncertainty=0.0))
+        true, predicted, nominal = (forward(r, held_out.q) for r in (truth, fit.robot, robot))
+        error, before = (
+            np.linalg.norm(pose.T[:, :3, 3] - true.T[:, :3, 3], axis=1)
+            for pose in (predicted, nominal)
+        )
+        U = pose_uncertainty(fit, predicted)
+        off = fit.estimate - truth.values[fit.free_parameters.places]
+        by_hand = {
+            "outcome": 0.0,
+            "position": np.sqrt(np.mean(error**2)),
+            "position_max": error.max(),
+            "position_before": np.sqrt(np.mean(before**2)),
+            "position_before_max": before.max(),
+            "parameters": np.sqrt(np.mean((off / fit.free_parameters.tolerance) ** 2)),
+            "covered_parameters": np.mean(np.abs(off) <= fit.interval()),
+            "covered_position": np.mean(error <= U.expanded_position),
+            "rank": fit.rank,
+            "condition": fit.spectrum.condition,
+            "noise": np.sqrt(fit.chi_square / fit.residual_test.degrees),
+        }
+        assert_allclose([scores[name][i] for name in by_hand], list(by_hand.values()), rtol=1e-6)
+
+
+def test_errors_in_fitted_frames_are_those_of_one_calibration():
+    tracker = InstrumentLevel(("position",), sigma_position=2e-5, unknown_frames=("base", "tool"))
+    study = make_study("hexapod-42", instruments={"t": tracker}, poses={"40": PosesLevel(40)})
+    (together,) = compute_cells(study)
+    (each,) = compute_cells(
+        make_study(
+            "hexapod-42",
+            instruments={"t": tracker},
+            poses={"40": PosesLevel(40)},
+            scores=Scores(held_out=5, intervals="adjusted"),
+        )
+    )
+    for name in ("position", "orientation", "position_before", "parameters", "rank"):
+        assert_allclose(together[name], each[name], rtol=1e-4)
+    (base,) = compute_cells(
+        make_study(
+            "hexapod-42",
+            instruments={"t": tracker},
+            poses={"40": PosesLevel(40)},
+            scores=Scores(held_out=5, frame="base"),
+        )
+    )
+    assert np.all(base["position"] > 1.5 * together["position"])
+    assert_array_equal(base["covered_position"], 1.0)  # a frame that nothing determines
+
+
+@pytest.mark.parametrize("name", ["linear-delta", "five-bar"])
+@pytest.mark.parametrize("method", ["map", "least-squares"])
+def test_coverage_is_95_percent(name, method):
+    axes = ("x", "y", "z") if name == "linear-delta" else ("x", "y")
+    study = make_study(
+        name,
+        replicates=200,
+        block=200,
+        instruments={"camera": InstrumentLevel(("component",), axes, sigma_position=1e-5)},
+        poses={"20": PosesLevel(20)},
+        methods={method: MethodLevel(method)},
+    )
+    (scores,) = compute_cells(study)
+    assert_array_equal(scores["outcome"], 0)
+    for score in ("covered_parameters", "covered_position"):
+        share, spread = scores[score].mean(), scores[score].std() / np.sqrt(200)
+        assert abs(share - 0.95) < 4.0 * spread + 0.003, score
+    assert abs(np.mean(scores["noise"] ** 2) - 1.0) < 0.06
+
+
+def test_methods_see_the_same_machines_and_measurements():
+    methods = {
+        "a": MethodLevel("map"),
+        "b": MethodLevel("least-squares"),
+        "c": MethodLevel("ridge"),
+    }
+    cells = compute_cells(make_study(methods=methods))
+    for other in cells[1:]:
+        for name in ("position_before", "position_before_max"):
+            assert_array_equal(other[name], cells[0][name])
+        assert np.all(other["position"] != cells[0]["position"])
+
+
+def test_all_cells_have_the_same_machines():
+    cells = compute_cells(
+        make_study(
+            noise={"1": NoiseLevel(), "4": NoiseLevel(4.0)},
+            poses={"12": PosesLevel(12), "15": PosesLevel(15)},
+        )
+    )
+    for other in cells[1:]:
+        assert_array_equal(other["position_before"], cells[0]["position_before"])
+    single, fourfold = cells[0], cells[2]  # linear in the noise, as it is small
+    assert_allclose(fourfold["position"], 4.0 * single["position"], rtol=0.02)
+
+
+def test_more_poses_are_the_same_poses_and_further_ones():
+    study = make_study(poses={"12": PosesLevel(12), "15": PosesLevel(15)})
+    few, many = (json.loads(task.content)["measured"] for task in study.list_tasks())
+    assert many[:12] == few
+
+
+def test_planned_poses_are_better_than_random_ones():
+    levels = {"random": PosesLevel(8), "planned": PosesLevel(8, "planned")}
+    random, planned = compute_cells(make_study(poses=levels, replicates=30, block=30))
+    assert np.median(planned["position"]) < 0.8 * np.median(random["position"])
+
+
+@pytest.mark.parametrize("distribution", ["normal", "uniform"])
+def test_errors_have_the_stated_distribution(distribution):
+    from loopcal.studies.machines import draw_machines
+
+    robot = lc.load_robot("linear-delta")
+    level = ErrorsLevel(error_factor=2.0, distribution=distribution)
+    truth = draw_machines(robot, level, 2000, make_stream(3, 0))
+    free = robot.parameters.free
+    scaled = (truth - robot.parameters.nominal)[:, free] / robot.parameters.tolerance[free]
+    assert_array_equal(truth[:, ~free], robot.parameters.nominal[~free] + 0.0 * truth[:, ~free])
+    assert_allclose(scaled.std(axis=0), 2.0, rtol=0.06)
+    largest = np.abs(scaled).max()
+    assert largest <= 2.0 * np.sqrt(3.0) if distribution == "uniform" else largest > 6.0
+
+
+def test_fixed_deviations_are_those_of_every_trial():
+    name = lc.load_robot("linear-delta").parameters.names[0]
+    errors = ErrorsLevel(deviations={name: "0.3 mm"})
+    (scores,) = compute_cells(make_study(errors={"set": errors}))
+    assert np.ptp(scores["position_before"]) == 0.0
+    assert np.ptp(scores["position"]) > 0.0
+
+
+def test_tolerances_are_known_to_the_fit_and_error_factors_are_not():
+    errors = {
+        "as stated": ErrorsLevel(),
+        "tolerances": ErrorsLevel(tolerance_factor=3.0),
+        "errors": ErrorsLevel(error_factor=3.0),
+    }
+    study = make_study(
+        errors=errors,
+        methods={"map": MethodLevel("map")},
+        instruments={"z": InstrumentLevel(("component",), ("z",), sigma_position=5e-5)},
+        replicates=60,
+        block=60,
+    )
+    stated, tolerances, wrong = compute_cells(study)
+    assert_allclose(tolerances["position_before"], wrong["position_before"])
+    assert tolerances["covered_parameters"].mean() > 0.93
+    assert wrong["covered_parameters"].mean() < 0.75
+    assert_allclose(tolerances["parameters"].mean(), stated["parameters"].mean(), rtol=0.35)
+
+
+def test_a_trial_that_fails_does_not_change_the_others():
+    errors = {"usual": ErrorsLevel(), "huge": ErrorsLevel(error_factor=300.0)}
+    usual, huge = compute_cells(
+        make_study(
+            "five-bar",
+            errors=errors,
+            instruments={
+                "camera": InstrumentLevel(("component",), ("x", "y"), sigma_position=1e-5)
+            },
+            replicates=30,
+            block=30,
+        )
+    )
+    assert_array_equal(usual["outcome"], 0)
+    failed = huge["outcome"] > 0
+    assert 0 < failed.sum() < 30
+    assert np.isfinite(huge["position"][~failed]).all()
+    assert {OUTCOMES[int(code)] for code in huge["outcome"]} <= set(OUTCOMES)
+
+
+def test_trials_that_are_refused_are_counted():
+    methods = {"huber": MethodLevel("least-squares", loss="huber")}
+    (scores,) = compute_cells(make_study(methods=methods, poses={"2": PosesLevel(2)}))
+    assert {OUTCOMES[int(code)] for code in scores["outcome"]} == {"study.refused"}
+    assert np.isnan(scores["position"]).all()
+
+
+def test_losses_resist_outliers():
+    from loopcal.studies.specification import Outliers
+
+    methods = {"plain": MethodLevel("map"), "tukey": MethodLevel("map", loss="tukey")}
+    effects = {"outliers": EffectsLevel(outliers=Outliers(0.1, 30.0))}
+    plain, tukey = compute_cells(
+        make_study(methods=methods, effects=effects, poses={"20": PosesLevel(20)})
+    )
+    assert np.median(tukey["position"]) < 0.6 * np.median(plain["position"])
+    assert tukey["covered_position"].mean() > 0.8
+
+
+def test_adjusted_intervals_cover_the_truth_where_the_noise_is_larger_than_stated():
+    effects = {"noise": EffectsLevel(noise=2.0)}
+    scores = [
+        compute_cells(
+            make_study(
+                effects=effects,
+                poses={"20": PosesLevel(20)},
+                replicates=15,
+                block=15,
+                scores=Scores(held_out=5, intervals=intervals),
+            )
+        )[0]
+        for intervals in ("stated", "adjusted")
+    ]
+    assert_allclose(scores[0]["position"], scores[1]["position"], rtol=1e-6)
+    assert scores[0]["covered_position"].mean() < 0.8
+    assert scores[1]["covered_position"].mean() > 0.88
+
+
+def test_verdicts_are_those_of_calibrations():
+    scores = Scores(held_out=6, verdict=True, limit_position=1e-3)
+    effects = {"none": EffectsLevel(), "noise": EffectsLevel(noise=4.0)}
+    study = make_study(scores=scores, effects=effects, replicates=2, block=2)
+    good, bad = compute_cells(study)
+    assert set(good["verdict"]) <= {0.0, 1.0}
+    assert_array_equal(bad["verdict"], 3.0)  # not calibrated
+
+
+CHILD = """
+import hashlib, sys
+from loopcal.studies import compute_block
+from tests.studies.studies import make_study
+study = make_study(replicates=12)
+tasks = list(study.list_tasks())[:: int(sys.argv[1])]
+values = {task.block: compute_block(task).values for task in tasks}
+print(hashlib.sha256(b"".join(values[b].tobytes() for b in sorted(values))).hexdigest())
+"""
+
+
+def test_blocks_have_the_same_bits_in_every_process():
+    study = make_study(replicates=12)
+    values = [compute_block(task).values.tobytes() for task in study.list_tasks()]
+    here = hashlib.sha256(b"".join(values)).hexdigest()
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "3", "OMP_NUM_THREADS": "3"}
+    command = [sys.executable, "-c", CHILD, "-1"]  # in the opposite order, with other threads
+    child = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert child.stdout.strip() == here
+
+
+def test_blocks_differ():
+    study = make_study(replicates=12)
+    first, second = (compute_block(task).values for task in study.list_tasks())
+    assert np.all(first[:, 1] != second[:, 1])
+
+
+def test_columns_are_those_of_the_study():
+    study = make_study()
+    (task,) = study.list_tasks()
+    result = compute_block(task)
+    assert result.key == task.key
+    assert result.values.shape == (6, len(study.columns))
+    assert result.values.dtype == np.float64
+    assert study.columns[0].name == "outcome"
+    undefined = {
+        c.name for c, v in zip(study.columns, result.values.T, strict=True) if np.isnan(v).any()
+    }
+    assert all(name.startswith(ROTATION_FREE) for name in undefined)
+    assert CAMERA.components == ("x", "y", "z")
