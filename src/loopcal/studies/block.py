@@ -71,7 +71,7 @@ def score_poses(
     robot, held_out = cell.robot, cell.held_out
     readings = _draw_true_readings(cell, len(trials), stream)
     truth = forward_trials(robot, trials.truth, readings, held_out.state)
-    nominal = held_out.T[None], cell.commanded.T[None]
+    nominal = held_out.T[None], cell.reference.T[None]
     reached = is_reached(truth) & fits.reached
     scores: dict[str, FloatArray] = {
         "outcome": np.where((fits.outcome == 0) & ~reached, NOT_REACHED, fits.outcome)
@@ -80,7 +80,7 @@ def score_poses(
         error = _tool_errors(robot, T, truth.T)
         if not can_rotate(robot):
             error[..., :3] = np.nan
-        if measured is not None and cell.motions.shape[1]:
+        if cell.motions.shape[1]:
             error = error - _fit_motions(cell, trials, T, measured)
         for name, part in (("position", slice(3, 6)), ("orientation", slice(0, 3))):
             size = np.linalg.norm(error[..., part], axis=2)

@@ -61,7 +61,7 @@ class FittedTrials:
     ----------
     values : (t, p of the robot) [SI]. outcome : (t,) numbers of OUTCOMES.
     T, reached : (t, h, 4, 4), (t,) calibrated machines at the readings of the held-out poses.
-    T_measured : (t, n, 4, 4) at those of the measured poses; None where no frame is fitted.
+    T_measured : (t, n, 4, 4) at those of the measured poses; n = 0 where no frame is fitted.
     half_width : (t, p free) of 95 % intervals [SI]. expanded : (t, h, 2) position and rotation
         errors that 95 % of the errors of held-out poses do not exceed [m], [rad].
     rank, condition, iterations : (t,). noise : (t,) residuals over stated noise.
@@ -72,7 +72,7 @@ class FittedTrials:
     outcome: IntArray
     T: FloatArray
     reached: BoolArray
-    T_measured: FloatArray | None
+    T_measured: FloatArray
     half_width: FloatArray
     expanded: FloatArray
     rank: FloatArray
@@ -101,7 +101,7 @@ def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
         outcome=np.array([_OF_STATUS[DescentStatus(int(status))] for status in fits.status]),
         T=state.T,
         reached=is_reached(state),
-        T_measured=None if measured is None else measured.T,
+        T_measured=measured.T,
         half_width=LEVEL_95 * fits.standard_deviations(),
         expanded=_expand_errors(cell, fits, state, measured),
         rank=plain.rank.astype(float),
@@ -118,15 +118,15 @@ def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
     return np.sqrt(np.asarray(chi_square) / np.where(left > 0.0, left, np.nan))
 
 
-def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State | None]:
-    """Return the states of machines (t, p) at the readings of the held-out poses and, where frames
-    are fitted, of the measured poses.
+def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State]:
+    """Return the states of machines (t, p) at the readings of the held-out poses, and at those of
+    the measured poses, of which there are none where no frame is fitted.
     """
-    held_out, commanded = cell.held_out, cell.commanded
-    state = forward_trials(cell.robot, values, held_out.q[None], held_out.state)
-    if not cell.motions.shape[1]:
-        return state, None
-    return state, forward_trials(cell.robot, values, commanded.q[None], commanded.state)
+    held_out, commanded = cell.held_out, cell.reference
+    return (
+        forward_trials(cell.robot, values, held_out.q[None], held_out.state),
+        forward_trials(cell.robot, values, commanded.q[None], commanded.state),
+    )
 
 
 def is_reached(state: State) -> BoolArray:
@@ -135,7 +135,7 @@ def is_reached(state: State) -> BoolArray:
 
 
 def _expand_errors(
-    cell: PreparedCell, fits: IdentifiedTrials, state: State, measured: State | None
+    cell: PreparedCell, fits: IdentifiedTrials, state: State, measured: State
 ) -> FloatArray:
     """Return what 95 % of the errors of held-out poses do not exceed (t, h, 2) [m], [rad], as
     `pose_uncertainty` does for one machine.
@@ -147,8 +147,8 @@ def _expand_errors(
     slopes = differentiate_pose(robot, fits.values, cell.held_out.q[None], state)
     D = slopes.parameters[..., free.places] * unit
     size = np.linalg.norm(D * twist_weights(robot)[:, None], axis=(2, 3))
-    if measured is not None:
-        by_measured = differentiate_pose(robot, fits.values, cell.commanded.q[None], measured)
+    if cell.motions.shape[1]:
+        by_measured = differentiate_pose(robot, fits.values, cell.reference.q[None], measured)
         reference = by_measured.parameters[..., free.places] * unit
         D = np.stack(
             [
@@ -193,14 +193,13 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
 
     A trial that is refused does not stop the others.
     """
-    free, h, n = select_free_parameters(cell.robot), len(cell.held_out.q), len(cell.measured)
-    has_frames = cell.motions.shape[1] > 0
+    free, h, n = select_free_parameters(cell.robot), len(cell.held_out.q), len(cell.reference.q)
     nothing = FittedTrials(
         values=np.full(len(cell.robot.parameters), np.nan),
         outcome=np.array(REFUSED),
         T=np.full((h, 4, 4), np.nan),
         reached=np.array(False),
-        T_measured=np.full((n, 4, 4), np.nan) if has_frames else None,
+        T_measured=np.full((n, 4, 4), np.nan),
         half_width=np.full(len(free), np.nan),
         expanded=np.full((h, 2), np.nan),
         **dict.fromkeys(("rank", "condition", "iterations", "noise", "verdict"), np.array(np.nan)),
@@ -212,13 +211,7 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
         except (EstimationError, DataError):
             single.append(nothing)
     names = [entry.name for entry in fields(FittedTrials)]
-    stacked = {
-        name: None
-        if getattr(nothing, name) is None
-        else np.stack([getattr(fit, name) for fit in single])
-        for name in names
-    }
-    return FittedTrials(**stacked)
+    return FittedTrials(**{name: np.stack([getattr(f, name) for f in single]) for name in names})
 
 
 def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
@@ -245,7 +238,7 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         outcome=np.array(_OF_STATUS[fit.status]),
         T=state.T[0],
         reached=is_reached(state)[0],
-        T_measured=None if measured is None else measured.T[0],
+        T_measured=measured.T[0],
         half_width=fit.interval(),
         expanded=np.stack([U.expanded_position, U.expanded_orientation], axis=-1),
         rank=np.array(float(fit.rank)),

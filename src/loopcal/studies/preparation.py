@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
-from loopcal.estimate import FitOptions, LeastSquares
+from loopcal.estimate import MAP, FitOptions
 from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.trial_posteriors import compute_trial_posterior
 from loopcal.measure import Instrument, simulate_trials, solve_commanded_poses
@@ -48,10 +48,12 @@ class PreparedCell:
     robot : nominal, with the tolerances of the cell. instrument : with its true noise.
     errors, effects, scores, fit_options : of the cell.
     measured, validated : (n, c), (h, c) controlled coordinates of measured and held-out poses.
-    commanded, held_out : solutions of the nominal robot there.
-    seed, trials : of the study, and of a block.
+    held_out : solution of the nominal robot at the held-out poses.
     motions : (12, k) motions of the base and platform frames that are fitted before errors are
         stated: in the frame "fitted" those that the measurements do not determine.
+    reference : solution of the nominal robot at the poses over which these are fitted: the measured
+        ones, or none where there is no such motion.
+    seed, trials : of the study, and of a block.
     """
 
     robot: Mechanism
@@ -61,10 +63,10 @@ class PreparedCell:
     scores: Scores
     fit_options: FitOptions
     measured: FloatArray
-    commanded: Solution
     validated: FloatArray
     held_out: Solution
     motions: FloatArray
+    reference: Solution
     seed: int
     trials: int
 
@@ -86,6 +88,8 @@ def _prepare(text: str) -> PreparedCell:
     effects = read_record(EffectsLevel, content["effects"])
     scores = read_record(Scores, content["scores"])
     measured = np.array(content["measured"])
+    motions = find_fitted_motions(robot, instrument, measured, scores.frame)
+    commanded = solve_commanded_poses(robot, measured)
     return PreparedCell(
         robot,
         alter_noise(instrument, effects),
@@ -94,10 +98,10 @@ def _prepare(text: str) -> PreparedCell:
         scores,
         make_fit_options(read_record(MethodLevel, content["method"])),
         measured,
-        solve_commanded_poses(robot, measured),
         np.array(content["held_out"]),
         inverse(robot, content["held_out"]),
-        find_fitted_motions(robot, instrument, measured, scores.frame),
+        motions,
+        commanded if motions.shape[1] else commanded.take(np.arange(0)),
         content["seed"],
         content["trials"],
     )
@@ -113,7 +117,7 @@ def find_fitted_motions(
     if frame == BASE:
         return np.zeros((12, 0))
     trials = simulate_trials(robot, robot.values[None], measured, instrument, 0)
-    fits = identify_trials(robot, trials, LeastSquares())
+    fits = identify_trials(robot, trials, MAP())
     posterior = compute_trial_posterior(fits, trials, 0)
     is_moved = choose_error_frame(posterior).fitted
     return list_unfixed_motions(posterior) if is_moved else np.zeros((12, 0))
