@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
+from loopcal.studies.effects import AlteredNoise
+from loopcal.studies.specification import EffectsLevel, Outliers
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -34,29 +36,6 @@ GROSS = 20.0
 
 POSE_TIME = 60.0
 """Seconds from one pose to the next."""
-
-
-@dataclass(frozen=True, eq=False)
-class BrokenNoise(Gaussian):
-    """Noise of the stated sigma `sd` as a case breaks it."""
-
-    case: Case = field(default_factory=lambda: Case(""))
-
-    def draw(self, generator: np.random.Generator, n: int) -> Array:
-        """Return noise (n, m) [SI] of poses in their order."""
-        case, shape = self.case, (n, len(self.sd))
-        noise = generator.standard_normal(shape)
-        if np.isfinite(case.degrees):  # of unit variance
-            scale = np.sqrt((case.degrees - 2.0) / case.degrees)
-            noise = scale * generator.standard_t(case.degrees, shape)
-        for i in range(1, n if case.correlation else 0):
-            share = np.sqrt(1.0 - case.correlation**2)
-            noise[i] = case.correlation * noise[i - 1] + share * noise[i]
-        if case.outliers:
-            wrong = generator.permutation(n)[: round(case.outliers * n)]
-            direction = generator.standard_normal((len(wrong), shape[1]))
-            noise[wrong] += GROSS * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        return case.noise * noise * self.sd
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +66,8 @@ def simulate_case(setup: Setup, case: Case, fits: int) -> Simulation:
     length, angle = setup.coarse if case.is_coarse else setup.sigma
     kind = Component(setup.columns) if setup.columns else Pose()
     sd = np.array([length] * len(setup.columns) if setup.columns else [angle] * 3 + [length] * 3)
-    instrument = Instrument((Sensor(kind, BrokenNoise(sd, case)),))
+    noise = AlteredNoise(Gaussian(sd), describe_noise(case))
+    instrument = Instrument((Sensor(kind, noise),))
     trials = simulate_trials(robot, truth, poses, instrument, SEED)
     T = forward_trials(robot, truth, held_out[None]).T
     axes = len(setup.columns) or 3
@@ -99,6 +79,16 @@ def simulate_case(setup: Setup, case: Case, fits: int) -> Simulation:
     position[..., :axes] += held_out_shift
     data = tuple(state_order(trials.trial(i), case) for i in range(fits))
     return Simulation(trials, data, moved, held_out, T[..., :3, :3], position)
+
+
+def describe_noise(case: Case) -> EffectsLevel:
+    """Return how the noise of a case differs from the stated one."""
+    return EffectsLevel(
+        noise=case.noise,
+        degrees=case.degrees if np.isfinite(case.degrees) else None,
+        correlation=case.correlation,
+        outliers=Outliers(case.outliers, GROSS) if case.outliers else None,
+    )
 
 
 def draw_machines(robot: Mechanism, setup: Setup, case: Case, fits: int) -> tuple[Array, BoolArray]:

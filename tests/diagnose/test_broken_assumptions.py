@@ -11,19 +11,22 @@ from scipy.stats import binom
 from evidence.assumptions.cases import SETUPS, Case, list_cases
 from evidence.assumptions.evaluation import evaluate_case, is_met
 from evidence.assumptions.levels import STATED_LEVELS, name_group
-from evidence.assumptions.simulation import BrokenNoise, simulate_case
+from evidence.assumptions.simulation import describe_noise, simulate_case
 from loopcal import load_robot
 from loopcal.diagnose import find_outliers
 from loopcal.diagnose.residuals import residual_patterns
 from loopcal.estimate.inference import residual_test
 from loopcal.estimate.methods import prior_conflict
+from loopcal.measure import Gaussian
+from loopcal.studies.effects import AlteredNoise
 
 SCRIPTS = {"linear-delta": "delta", "five-bar": "five_bar", "hexapod-42": "hexapod"}
 
 
 def draw(case, n=4000, columns=3):
     """Draw noise of unit sigma."""
-    return BrokenNoise(np.ones(columns), case).draw(np.random.default_rng(0), n)
+    noise = AlteredNoise(Gaussian(np.ones(columns)), describe_noise(case))
+    return noise.draw(np.random.default_rng(0), n)
 
 
 def test_broken_noise_has_the_stated_size_and_correlation():

@@ -63,8 +63,8 @@ class AlteredNoise(Noise):
         if effects.outliers is not None:
             wrong = generator.permutation(n)[: round(effects.outliers.share * n)]
             direction = generator.standard_normal((len(wrong), shape[1]))
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            noise[wrong] += effects.outliers.size * direction
+            length = np.linalg.norm(direction, axis=1, keepdims=True)
+            noise[wrong] += effects.outliers.size * direction / length
         return effects.noise * noise * self.sigma
 
 
