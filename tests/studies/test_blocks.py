@@ -15,10 +15,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
 from loopcal.apply import pose_uncertainty
+from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, LeastSquares, identify
 from loopcal.measure import Measurements, Observations, make_random_stream
 from loopcal.mechanism import forward, inverse
-from loopcal.studies import OUTCOMES, compute_block
+from loopcal.studies import OUTCOMES, compute_block, replay_trial
 from loopcal.studies.block import make_stream
 from loopcal.studies.specification import (
     EffectsLevel,
@@ -288,6 +289,21 @@ def test_blocks_have_the_same_bits_in_every_process():
     command = [sys.executable, "-c", CHILD, "-1"]  # in the opposite order, with other threads
     child = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert child.stdout.strip() == here
+
+
+def test_a_replayed_trial_gives_the_scores_of_its_block():
+    study = make_study(replicates=12)
+    _, task = study.list_tasks()
+    column = [c.name for c in study.columns].index("parameters")
+    expected = compute_block(task).values[2, column]
+    trial = replay_trial(study, 0, 8)
+    fit = identify(trial.robot, trial.data, options=trial.options)
+    places = fit.free_parameters.places
+    off = (fit.robot.values - trial.truth.values)[places] / fit.free_parameters.tolerance
+    assert_allclose(np.sqrt(np.mean(off**2)), expected, rtol=1e-6)
+    for cell, number in ((1, 0), (0, 12), (0, -1)):
+        with pytest.raises(DataError, match="numbered from 0"):
+            replay_trial(study, cell, number)
 
 
 def test_blocks_differ():

@@ -5,6 +5,8 @@ from loopcal.studies.cells import Cell as Cell
 from loopcal.studies.cells import list_factors as list_factors
 from loopcal.studies.cells import list_varied_factors as list_varied_factors
 from loopcal.studies.fits import OUTCOMES as OUTCOMES
+from loopcal.studies.replay import ReplayedTrial as ReplayedTrial
+from loopcal.studies.replay import replay_trial as replay_trial
 from loopcal.studies.scores import ScoreColumn as ScoreColumn
 from loopcal.studies.study import Study as Study
 from loopcal.studies.study_file import load_study as load_study

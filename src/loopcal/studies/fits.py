@@ -46,6 +46,9 @@ _OF_STATUS = {
 }
 REFUSED, NOT_REACHED = OUTCOMES.index("study.refused"), OUTCOMES.index("study.held-out-not-reached")
 
+POSE_TIME = 60.0
+"""Seconds from one pose to the next."""
+
 VERDICTS = (Verdict.CALIBRATED, Verdict.RESERVATIONS, Verdict.UNDECIDED, Verdict.NOT_CALIBRATED)
 """Verdicts by their number."""
 
@@ -207,24 +210,35 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
     single = []
     for i in range(len(trials)):
         try:
-            single.append(_fit_one(cell, trials.trial(i)))
+            single.append(_fit_one(cell, state_times(trials.trial(i))))
         except (EstimationError, DataError):
             single.append(nothing)
     names = [entry.name for entry in fields(FittedTrials)]
     return FittedTrials(**{name: np.stack([getattr(f, name) for f in single]) for name in names})
 
 
+def state_times(data: Measurements) -> Measurements:
+    """Return measurements with the time of each row, as instruments record it: the tests for slow
+    errors need it.
+    """
+    first = [rows.rows.reshape(len(rows), -1)[:, 0] for rows in data.observations]
+    observations = tuple(
+        replace(rows, context={"time": POSE_TIME * poses})
+        for rows, poses in zip(data.observations, first, strict=True)
+    )
+    return replace(data, observations=observations)
+
+
 def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
     """Return the calibration of one trial, without the axis of trials."""
     verdict = np.nan
     if cell.scores.verdict:
-        mask = np.arange(data.n_poses) >= len(cell.measured)
         options = CalibrationOptions(
             fit=cell.fit_options,
             limit_position=cell.scores.limit_position,
             limit_angle=cell.scores.limit_angle,
         )
-        report = calibrate(cell.robot, replace(data, is_held_out=mask), options)
+        report = calibrate(cell.robot, cell.hold_out(data), options)
         fit, verdict = report.identification, float(VERDICTS.index(report.verdict))
     else:
         fit = identify(cell.robot, data, options=cell.fit_options)

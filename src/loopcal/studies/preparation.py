@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,7 +15,7 @@ from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed
 from loopcal.estimate import MAP, FitOptions
 from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.trial_posteriors import compute_trial_posterior
-from loopcal.measure import Instrument, simulate_trials, solve_commanded_poses
+from loopcal.measure import Instrument, Measurements, simulate_trials, solve_commanded_poses
 from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.studies.effects import alter_noise
 from loopcal.studies.instruments import make_instrument
@@ -69,6 +69,10 @@ class PreparedCell:
     reference: Solution
     seed: int
     trials: int
+
+    def hold_out(self, data: Measurements) -> Measurements:
+        """Return measurements in which the poses behind the measured ones are held out."""
+        return replace(data, is_held_out=np.arange(data.n_poses) >= len(self.measured))
 
 
 def prepare_cell(content: Mapping[str, Any]) -> PreparedCell:

@@ -86,16 +86,20 @@ class Study:
         return compute_key(describe_block(self, cell, block))
 
     def list_tasks(
-        self, cells: Sequence[int] | None = None, finished: AbstractSet[str] = frozenset()
+        self,
+        cells: Sequence[int] | None = None,
+        finished: AbstractSet[str] = frozenset(),
+        blocks: Sequence[int] | None = None,
     ) -> Iterator[BlockTask]:
-        """Yield the blocks of some cells, or of all, whose keys are not finished.
+        """Yield the tasks of these blocks of these cells, of all by default, whose keys are not
+        finished.
 
         The poses of a cell are drawn or planned when its first task is made.
         """
         for number in range(len(self.cells)) if cells is None else cells:
             cell = self.cells[number]
             poses: Mapping[str, object] | None = None
-            for block in range(self.blocks):
+            for block in range(self.blocks) if blocks is None else blocks:
                 content = describe_block(self, cell, block)
                 key = compute_key(content)
                 if key in finished:
