@@ -24,6 +24,9 @@ from loopcal.io.exports.profile import ColumnSource, ProfileRecord
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES, RobotRecord
+from loopcal.studies.scores import list_columns
+from loopcal.studies.specification import Question, Scores
+from loopcal.studies.study_file import LEVELS, StudySettings
 from loopcal.units import DISPLAY_UNITS, Dimension
 from tools.markdown import fill_blocks, format_table
 
@@ -187,6 +190,24 @@ def format_example(name: str) -> Callable[[], str]:
     return lambda: f"```yaml\n{(EXAMPLES / name).read_text('utf-8')}```\n"
 
 
+def format_study() -> str:
+    """Return the keys of a study file, of the levels of its factors, and of its scores."""
+    sections = [format_record(StudySettings, without=("scores", "questions"))]
+    for name, record in {**LEVELS, "scores": Scores, "questions": Question}.items():
+        plain = getattr(record, "PLAIN", None)
+        short = f" A plain value is its `{plain}`." if plain else ""
+        sections.append(f"### `{name}`\n\n{summarize(record)}{short}\n\n{format_record(record)}")
+        sections += [_format_nested(nested) for nested in list_nested_records(record)]
+    return "\n".join(sections)
+
+
+def format_scores() -> str:
+    """Return the columns of the results of trials."""
+    columns = list_columns(Scores(verdict=True))
+    rows = [(f"`{c.name}`", "" if c.unit == "1" else c.unit, c.meaning) for c in columns]
+    return format_table(("score", "unit", "meaning"), rows)
+
+
 BLOCKS = {
     "common": format_common,
     "families": format_families,
@@ -195,6 +216,8 @@ BLOCKS = {
     "columns": format_columns,
     "made-by": format_provenance,
     "limits": format_limits,
+    "study": format_study,
+    "scores": format_scores,
 }
 EXPORT_BLOCKS = {"profile": format_profile, "profile-columns": format_profile_columns} | {
     name: format_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")

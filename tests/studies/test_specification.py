@@ -104,6 +104,13 @@ def test_the_quick_tier_replaces_settings_and_factors(write):
     assert short == replace(full, replicates=20)  # one block
 
 
+def test_the_documented_study_is_read(write):
+    page = (Path(__file__).parents[2] / "docs" / "files.md").read_text("utf-8")
+    text = page.split("## Study files")[1].split("```yaml\n")[1].split("```")[0]
+    study = load_study(write(text), quick=True)
+    assert (len(study.cells), study.replicates) == (4, 50)
+
+
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_shipped_studies_are_read(path):
     study, quick = load_study(path), load_study(path, quick=True)

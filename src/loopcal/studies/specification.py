@@ -46,8 +46,10 @@ class InstrumentLevel:
     Parameters
     ----------
     kinds : kinds of measurement. components : coordinates that the kind `component` measures.
-    orientation : form of measured angles. sigma_position, sigma_angle : standard deviations of each
-        length and angle. unknown_frames : of "base" and "tool". distribution : of the noise.
+    orientation : form of measured angles. sigma_position, sigma_angle : standard deviation of each
+        length and each angle, by default 10 um and 50 urad.
+    unknown_frames : which of "base" and "tool" the fit estimates. distribution : of the noise; a
+        sigma is its standard deviation in both, so uniform noise lies within sqrt(3) of it.
     """
 
     kinds: tuple[str, ...] = ("pose",)
