@@ -28,6 +28,8 @@ SECTIONS = {
     "loopcal.diagnose": "Diagnosis",
     "loopcal.apply": "Use of a calibration",
     "loopcal.planning": "Planning",
+    "loopcal.studies.running": "Simulation studies",
+    "loopcal.studies": "Parts of studies",
     "loopcal.findings": "Findings",
     "loopcal.errors": "Errors",
 }

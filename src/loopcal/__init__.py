@@ -134,6 +134,14 @@ if TYPE_CHECKING:
     from loopcal.sampling import compute_joint_region as compute_joint_region
     from loopcal.sampling import compute_simultaneous_intervals as compute_simultaneous_intervals
     from loopcal.sampling import sample_posterior as sample_posterior
+    from loopcal.studies import Dask as Dask
+    from loopcal.studies import Processes as Processes
+    from loopcal.studies import Ray as Ray
+    from loopcal.studies import Serial as Serial
+    from loopcal.studies import Study as Study
+    from loopcal.studies import StudyResult as StudyResult
+    from loopcal.studies import load_study as load_study
+    from loopcal.studies.running import study as study
     from loopcal.workflow import CalibrationOptions as CalibrationOptions
     from loopcal.workflow import CalibrationReport as CalibrationReport
     from loopcal.workflow import Verdict as Verdict
@@ -185,6 +193,8 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
             Bootstrap Intervals JointRegion PosteriorSample SimultaneousIntervals bootstrap
             compute_joint_region compute_simultaneous_intervals sample_posterior
         """,
+        "loopcal.studies": "Dask Processes Ray Serial Study StudyResult load_study",
+        "loopcal.studies.running": "study",
         "loopcal.workflow": "CalibrationOptions CalibrationReport Verdict calibrate",
     }.items()
 }

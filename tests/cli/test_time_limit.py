@@ -10,10 +10,12 @@ from click.testing import CliRunner
 
 from loopcal.cli import main
 from loopcal.cli.entry_point import SECTIONS, commands
+from loopcal.cli.study_commands import study
 from loopcal.cli.terminal import ProgressBar
 from loopcal.cli.time_limit import TimeLimitError, limit_time
 
-EVERY = [name for members in SECTIONS.values() for name in members]
+NAMES = [(name,) for members in SECTIONS.values() for name in members if name != "study"]
+EVERY = [*NAMES, *(("study", name) for name in study.commands)]
 
 
 def work_forever() -> None:
@@ -77,9 +79,9 @@ def test_long_calibration_ends_with_exit_code_4_and_leaves_nothing(tmp_path, cap
     assert sorted(tmp_path.iterdir()) == names
 
 
-@pytest.mark.parametrize("name", EVERY)
-def test_every_command_has_the_option(name: str) -> None:
-    result = CliRunner().invoke(commands, [name, "--help"])
+@pytest.mark.parametrize("words", EVERY)
+def test_every_command_has_the_option(words: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(commands, [*words, "--help"])
     assert "--time-limit DURATION" in result.output
 
 

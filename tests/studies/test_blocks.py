@@ -71,7 +71,7 @@ def test_scores_equal_calibrations_made_by_hand():
             "covered_position": np.mean(error <= U.expanded_position),
             "rank": fit.rank,
             "condition": fit.spectrum.condition,
-            "noise": np.sqrt(fit.chi_square / fit.residual_test.degrees),
+            "noise_scale": np.sqrt(fit.chi_square / fit.residual_test.degrees),
         }
         assert_allclose([scores[name][i] for name in by_hand], list(by_hand.values()), rtol=1e-6)
 
@@ -119,7 +119,7 @@ def test_coverage_is_95_percent(name, method):
     for score in ("covered_parameters", "covered_position"):
         share, spread = scores[score].mean(), scores[score].std() / np.sqrt(200)
         assert abs(share - 0.95) < 4.0 * spread + 0.003, score
-    assert abs(np.mean(scores["noise"] ** 2) - 1.0) < 0.06
+    assert abs(np.mean(scores["noise_scale"] ** 2) - 1.0) < 0.06
 
 
 def test_methods_see_the_same_machines_and_measurements():

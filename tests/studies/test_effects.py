@@ -142,4 +142,4 @@ def test_effects_make_calibrations_worse_and_leave_the_machines():
     for scores in others:
         assert_array_equal(scores["position_before"], none["position_before"])
         assert np.median(scores["position"]) > 1.2 * np.median(none["position"])
-        assert scores["noise"].mean() > 1.3
+        assert scores["noise_scale"].mean() > 1.3

@@ -50,6 +50,9 @@ SECTIONS = {
         "sample": "Draw from the exact posterior of a calibration.",
         "region": "Show intervals that hold for several parameters at once.",
     },
+    "Simulate many calibrations": {
+        "study": "Compare instruments, numbers of poses and methods by simulation."
+    },
     "Published studies": {
         "reproduce": "Repeat a published study and compare its numbers.",
         "per-leg": "Identify a hexapod leg by leg, to compare with calibrate.",
@@ -64,6 +67,7 @@ MODULES = {
     "plan_command": ("plan",),
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
     "sampling_commands": ("bootstrap", "sample", "region"),
+    "study_commands": ("study",),
     "paper_commands": ("reproduce", "per-leg"),
 }
 """Modules of this package, and the commands in each; they are imported when they run."""
@@ -79,7 +83,9 @@ class SectionedGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command; None where there is none of this name."""
         command = find_command(cmd_name)
-        return None if command is None else add_time_limit(command)
+        if command is None or isinstance(command, click.Group):
+            return command
+        return add_time_limit(command)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -105,6 +111,14 @@ def find_command(name: str) -> click.Command | None:
         return None
     function = name.replace("-", "_") + "_" * keyword.iskeyword(name)
     return getattr(import_module(f"loopcal.cli.{module}"), function)
+
+
+def find_running_command(words: Sequence[str]) -> click.Command | None:
+    """Import the command of the words of a command line, also one of a group; None without one."""
+    command = find_command(words[0]) if words else None
+    if isinstance(command, click.Group) and len(words) > 1:
+        return command.commands.get(words[1], command)
+    return command
 
 
 @click.group(
@@ -148,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = None
     with record_outputs() as list_outputs:
         try:
-            command = find_command(words[0]) if words else None
+            command = find_running_command(words)
             code = commands.main(words, prog_name="loopcal", standalone_mode=False)
             terminal.flush_output()
             return code if isinstance(code, int) else 0

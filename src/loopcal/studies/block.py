@@ -34,7 +34,7 @@ def compute_scores(content: Mapping[str, Any]) -> FloatArray:
     trials = simulate_block(cell, stream)
     fits = fit_trials(cell, trials)
     scores = score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
-    for name in ("rank", "condition", "iterations", "noise", "verdict"):
+    for name in ("rank", "condition", "iterations", "noise_scale", "verdict"):
         scores[name] = getattr(fits, name)
     return np.stack([scores[column.name] for column in list_columns(cell.scores)], axis=1)
 

@@ -34,7 +34,8 @@ def list_conflicts(old: str, new: str) -> tuple[str, ...]:
 
 def _compare(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
     for key in dict.fromkeys((*old, *new)):
-        before, after = old.get(key), new.get(key)
+        before: Any = old.get(key)
+        after: Any = new.get(key)
         if key in FREE:
             continue
         if key == "replicates":

@@ -148,6 +148,4 @@ def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blo
     for cell in share.select_cells(study):
         if store.count_blocks(cell.levels, blocks) == len(blocks):
             continue
-        for task in study.list_tasks([cell.number], store.list_keys(cell.levels)):
-            if task.block in blocks:
-                yield task
+        yield from study.list_tasks([cell.number], store.list_keys(cell.levels), blocks=blocks)

@@ -67,7 +67,7 @@ class FittedTrials:
     T_measured : (t, n, 4, 4) at those of the measured poses; n = 0 where no frame is fitted.
     half_width : (t, p free) of 95 % intervals [SI]. expanded : (t, h, 2) position and rotation
         errors that 95 % of the errors of held-out poses do not exceed [m], [rad].
-    rank, condition, iterations : (t,). noise : (t,) residuals over stated noise.
+    rank, condition, iterations : (t,). noise_scale : (t,) residuals over stated noise.
     verdict : (t,) numbers of VERDICTS.
     """
 
@@ -81,7 +81,7 @@ class FittedTrials:
     rank: FloatArray
     condition: FloatArray
     iterations: FloatArray
-    noise: FloatArray
+    noise_scale: FloatArray
     verdict: FloatArray
 
 
@@ -110,7 +110,7 @@ def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
         rank=plain.rank.astype(float),
         condition=plain.condition,
         iterations=fits.iterations.astype(float),
-        noise=compute_noise(plain.unexplained, plain.rows - plain.rank),
+        noise_scale=compute_noise(plain.unexplained, plain.rows - plain.rank),
         verdict=np.full(len(trials), np.nan),
     )
 
@@ -205,7 +205,9 @@ def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
         T_measured=np.full((n, 4, 4), np.nan),
         half_width=np.full(len(free), np.nan),
         expanded=np.full((h, 2), np.nan),
-        **dict.fromkeys(("rank", "condition", "iterations", "noise", "verdict"), np.array(np.nan)),
+        **dict.fromkeys(
+            ("rank", "condition", "iterations", "noise_scale", "verdict"), np.array(np.nan)
+        ),
     )
     single = []
     for i in range(len(trials)):
@@ -258,6 +260,6 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         rank=np.array(float(fit.rank)),
         condition=np.array(fit.spectrum.condition),
         iterations=np.array(float(fit.history.iterations)),
-        noise=compute_noise(test.chi_square, test.degrees),
+        noise_scale=compute_noise(test.chi_square, test.degrees),
         verdict=np.array(verdict),
     )

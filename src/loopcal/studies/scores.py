@@ -47,7 +47,7 @@ COLUMNS = (
     ScoreColumn("rank", "1", "number of combinations of parameters that the data determine"),
     ScoreColumn("condition", "1", "condition number of the scaled rows"),
     ScoreColumn("iterations", "1", "steps of the fit"),
-    ScoreColumn("noise", "1", "residuals over stated noise"),
+    ScoreColumn("noise_scale", "1", "residuals over stated noise"),
 )
 """Columns of every study."""
 

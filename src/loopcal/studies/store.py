@@ -47,7 +47,7 @@ PRAGMA user_version = {FORMAT};
 CREATE TABLE study (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE cells (id INTEGER PRIMARY KEY, levels TEXT NOT NULL UNIQUE);
 CREATE TABLE blocks (
-    key TEXT NOT NULL UNIQUE,
+    key TEXT NOT NULL,
     cell INTEGER NOT NULL REFERENCES cells (id),
     block INTEGER NOT NULL,
     trials INTEGER NOT NULL,
@@ -138,7 +138,8 @@ class StudyStore:
         with _report_errors(self.path), self.connection:
             row = (key, self._find_cell(levels), block, len(scores), content, seconds)
             done = self.connection.execute(
-                "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (key) DO NOTHING", row
+                "INSERT INTO blocks VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (cell, block) DO NOTHING",
+                row,
             )
         return done.rowcount == 1
 
@@ -169,6 +170,16 @@ class StudyStore:
             row = self.connection.execute(question, (_name_cell(levels), *bounds)).fetchone()
         return int(row[0])
 
+    @contextmanager
+    def keep_state(self) -> Iterator[None]:
+        """Let the body read one state of the store, although a driver adds blocks meanwhile."""
+        if self.connection.in_transaction:
+            yield
+            return
+        with _report_errors(self.path), self.connection:
+            self.connection.execute("BEGIN")
+            yield
+
     def read_blocks(self, levels: Levels) -> Iterator[tuple[int, FloatArray]]:
         """Yield the blocks of a cell with their numbers, in this order: (number, (B, s) scores)."""
         question = (
@@ -186,13 +197,14 @@ class StudyStore:
 
         Memory is that of the result and of one block.
         """
-        scores = np.empty((self.count_cell(levels).trials, len(columns)))
-        first = 0
-        for _, block in self.read_blocks(levels):
-            last = first + len(block)
-            scores[first:last] = block[:, columns]
-            first = last
-        return scores[:first]
+        with self.keep_state():
+            scores = np.empty((self.count_cell(levels).trials, len(columns)))
+            first = 0
+            for _, block in self.read_blocks(levels):
+                last = first + len(block)
+                scores[first:last] = block[:, columns]
+                first = last
+        return scores
 
     def copy_blocks(self, other: StudyStore, levels: Levels) -> int:
         """Store the blocks of a cell of another store, and return how many are new."""
@@ -205,7 +217,7 @@ class StudyStore:
             before = self.connection.total_changes
             self.connection.executemany(
                 "INSERT INTO blocks (key, block, trials, scores, seconds, cell) "
-                f"VALUES (?, ?, ?, ?, ?, {cell}) ON CONFLICT (key) DO NOTHING",
+                f"VALUES (?, ?, ?, ?, ?, {cell}) ON CONFLICT (cell, block) DO NOTHING",
                 other.connection.execute(question, (_name_cell(levels),)),
             )
             return self.connection.total_changes - before

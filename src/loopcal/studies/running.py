@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run a study in Python: what `loopcal study run` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from loopcal.studies.driver import WHOLE, RunReport, Share, run_blocks
+from loopcal.studies.execution import Executor, Processes, Serial
+from loopcal.studies.study import Study
+from loopcal.studies.study_file import load_study
+from loopcal.studies.study_folder import StudySource, open_study
+from loopcal.studies.study_result import StudyResult
+from loopcal.typing import Progress, report_no_progress
+
+
+def study(
+    source: str | Path | Study,
+    folder: str | Path,
+    *,
+    workers: int = 1,
+    executor: Executor | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    progress: Progress = report_no_progress,
+) -> StudyResult:
+    """Run a study of simulated calibrations, and return its results.
+
+    Parameters
+    ----------
+    source : a study file, or a `Study`. folder : to make, or to continue.
+    workers : processes that compute; 1 computes in this process. In a script, more of them need
+        `if __name__ == "__main__":` around the call.
+    executor : other workers, such as `Dask("tcp://host:8786")`.
+    resume : continue a folder of this study, which may have got more replicates or levels.
+    quick : run the quick tier of the file. progress : receives the blocks that are stored.
+
+    Raises
+    ------
+    FileError : the study file or the folder cannot be used. StudyError : no workers.
+
+    Notes
+    -----
+    When it is interrupted, what was computed stays in the folder; continue with `resume`.
+    """
+    given = StudySource(source) if isinstance(source, Study) else read_source(source, quick)
+    run_study(given, Path(folder), executor or make_local(workers), resume, progress=progress)
+    return StudyResult(Path(folder))
+
+
+def read_source(path: str | Path, quick: bool = False) -> StudySource:
+    """Return the study of a study file."""
+    return StudySource(load_study(path, quick), Path(path))
+
+
+def make_local(workers: int) -> Executor:
+    """Return workers on this computer; one worker is this process."""
+    return Serial() if workers == 1 else Processes(workers)
+
+
+def run_study(
+    source: StudySource,
+    folder: Path,
+    executor: Executor,
+    resume: bool = False,
+    share: Share = WHOLE,
+    progress: Progress = report_no_progress,
+) -> RunReport:
+    """Compute what is missing in the folder of a study; see `open_study` and `run_blocks`."""
+    with open_study(folder, source, resume) as store:
+        return run_blocks(source.study, store, executor, share, progress)

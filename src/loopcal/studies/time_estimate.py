@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate how long a study takes, by computing one block of some of its cells."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from loopcal.report.text_page import Block
+from loopcal.studies.cells import Cell, list_factors
+from loopcal.studies.study import Study
+from loopcal.studies.work import compute_block
+from loopcal.typing import Progress, report_no_progress
+
+MOST_BLOCKS = 4
+"""Cells of which a block is computed at most; further cells are estimated from them."""
+
+LONGEST = 30.0
+"""Seconds after which no further block is begun."""
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """How long a study takes.
+
+    Attributes
+    ----------
+    cells, trials, blocks : of the study. measured : cells of which a block was computed.
+    seconds_per_block : mean of these blocks. worker_seconds : of the study, by one worker.
+    workers : processors of this computer. seconds : of the study by as many processes.
+    bytes : of its store. failed : share of the trials of these blocks that failed.
+    """
+
+    cells: int
+    trials: int
+    blocks: int
+    measured: int
+    seconds_per_block: float
+    worker_seconds: float
+    workers: int
+    seconds: float
+    bytes: int
+    failed: float
+
+
+def estimate_time(
+    study: Study, workers: int, progress: Progress = report_no_progress
+) -> TimeEstimate:
+    """Compute a block of some cells, evenly spread over the study, and estimate the whole.
+
+    Raises
+    ------
+    LoopcalError : one of these cells cannot be computed; the text names it.
+    """
+    chosen = _spread(study.cells, MOST_BLOCKS)
+    seconds, failed, trials = [], 0, 0
+    for i, cell in enumerate(chosen):
+        progress(i, len(chosen), "computing a block")
+        begin = time.perf_counter()
+        result = compute_block(next(study.list_tasks([cell.number])))
+        seconds.append(time.perf_counter() - begin)
+        failed, trials = failed + int((result.values[:, 0] != 0).sum()), trials + len(result.values)
+        if sum(seconds) > LONGEST:
+            break
+    blocks = study.blocks * len(study.cells)
+    each = sum(seconds) / len(seconds)
+    return TimeEstimate(
+        len(study.cells),
+        study.replicates * len(study.cells),
+        blocks,
+        len(seconds),
+        each,
+        each * blocks,
+        workers,
+        each * math.ceil(blocks / workers),
+        blocks * study.block * len(study.columns) * 8,
+        failed / trials,
+    )
+
+
+def view_estimate(
+    study: Study, estimate: TimeEstimate, format_duration: Callable[[float], str]
+) -> list[Block]:
+    """Return the page of an estimate."""
+    lines = [f"{study.title}: {estimate.cells} cells, {estimate.trials} trials"]
+    for name in list_factors(study):
+        levels = dict.fromkeys(cell.levels[name] for cell in study.cells)
+        lines.append(f"  {name:<12}{', '.join(levels)}")
+    total = format_duration(estimate.seconds)
+    plural = "es" if estimate.workers > 1 else ""
+    lines.append(
+        f"A block of {study.block} trials takes {estimate.seconds_per_block:.2g} s; the study "
+        f"takes about {total} with {estimate.workers} process{plural}, and "
+        f"{max(estimate.bytes / 1e6, 0.1):.1f} MB"
+    )
+    if estimate.failed:
+        lines.append(f"{estimate.failed:.0%} of the trials of these blocks failed")
+    return list(lines)
+
+
+def _spread(cells: tuple[Cell, ...], count: int) -> list[Cell]:
+    """Return some cells, evenly spread, with the first and the last."""
+    if len(cells) <= count:
+        return list(cells)
+    return [cells[round(i * (len(cells) - 1) / (count - 1))] for i in range(count)]

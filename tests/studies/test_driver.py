@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study survives what happens to its driver and its workers, and its folder is continued."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal
+from loopcal.errors import FileError
+from loopcal.studies.driver import Share, count_blocks, count_stored, run_blocks
+from loopcal.studies.execution import Answer, Processes, Serial
+from loopcal.studies.merging import merge_studies
+from loopcal.studies.running import read_source, run_study
+from loopcal.studies.store import NAME, open_store
+from loopcal.studies.study_folder import StudySource, extend_study, open_study, read_study
+from loopcal.studies.study_result import StudyResult
+from tests.findings.expectations import expect_refusal, list_codes
+from tests.studies.small_study import CELLS, read_contents, write_study
+
+ROOT = str(Path(__file__).parents[2])
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> Path:
+    """Return the folder of the small study, computed without disturbance."""
+    place = tmp_path_factory.mktemp("undisturbed")
+    loopcal.study(write_study(place), place / "study")
+    return place / "study"
+
+
+def test_study_in_python_returns_its_results(undisturbed) -> None:
+    result = StudyResult(undisturbed)
+    assert next(c.name for c in result.study.columns) == "outcome"
+    scores = result.read_scores(0, ["position", "rank"])
+    assert scores.shape == (20, 2)
+    assert (scores > 0.0).all()
+    summary = result.summarize()
+    assert summary.is_complete
+    assert summary.trials == CELLS * 20
+    frame, data = result.to_pandas(), result.to_xarray()
+    assert len(frame) == CELLS * 20
+    cell = frame[(frame.poses == "12") & (frame.method == "map")]
+    chosen = data.position.sel({"poses": "12", "method": "map"}).squeeze()
+    assert np.array_equal(cell.position, chosen)
+    assert chosen.attrs["units"] == "m"
+
+
+def test_progress_counts_blocks_and_finished_study_computes_nothing(undisturbed, tmp_path) -> None:
+    reports = []
+    source = read_source(write_study(tmp_path))
+
+    def note(done: int, total: int, _what: str) -> None:
+        reports.append((done, total))
+
+    again = run_study(source, undisturbed, Serial(), resume=True, progress=note)
+    assert (again.total, again.before, again.computed) == (16, 16, 0)
+    assert reports == [(16, 16)]
+    assert again.is_complete
+
+
+def test_folder_is_continued_extended_and_equal_to_one_made_at_once(undisturbed, tmp_path) -> None:
+    file = write_study(tmp_path, replicates=10)
+    first = loopcal.study(file, tmp_path / "study")
+    assert first.summarize().trials == CELLS * 10
+    with extend_study(tmp_path / "study", 20) as store:
+        study = read_study(tmp_path / "study")
+        report = run_blocks(study, store, Serial())
+    assert (report.total, report.before, report.computed, report.trials) == (16, 8, 8, 40)
+    assert read_contents(tmp_path / "study") == read_contents(undisturbed)
+
+
+def test_further_levels_keep_finished_blocks(undisturbed, tmp_path) -> None:
+    source = read_source(write_study(tmp_path))
+    fewer = replace(source.study, poses={"12": source.study.poses["12"]})
+    run_study(StudySource(fewer), tmp_path / "study", Serial())
+    report = run_study(source, tmp_path / "study", Serial(), resume=True)
+    assert (report.before, report.computed) == (8, 8)
+    assert read_contents(tmp_path / "study") == read_contents(undisturbed)
+
+
+def test_folder_is_refused_where_it_is_in_use_changed_or_of_others(undisturbed, tmp_path) -> None:
+    source = read_source(write_study(tmp_path))
+    with expect_refusal("store.in-use", FileError):
+        run_study(source, undisturbed, Serial())
+    changed = StudySource(replace(source.study, seed=4))
+    with expect_refusal("store.specification-changed", FileError, changes=("seed: 3 -> 4",)):
+        run_study(changed, undisturbed, Serial(), resume=True)
+    with expect_refusal("store.specification-changed", FileError):
+        run_study(read_source(write_study(tmp_path, 10)), undisturbed, Serial(), resume=True)
+    with expect_refusal("store.folder-of-others", FileError):
+        run_study(source, tmp_path, Serial(), resume=True)
+    (tmp_path / "file").touch()
+    with pytest.raises(FileError, match="this is a file, but a study is a folder"):
+        run_study(source, tmp_path / "file", Serial())
+
+
+def test_store_of_other_numbers_is_refused(undisturbed, tmp_path) -> None:
+    source = read_source(write_study(tmp_path))
+    with open_study(tmp_path / "study", source) as store:
+        store.set_header(replace(store.header, versions={"numerics": "0"}))
+    with expect_refusal("store.other-numbers", FileError, found="0"):
+        run_study(source, tmp_path / "study", Serial(), resume=True)
+
+
+def test_folder_contains_the_study_file_and_its_robots(tmp_path) -> None:
+    shipped = Path(loopcal.__file__).parent / "robots" / "five-bar.yaml"
+    (tmp_path / "mine.yaml").write_bytes(shipped.read_bytes())
+    file = write_study(tmp_path, 2, 2)
+    file.write_text(file.read_text().replace("[five-bar]", "[mine.yaml]"))
+    with open_study(tmp_path / "study", read_source(file)):
+        pass
+    names = {path.name for path in (tmp_path / "study").iterdir()}
+    assert names - {f"{NAME}-wal", f"{NAME}-shm"} == {NAME, "study.yaml", "mine.yaml"}
+    assert (tmp_path / "study" / "study.yaml").read_bytes() == file.read_bytes()
+    assert read_source(tmp_path / "study" / "study.yaml").study == read_source(file).study
+
+
+@pytest.mark.parametrize("parts", [2, 7])
+def test_shares_are_disjoint_and_their_folders_join_to_the_whole(
+    undisturbed, tmp_path, parts
+) -> None:
+    source = read_source(write_study(tmp_path))
+    folders = [tmp_path / f"part-{part}" for part in range(1, parts + 1)]
+    totals = []
+    for part, folder in enumerate(folders, start=1):
+        report = run_study(source, folder, Serial(), share=Share(part, parts))
+        assert report.is_complete
+        totals.append(report.total)
+    assert sum(totals) == 16
+    assert max(totals) - min(totals) <= 4
+    assert merge_studies(folders, tmp_path / "study") == 16
+    assert merge_studies(folders, tmp_path / "study") == 0
+    assert read_contents(tmp_path / "study") == read_contents(undisturbed)
+    other = StudySource(replace(source.study, seed=9))
+    run_study(other, tmp_path / "other", Serial(), share=Share(1, 7))
+    with expect_refusal("store.part-of-other-study", FileError, changes=("seed: 9 -> 3",)):
+        merge_studies([folders[0], tmp_path / "other"], tmp_path / "third")
+
+
+class GivesUp:
+    """Workers that give up every block of number 1 (a stand-in for blocks that need too much
+    memory; `test_execution` has processes that are really killed).
+    """
+
+    def map_blocks(self, function, tasks):
+        for task in tasks:
+            result = None if task.block == 1 else function(task)
+            yield Answer(task, result, 0.1, 5 if task.block == 1 else 0)
+
+
+def test_blocks_that_are_given_up_are_reported_and_computed_the_next_time(tmp_path) -> None:
+    source = read_source(write_study(tmp_path))
+    report = run_study(source, tmp_path / "study", GivesUp())
+    assert (report.computed, len(report.given_up), report.losses) == (12, 4, 20)
+    assert not report.is_complete
+    assert list_codes(report.findings) == {"workers.lost", "workers.blocks-given-up"}
+    assert "cell 0, block 1" in str(report.findings[1])
+    again = run_study(source, tmp_path / "study", Serial(), resume=True)
+    assert (again.computed, again.is_complete) == (4, True)
+
+
+def test_two_processes_give_the_same_blocks_and_little_overhead(undisturbed, tmp_path) -> None:
+    report = run_study(read_source(write_study(tmp_path)), tmp_path / "study", Processes(2))
+    assert report.computed == 16
+    assert read_contents(tmp_path / "study") == read_contents(undisturbed)
+
+
+RUN = """
+import sys
+from pathlib import Path
+from loopcal.studies.execution import Processes
+from loopcal.studies.running import read_source, run_study
+if __name__ == "__main__":
+    report = run_study(read_source(Path(sys.argv[1])), Path(sys.argv[2]), Processes(2), resume=True)
+    print(report.is_complete)
+"""
+
+
+@pytest.mark.slow
+def test_study_survives_killed_drivers_and_workers(tmp_path) -> None:
+    """The small version of evidence/study_interruption.py."""
+    file, script = write_study(tmp_path, 60), tmp_path / "run.py"
+    expected = tmp_path / "undisturbed"
+    run_study(read_source(file), expected, Serial())
+    script.write_text(RUN)
+    folder, rng = tmp_path / "study", random.Random(5)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    words = [sys.executable, str(script), str(file), str(folder)]
+    stored = [0]
+    for kill in range(3):
+        with subprocess.Popen(words, env=environment, start_new_session=True) as driver:
+            wait_for_blocks(folder, stored[-1] + 1)
+            time.sleep(rng.uniform(0.0, 0.3))
+            victims = list_children(driver.pid) if kill % 2 else [driver.pid]
+            os.kill(rng.choice(victims or [driver.pid]), signal.SIGKILL)
+            time.sleep(rng.uniform(0.0, 0.3))
+            driver.kill()
+        stored.append(count_all(folder))
+    assert stored == sorted(stored)
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
+    assert read_contents(folder) == read_contents(expected)
+
+
+def wait_for_blocks(folder: Path, count: int) -> None:
+    end = time.monotonic() + 60.0
+    while not (folder / NAME).exists() or count_all(folder) < count:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def count_all(folder: Path) -> int:
+    return len(read_contents(folder))
+
+
+def list_children(process: int) -> list[int]:
+    """Return the worker processes of a driver, without the tracker of resources."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    return [
+        int(child)
+        for child in children
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+    ]
+
+
+def test_counts_of_shares_add_up(undisturbed) -> None:
+    study = read_study(undisturbed)
+    for parts in (1, 3, 4, 5, 9):
+        shares = [Share(part, parts) for part in range(1, parts + 1)]
+        assert sum(count_blocks(study, share) for share in shares) == 16
+    with open_store(undisturbed) as store:
+        assert sum(count_stored(study, store, Share(part, 5)) for part in range(1, 6)) == 16

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The store keeps what was committed, stores nothing twice, and refuses what it cannot keep."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.errors import FileError
+from loopcal.studies import file_systems
+from loopcal.studies.changes import list_conflicts
+from loopcal.studies.file_systems import find_type, is_network
+from loopcal.studies.keys import dump_json
+from loopcal.studies.specification import ErrorsLevel, MethodLevel, NoiseLevel, Robot
+from loopcal.studies.store import NAME, StoreHeader, is_driven, make_store, open_store, read_store
+from loopcal.studies.study import Study
+from tests.findings.expectations import expect_refusal
+
+HEADER = StoreHeader("{}", ("outcome", "position", "rank"), {"numerics": "1"})
+A, B = {"robot": "r", "poses": "10"}, {"robot": "r", "poses": "20"}
+ROOT = str(Path(__file__).parents[2])
+
+
+def make_scores(number: int, trials: int = 4) -> np.ndarray:
+    scores = np.random.default_rng(number).normal(size=(trials, 3))
+    scores[0, 1] = np.nan
+    return scores
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    make_store(tmp_path, HEADER)
+    return tmp_path
+
+
+def test_blocks_are_read_back_to_the_last_bit_in_the_order_of_their_numbers(folder) -> None:
+    with open_store(folder) as store:
+        for number in (2, 0, 1):
+            assert store.add_block(f"key{number}", A, number, make_scores(number), 0.5)
+        assert store.add_block("other", B, 0, make_scores(7, 2), 0.25)
+    with read_store(folder) as store:
+        assert store.header == HEADER
+        blocks = list(store.read_blocks(A))
+        assert [number for number, _ in blocks] == [0, 1, 2]
+        assert all(np.array_equal(b, make_scores(n), equal_nan=True) for n, b in blocks)
+        swapped = dict(reversed(A.items()))
+        expected = np.concatenate([make_scores(n)[:, [2, 0]] for n in range(3)])
+        assert np.array_equal(store.read_scores(swapped, [2, 0]), expected)
+        assert (store.count_cell(A).blocks, store.count_cell(A).trials) == (3, 12)
+        assert store.count_cell(A).seconds == pytest.approx(1.5)
+        assert store.count_blocks(A, range(1, 9, 2)) == 1
+        assert store.list_keys(B) == {"other"}
+        assert store.count_cell({"robot": "unknown"}).blocks == 0
+        assert store.read_scores({"robot": "unknown"}, [0]).shape == (0, 1)
+
+
+def test_block_that_is_computed_twice_is_stored_once(folder) -> None:
+    with open_store(folder) as store:
+        assert store.add_block("key", A, 0, make_scores(0), 0.5)
+        assert not store.add_block("key", A, 0, make_scores(1), 0.5)
+        assert np.array_equal(next(store.read_blocks(A))[1], make_scores(0), equal_nan=True)
+
+
+def test_cells_of_equal_content_have_blocks_of_their_own(folder) -> None:
+    with open_store(folder) as store:
+        assert store.add_block("same", A, 0, make_scores(0), 0.5)
+        assert store.add_block("same", B, 0, make_scores(0), 0.5)
+
+
+def test_scores_can_be_read_while_they_are_written(folder) -> None:
+    with open_store(folder) as store, read_store(folder) as reader:
+        assert reader.count_cell(A).blocks == 0
+        store.add_block("key", A, 0, make_scores(0), 0.5)
+        assert reader.count_cell(A).blocks == 1
+        with pytest.raises(FileError, match="readonly"):
+            reader.add_block("key1", A, 1, make_scores(0), 0.5)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from loopcal.studies.store import open_store
+from tests.studies.test_store import A, make_scores
+with open_store(Path(sys.argv[1])) as store:
+    for number in range(10):
+        store.add_block(f"key{number}", A, number, make_scores(number), 0.1)
+        print(number, flush=True)
+    store.connection.execute("INSERT INTO cells (levels) VALUES ('unfinished')")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_every_committed_block_survives_a_killed_driver_and_the_lock_does_not(folder) -> None:
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, folder], env=environment, capture_output=True, check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert not is_driven(folder)
+    with open_store(folder) as store:
+        assert is_driven(folder)
+        blocks = dict(store.read_blocks(A))
+        assert sorted(blocks) == list(range(10))
+        assert all(np.array_equal(blocks[n], make_scores(n), equal_nan=True) for n in blocks)
+        assert store.connection.execute("SELECT count(*) FROM cells").fetchone() == (1,)
+
+
+def test_second_driver_is_refused_but_may_read(folder) -> None:
+    with open_store(folder):
+        with expect_refusal("store.other-driver", FileError), open_store(folder):
+            pass
+        with read_store(folder) as reader:
+            assert reader.header == HEADER
+    with open_store(folder):
+        pass
+
+
+def test_folder_without_store_and_foreign_files_are_refused(tmp_path) -> None:
+    with expect_refusal("store.missing", FileError), open_store(tmp_path):
+        pass
+    (tmp_path / NAME).write_text("this is no database, but it has some length" * 40)
+    for opens in (open_store, read_store):
+        with expect_refusal("store.damaged", FileError), opens(tmp_path):
+            pass
+    (tmp_path / NAME).unlink()
+    foreign = sqlite3.connect(tmp_path / NAME)
+    foreign.execute("CREATE TABLE blocks (x)")
+    foreign.close()
+    with expect_refusal("store.damaged", FileError), open_store(tmp_path):
+        pass
+
+
+def test_store_of_another_format_is_refused_and_unchanged(folder) -> None:
+    connection = sqlite3.connect(folder / NAME)
+    connection.execute("PRAGMA user_version = 7")
+    connection.close()
+    before = (folder / NAME).read_bytes()
+    for opens in (open_store, read_store):
+        with expect_refusal("store.other-format", FileError, found=7, known=1), opens(folder):
+            pass
+    assert (folder / NAME).read_bytes() == before
+
+
+@pytest.mark.parametrize("part", ["middle", "end"])
+def test_damaged_store_gives_a_sentence(folder, part) -> None:
+    with open_store(folder) as store:
+        for number in range(200):
+            store.add_block(f"key{number}", A, number, make_scores(number, 20), 0.1)
+    raw = bytearray((folder / NAME).read_bytes())
+    if part == "end":
+        raw = raw[: len(raw) // 2]
+    else:
+        raw[4096 : len(raw) - 4096] = os.urandom(len(raw) - 8192)
+    (folder / NAME).write_bytes(raw)
+    with pytest.raises(FileError) as caught, read_store(folder) as store:
+        list(store.read_blocks(A))
+    assert caught.value.code in {"store.damaged", "store.disk-full", "store.not-accessible"}
+
+
+FULL = """
+import sys
+from pathlib import Path
+from loopcal.errors import FileError
+from loopcal.studies.store import make_store, open_store, read_store
+from tests.studies.test_store import A, HEADER, make_scores
+folder = Path("disk/study")
+folder.mkdir()
+make_store(folder, HEADER)
+number = 0
+with open_store(folder) as store:
+    try:
+        while number < 10000:
+            store.add_block(f"key{number}", A, number, make_scores(number, 50), 0.1)
+            number += 1
+    except FileError as error:
+        print(error.code, number > 5)
+        print(store.count_cell(A).blocks == number)
+with read_store(folder) as store:
+    print([n for n, _ in store.read_blocks(A)] == list(range(number)))
+"""
+
+
+@pytest.mark.slow
+def test_full_disk_loses_only_the_block(tmp_path) -> None:
+    (tmp_path / "disk").mkdir()
+    mount = "mount -t tmpfs -o size=400k none disk"
+    probe = subprocess.run(["unshare", "-m", "sh", "-c", mount], cwd=tmp_path, check=False)
+    if probe.returncode != 0:
+        pytest.skip("no small disk can be mounted here")
+    words = ["unshare", "-m", "sh", "-c", f'{mount} && exec "$0" -c "$1"', sys.executable, FULL]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    done = subprocess.run(
+        words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.stdout.splitlines() == ["store.disk-full True", "True", "True"], done.stderr
+
+
+MOUNTS = """\
+22 1 8:1 / / rw,relatime - ext4 /dev/sda1 rw
+23 22 0:21 / /proc rw - proc proc rw
+30 22 0:40 / /home rw,relatime shared:1 - nfs4 server:/home rw
+31 30 8:2 / /home/me/local\\040disk rw - xfs /dev/sdb rw
+32 22 0:41 / /mnt/share rw - fuse.sshfs me@host:/ rw
+33 22 0:42 / /mnt/share rw - cifs //host/share rw
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "refused"),
+    [
+        ("/var/study", "ext4", False),
+        ("/homework", "ext4", False),
+        ("/home/me/study", "nfs4", True),
+        ("/home/me/local disk/study", "xfs", False),
+        ("/mnt/share/a", "cifs", True),
+    ],
+)
+def test_file_system_is_that_of_the_deepest_and_latest_mount(path, kind, refused) -> None:
+    assert find_type(MOUNTS, Path(path)) == kind
+    assert is_network(kind) == refused
+
+
+def test_file_systems_of_user_programs_are_networks_unless_they_use_a_disk() -> None:
+    kinds = ("fuse.sshfs", "fuse.rclone", "fuse.s3fs", "fuse.ntfs-3g", "fuse.overlayfs", "tmpfs")
+    assert [is_network(kind) for kind in kinds] == [True, True, True, False, False, False]
+
+
+def test_network_file_system_is_refused_but_a_complete_copy_there_is_read(
+    folder, tmp_path, monkeypatch
+) -> None:
+    with open_store(folder) as store:
+        store.add_block("key", A, 0, make_scores(0), 0.5)
+    table = tmp_path / "mounts"
+    table.write_text(f"1 0 8:1 / / rw - ext4 /dev/a rw\n2 1 0:40 / {tmp_path} rw - nfs4 h:/ rw\n")
+    monkeypatch.setattr(file_systems, "MOUNTS", table)
+    with expect_refusal("store.network-file-system", FileError, kind="nfs4"), open_store(folder):
+        pass
+    with expect_refusal("store.network-file-system", FileError):
+        make_store(tmp_path, HEADER)
+    with read_store(folder) as store:
+        assert store.count_cell(A).blocks == 1
+
+
+def test_many_readers_and_a_writer_do_not_disturb_each_other(folder) -> None:
+    problems: list[BaseException] = []
+
+    def read() -> None:
+        try:
+            for _ in range(20):
+                with read_store(folder) as reader:
+                    trials = reader.read_scores(A, [0, 1, 2])
+                    assert len(trials) % 4 == 0
+        except BaseException as error:  # noqa: BLE001 shown below
+            problems.append(error)
+
+    readers = [threading.Thread(target=read) for _ in range(3)]
+    with open_store(folder) as store:
+        for reader in readers:
+            reader.start()
+        for number in range(100):
+            store.add_block(f"key{number}", A, number, make_scores(number), 0.1)
+        for reader in readers:
+            reader.join()
+    assert problems == []
+
+
+STUDY = Study(
+    "title",
+    {"r": Robot("five-bar", "text of the robot")},
+    errors={"small": ErrorsLevel(1.0), "wide": ErrorsLevel(2.0)},
+)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        STUDY,
+        replace(STUDY, title="another"),
+        replace(STUDY, replicates=5000),
+        replace(STUDY, errors={**STUDY.errors, "wider": ErrorsLevel(4.0)}),
+        replace(STUDY, noise={"1": NoiseLevel(1.0), "2": NoiseLevel(2.0)}),
+        replace(STUDY, order=("errors", "robot")),
+    ],
+)
+def test_more_replicates_and_further_levels_keep_finished_blocks(changed) -> None:
+    assert list_conflicts(dump_json(STUDY), dump_json(changed)) == ()
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        (replace(STUDY, seed=2), "seed: 1 -> 2"),
+        (replace(STUDY, block=10), "block: 50 -> 10"),
+        (replace(STUDY, replicates=10), "replicates: 1000 -> 10 (more are allowed, but not fewer)"),
+        (replace(STUDY, errors={"small": ErrorsLevel(1.0)}), "errors/wide: removed"),
+        (
+            replace(STUDY, errors={**STUDY.errors, "wide": ErrorsLevel(3.0)}),
+            "errors/wide/tolerance_factor: 2.0 -> 3.0",
+        ),
+        (
+            replace(STUDY, methods={"auto": MethodLevel("map")}),
+            'methods/auto/method: "auto" -> "map"',
+        ),
+        (
+            replace(STUDY, robots={"r": Robot("five-bar", "another text" * 9)}),
+            "robots/r/text: changed",
+        ),
+        (replace(STUDY, scores=replace(STUDY.scores, held_out=9)), "scores/held_out: 20 -> 9"),
+    ],
+)
+def test_other_changes_are_named(changed, sentence) -> None:
+    assert list_conflicts(dump_json(STUDY), dump_json(changed)) == (sentence,)
