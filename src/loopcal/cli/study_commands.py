@@ -14,6 +14,7 @@ from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.options import FILE, file_option, flag_option, force_option, json_option
 from loopcal.cli.study_options import (
+    choose_work,
     count_processors,
     round_duration,
     run_and_report,
@@ -116,9 +117,9 @@ def run(
     from loopcal.studies.running import read_source
     from loopcal.studies.study_folder import open_study
 
-    source = read_source(study_file, quick)
+    source, work = read_source(study_file, quick), choose_work(**options)
     with open_study(folder, source, resume) as store:
-        return run_and_report(source.study, store, folder, as_json, **options)
+        return run_and_report(source.study, store, folder, work, as_json)
 
 
 @study.command()
@@ -137,8 +138,9 @@ def extend(folder: Path, replicates: int, as_json: bool, **options: Any) -> int:
     """  # noqa: D301
     from loopcal.studies.study_folder import extend_study, load_specification
 
+    work = choose_work(**options)
     with extend_study(folder, replicates) as store:
-        return run_and_report(load_specification(store), store, folder, as_json, **options)
+        return run_and_report(load_specification(store), store, folder, work, as_json)
 
 
 @study.command()

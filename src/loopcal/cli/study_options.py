@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,8 @@ from loopcal.cli.time_limit import TimeLimitError, format_duration
 if TYPE_CHECKING:
     from loopcal.studies.driver import RunReport, Share
     from loopcal.studies.execution import Executor
+    from loopcal.studies.store import StudyStore
+    from loopcal.studies.study import Study
 
 STOPPED, INCOMPLETE = 1, 2
 """Exit codes of a study that was stopped, and of one with blocks that could not be computed."""
@@ -66,16 +69,30 @@ worker_options = add_options(
 )
 
 
+@dataclass(frozen=True)
+class Work:
+    """Who computes a study, and which share of it."""
+
+    executor: Executor
+    share: Share
+
+
+def choose_work(share: Share | None, workers: int | None, dask: str | None, ray: bool) -> Work:
+    """Return what the values of `worker_options` mean."""
+    from loopcal.studies.driver import WHOLE
+
+    return Work(_make_executor(workers, dask, ray), share or WHOLE)
+
+
 def run_and_report(
-    chosen: Any, store: Any, folder: Path, as_json: bool, *, share: Share | None, **workers: Any
+    chosen: Study, store: StudyStore, folder: Path, work: Work, as_json: bool
 ) -> int:
     """Compute what is missing in an open store, print the report, and return the exit code."""
-    from loopcal.studies.driver import WHOLE, run_blocks
+    from loopcal.studies.driver import run_blocks
 
-    executor, part = _make_executor(**workers), share or WHOLE
-    with _keep_when_stopped(chosen, store, part, folder) as stop:
+    with _keep_when_stopped(chosen, store, work.share, folder) as stop:
         with terminal.ProgressBar() as progress:
-            report = run_blocks(chosen, store, executor, part, progress)
+            report = run_blocks(chosen, store, work.executor, work.share, progress)
         _print_report(report, folder, as_json)
         return 0 if report.is_complete else INCOMPLETE
     return stop[0]
@@ -107,7 +124,9 @@ def count_processors() -> int:
 
 
 @contextmanager
-def _keep_when_stopped(chosen: Any, store: Any, share: Any, folder: Path) -> Iterator[list[int]]:
+def _keep_when_stopped(
+    chosen: Study, store: StudyStore, share: Share, folder: Path
+) -> Iterator[list[int]]:
     """Say what is kept where the body is stopped by Ctrl-C or by the time limit.
 
     Yields a list that receives the exit code.

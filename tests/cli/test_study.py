@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""loopcal study: from a new file to results, and what happens to folders."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.io import load_robot
+from loopcal.studies.store import NAME, open_store
+from loopcal.studies.study_result import StudyResult
+from tests.studies.small_study import CELLS, read_contents, write_study
+
+ROOT = str(Path(__file__).parents[2])
+ONE = "--workers 1"
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run a command line in an empty folder; return exit code, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        code = main(["study", *words.split()])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def shrink(file: Path) -> None:
+    """Leave few trials and levels in a study file."""
+    text = file.read_text().replace("replicates: 1000", "replicates: 6\nblock: 3")
+    file.write_text(text.replace("poses: [10, 20, 40]", "poses: [10]"))
+
+
+def test_new_file_leads_to_results_by_the_commands_that_each_step_names(run, tmp_path) -> None:
+    code, out, _ = run("new study.yaml")
+    assert (code, out.splitlines()[-1]) == (0, "Next: loopcal study check study.yaml")
+    shrink(tmp_path / "study.yaml")
+    code, out, _ = run("check study.yaml")
+    assert code == 0
+    assert "4 cells, 24 trials" in out
+    assert out.splitlines()[-1] == "Next: loopcal study run study.yaml -o FOLDER"
+    code, out, _ = run(f"run study.yaml -o results {ONE}")
+    assert (code, out.splitlines()[-1]) == (0, "Next: loopcal study summary results")
+    assert "8 of 8 blocks are stored in results: 8 new, 24 trials" in out
+    code, out, _ = run("summary results")
+    assert code == 0
+    for word in ("instrument", "effects", "tracker", "noisier", "position", "[mm]"):
+        assert word in out
+    rows = list(csv.DictReader((tmp_path / "results" / "summary.csv").open()))
+    assert len(rows) == 4
+    factors = {"robot", "instrument", "noise", "poses", "errors", "method", "effects"}
+    assert factors <= set(rows[0])
+    row = rows[0]
+    low, median, high = (row[f"position{part} [m]"] for part in (" low", "", " high"))
+    assert float(low) <= float(median) <= float(high)
+
+
+@pytest.mark.parametrize("robot", ["five-bar", "hexapod-42"])
+def test_template_is_valid_for_other_robots(run, tmp_path, robot) -> None:
+    assert run(f"new study.yaml --robot {robot}")[0] == 0
+    shrink(tmp_path / "study.yaml")
+    code, out, err = run("check study.yaml --json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["cells"] == 4
+
+
+def test_every_command_prints_json(run, tmp_path) -> None:
+    file = write_study(tmp_path, 4, 2).name
+    documents = {}
+    for words in (
+        f"check {file}",
+        f"run {file} -o f {ONE}",
+        "status f",
+        f"extend f --replicates 6 {ONE}",
+        "summary f",
+        "export f -o trials.csv",
+        "replay f 1/5 -o trial",
+        "merge f -o g",
+    ):
+        code, out, err = run(f"{words} --json")
+        assert code in (0, 2), err
+        documents[words.split()[0]] = json.loads(out)
+    assert documents["check"]["trials"] == CELLS * 4
+    assert documents["run"]["computed"] == CELLS * 2
+    assert documents["status"]["total"] == CELLS * 2
+    assert documents["extend"]["computed"] == CELLS
+    assert documents["summary"]["cells"][0]["trials"] == 6
+    assert documents["export"]["trials"] == CELLS * 6
+    assert "verdict" in documents["replay"]
+    assert documents["merge"]["new_blocks"] == CELLS * 3
+    assert read_contents(tmp_path / "g") == read_contents(tmp_path / "f")
+
+
+def test_exports_contain_every_trial_with_its_factors(run, tmp_path) -> None:
+    from pyarrow import parquet
+
+    file = write_study(tmp_path, 3, 2).name
+    run(f"run {file} -o f {ONE}")
+    for name in ("trials.csv", "trials.parquet"):
+        assert run(f"export f -o {name}")[0] == 0
+    rows = list(csv.DictReader((tmp_path / "trials.csv").open()))
+    table = parquet.read_table(tmp_path / "trials.parquet")
+    assert len(rows) == table.num_rows == CELLS * 3
+    assert [row["trial"] for row in rows[:4]] == ["0", "1", "2", "0"]
+    assert [row["method"] for row in rows] == table["method"].to_pylist()
+    assert [float(row["position [m]"]) for row in rows] == table["position"].to_pylist()
+    assert table.schema.field("position").metadata == {b"unit": b"m"}
+    code, _, err = run("export f -o trials.txt")
+    assert (code, "must end in .csv or .parquet" in err) == (1, True)
+
+
+def test_replayed_trial_is_a_normal_run_with_the_numbers_of_the_study(run, tmp_path) -> None:
+    file = write_study(tmp_path, 4, 2).name
+    run(f"run {file} -o f {ONE}")
+    code, out, err = run("replay f 2/3 -o trial")
+    assert code == 0, err
+    assert "Written to trial, and its inputs to trial-input" in out
+    data = "trial-input/robot.yaml trial-input/measurements.csv"
+    again = main(f"calibrate {data} -o again --method map".split())
+    robots = [load_robot(tmp_path / name / "robot.yaml") for name in ("trial", "again")]
+    assert again == code
+    assert robots[0].values == pytest.approx(robots[1].values, rel=1e-9)
+    truth = load_robot(tmp_path / "trial-input" / "truth.yaml")
+    error = (robots[0].values - truth.values)[select_free_parameters(truth).places]
+    scaled = error / select_free_parameters(truth).tolerance
+    stored = StudyResult(tmp_path / "f").read_scores(2, ["parameters"])[3, 0]
+    assert np.sqrt(np.mean(scaled**2)) == pytest.approx(stored, rel=1e-6)
+    for words in ("9/0", "0/4", "x"):
+        code, _, err = run(f"replay f {words} -o other")
+        assert code == 1
+        assert "there is no" in err or "such as 3/17" in err
+
+
+def test_folder_in_use_changed_study_other_version_and_two_drivers_are_refused(
+    run, tmp_path
+) -> None:
+    file = write_study(tmp_path, 4, 2)
+    start = f"run {file.name} -o f {ONE}"
+    assert run(start)[0] == 0
+    code, _, err = run(start)
+    assert code == 1
+    assert "already contains a study" in err
+    assert "Hint: use --resume to continue it" in err
+    assert run(f"{start} --resume")[0] == 0
+    file.write_text(file.read_text().replace("seed: 3", "seed: 4"))
+    code, _, err = run(f"{start} --resume")
+    assert (code, "seed: 3 -> 4" in err) == (1, True)
+    with open_store(tmp_path / "f") as store:
+        code, _, err = run("extend f --replicates 8")
+        assert (code, "another process computes this study now" in err) == (1, True)
+        assert "it is being computed now" in run("status f")[1].replace("\n", " ")
+        store.connection.execute("PRAGMA user_version = 9")
+    for words in ("status f", "summary f", "extend f --replicates 8"):
+        code, _, err = run(words)
+        assert (code, "has format 9" in err) == (1, True)
+
+
+def test_ctrl_c_leaves_a_folder_that_is_continued(tmp_path) -> None:
+    file = write_study(tmp_path, 4000, 5)
+    words = [sys.executable, "-m", "loopcal", "study", "run", file.name, "-o", "f"]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    with subprocess.Popen(
+        [*words, "--workers", "2"], cwd=tmp_path, env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    ) as driver:  # fmt: skip
+        end = time.monotonic() + 60.0
+        while not (tmp_path / "f" / NAME).exists() or len(read_contents(tmp_path / "f")) < 2:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        os.killpg(driver.pid, signal.SIGINT)  # as a terminal does, to the workers, too
+        out, err = driver.communicate(timeout=30.0)
+    assert (driver.returncode, out) == (1, "")
+    stored = len(read_contents(tmp_path / "f"))
+    assert f"loopcal: Stopped. {stored} of 3200 blocks are stored in f" in err
+    assert "use --resume to continue" in err
+    assert "Traceback" not in err
+
+
+def test_time_limit_leaves_a_folder_that_is_continued(run, tmp_path) -> None:
+    file = write_study(tmp_path, 100_000, 5).name
+    code, _, err = run(f"run {file} -o f {ONE} --time-limit 2s")
+    assert code == 4
+    assert "the time limit of 2 s was reached" in err
+    assert "blocks are stored in f, and the study can be continued there" in err
+    assert "no result was written" not in err
+
+
+FULL = """
+import os
+from loopcal.cli import main
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.io import load_robot
+code = main("study run small.yaml -o disk/f --workers 1".split())
+print(code, flush=True)
+os.unlink("disk/filler")
+print(main("study run small.yaml -o disk/f --workers 1 --resume".split()))
+"""
+
+
+@pytest.mark.slow
+def test_study_on_a_full_disk_is_continued_when_there_is_space(tmp_path) -> None:
+    write_study(tmp_path, 300, 50)
+    (tmp_path / "disk").mkdir()
+    mount = "mount -t tmpfs -o size=1m none disk && dd if=/dev/zero of=disk/filler bs=1k count=850"
+    probe = subprocess.run(
+        ["unshare", "-m", "sh", "-c", mount], cwd=tmp_path, check=False, capture_output=True
+    )
+    if probe.returncode != 0:
+        pytest.skip("no small disk can be mounted here")
+    command = f'{mount} 2>/dev/null && exec "$0" -c "$1"'
+    words = ["unshare", "-m", "sh", "-c", command, sys.executable, FULL]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    done = subprocess.run(
+        words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.stdout.splitlines()[0] == "1", done.stdout + done.stderr
+    assert "the disk takes no more" in done.stderr
+    assert "Hint: use --resume to continue" in done.stderr
+    assert done.stdout.splitlines()[-1] == "0"
+    assert "24 of 24 blocks" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("run small.yaml -o f --cells 11/10", "'11/10' is not a share"),
+        ("run small.yaml -o f --workers 0", "--workers"),
+        ("run small.yaml -o f --ray --workers 2", "--workers has no effect with --ray"),
+        ("run small.yaml -o f --dask tcp://h:1 --ray", "--ray has no effect with --dask"),
+        ("run missing.yaml -o f", "this study file does not exist"),
+        ("status small.yaml", "this folder contains no study"),
+        ("summary nowhere", "this folder contains no study"),
+        ("sumary f", "did you mean 'summary'"),
+    ],
+)
+def test_wrong_use_gets_a_sentence(run, tmp_path, words, sentence) -> None:
+    write_study(tmp_path)
+    code, out, err = run(words)
+    assert (code, out) == (1, "")
+    assert sentence in err
+    assert not (tmp_path / "f").exists()
+
+
+def test_share_of_a_job_and_scores_of_the_summary_are_chosen(run, tmp_path) -> None:
+    file = write_study(tmp_path, 4, 2).name
+    for part in (1, 2):
+        assert run(f"run {file} -o part-{part} --cells {part}/2 {ONE}")[0] == 0
+    code, out, _ = run("status part-1")
+    assert "4 of 8 blocks" in out
+    assert run("merge part-1 part-2 -o whole")[0] == 0
+    code, out, _ = run("summary whole --score condition --score rank")
+    assert (code, "condition" in out, "position" in out) == (0, True, False)
+    code, _, err = run("summary whole --score positon")
+    assert (code, "did you mean 'position'" in err) == (1, True)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same study computed in one process, by two, by dask and by ray has identical blocks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import distributed
+import pytest
+
+from loopcal.errors import FileError
+from loopcal.studies.execution import Dask, Executor, Processes, Ray, Serial
+from loopcal.studies.running import read_source, run_study
+from tests.studies.block_functions import die_once, draw_numbers, list_tasks, refuse_third
+from tests.studies.small_study import CELLS, Contents, read_contents, write_study
+from tests.studies.test_execution import check_numbers, collect
+
+ROOT = str(Path(__file__).parents[2])
+
+
+def compute(folder: Path, executor: Executor) -> Contents:
+    folder.mkdir()
+    report = run_study(read_source(write_study(folder)), folder / "study", executor)
+    assert report.is_complete
+    return read_contents(folder / "study")
+
+
+@pytest.mark.slow
+def test_every_kind_of_worker_computes_identical_blocks(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")  # of the workers of ray
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    expected = compute(tmp_path / "serial", Serial())
+    assert len(expected) == CELLS * 4
+    assert len(set(expected.values())) == len(expected)
+    assert compute(tmp_path / "processes", Processes(2)) == expected
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        assert compute(tmp_path / "dask", Dask(cluster.scheduler_address)) == expected
+    assert compute(tmp_path / "ray", Ray(processors=2)) == expected
+
+
+@pytest.mark.slow
+def test_ray_survives_lost_workers_and_passes_errors_on(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    import ray
+
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        answers = collect(Ray().map_blocks(draw_numbers, list_tasks(20)))
+        check_numbers(answers, 20)
+        check_numbers(collect(Ray().map_blocks(die_once, list_tasks(8, tmp_path))), 8)
+        with pytest.raises(FileError) as caught:
+            collect(Ray().map_blocks(refuse_third, list_tasks(6)))
+        assert str(caught.value) == "study.yaml:7: task 3 is refused"
+    finally:
+        ray.shutdown()
