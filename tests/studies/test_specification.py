@@ -127,6 +127,33 @@ def test_robots_are_shipped_ones_or_files_beside_the_study(write, tmp_path):
     assert study.robots["shop"].source == "mine.yaml"
 
 
+def test_poses_may_be_those_of_a_file(write, tmp_path):
+    poses = "pose,x [mm],y [mm],z [mm]\na,10,20,30\nb,-10,5,40\n"
+    (tmp_path / "poses.csv").write_text(poses, encoding="utf-8")
+    text = "format: 1\ntitle: t\nrobots: [linear-delta]\nposes: {mine: {file: poses.csv}}\n"
+    study = load_study(write(text))
+    level = study.poses["mine"]
+    assert level.count == 2
+    assert json.loads(next(study.list_tasks()).content)["measured"] == [
+        list(c) for c in level.coordinates
+    ]
+    (tmp_path / "poses.csv").rename(tmp_path / "others.csv")
+    renamed = load_study(write(text.replace("poses.csv", "others.csv")))
+    assert list_keys(renamed) == list_keys(study)
+    for old, new, words in (
+        ("poses.csv", "none.csv", "no file"),
+        ("poses.csv", "others.csv, count: 3", "no other setting"),
+        ("file: poses.csv", "coordinates: [[0.0, 0.0, 0.0]]", "given by a file"),
+        ("file: poses.csv", "file: 3", "text is needed"),
+    ):
+        with pytest.raises(FileError, match=words) as caught:
+            load_study(write(text.replace(old, new)))
+        assert caught.value.line == 4
+    robots = text.replace("poses.csv", "others.csv").replace("linear-delta", "hexapod-42")
+    with pytest.raises(FileError, match="4: the poses cannot be read: .*others.csv"):
+        load_study(write(robots))
+
+
 def test_a_study_is_the_same_after_json():
     study = make_study(effects={"e": EffectsLevel(outliers=Outliers(0.1), drift=1e-5)})
     assert Study.from_json(study.to_json()) == study

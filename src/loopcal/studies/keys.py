@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -29,6 +30,7 @@ def describe_block(study: Study, cell: Cell, block: int) -> dict[str, Any]:
     """Return everything that determines the numbers of a block, as plain values."""
     levels = select_levels(study, cell)
     robot = levels.pop("robot")
+    levels["poses"] = replace(levels["poses"], file=None)  # its poses count, not its name
     return {
         "numerics": NUMERICS,
         "seed": study.seed,

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from loopcal.measure import Instrument
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.planning import PlanOptions, plan
@@ -43,7 +45,9 @@ def add_poses(content: Mapping[str, Any]) -> dict[str, Any]:
 def choose_poses(
     robot: Mechanism, instrument: Instrument, level: PosesLevel, seed: int
 ) -> FloatArray:
-    """Return coordinates (n, c) of poses, drawn from the workspace or planned."""
+    """Return coordinates (n, c) of poses: given ones, drawn from the workspace, or planned."""
+    if level.coordinates:
+        return np.array(level.coordinates)
     if level.choice == "random":
         return sample_workspace(robot.nominal, level.count, seed).coordinates
     options = PlanOptions(n_poses=level.count, hold_out=0, seed=seed)

@@ -85,12 +85,16 @@ class PosesLevel:
     count : number of poses. choice : "random" draws them evenly from the workspace, "planned" plans
         them for the robot and the instrument. seed : of the draw or the plan; by default that of
         the study. Every trial of a cell measures the same poses.
+    file : CSV file of poses beside the study file, in place of these settings.
+    coordinates : (n, c) controlled coordinates [m, rad] of that file.
     """
 
     PLAIN: ClassVar[str] = "count"
     count: int = 40
     choice: Literal["random", "planned"] = "random"
     seed: int | None = None
+    file: str | None = None
+    coordinates: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         _require(1 <= self.count <= MOST_POSES, "count", self.count, f"from 1 to {MOST_POSES}")

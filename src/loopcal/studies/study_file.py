@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,6 +12,7 @@ from loopcal.errors import LoopcalError
 from loopcal.io.core.records import read_record
 from loopcal.io.core.references import find_file_beside
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
+from loopcal.io.data.measurement_file import load_poses
 from loopcal.io.robot.robot_file import check_format, find_robot_file, get_source, load_robot
 from loopcal.mechanism import Mechanism
 from loopcal.studies.instruments import make_instrument
@@ -156,8 +157,38 @@ def build_study(content: StudyContent) -> Study:
         questions=settings.questions,
         **factors,
     )
+    study = replace(study, poses=_load_pose_files(study, robots, content))
     check_levels(study, {name: robot for name, (_, robot) in robots.items()}, content)
     return study
+
+
+def _load_pose_files(
+    study: Study, robots: Mapping[str, tuple[Robot, Mechanism]], content: StudyContent
+) -> dict[str, PosesLevel]:
+    """Return the levels of poses, those of files with the poses of these files."""
+    file, levels = content.file, dict(study.poses)
+    for name, value, place in _list_items(content, "poses") if "poses" in content.values else ():
+        stated = value if isinstance(value, dict) else {}
+        if "coordinates" in stated:
+            at = (*place, "coordinates")
+            raise file.error("poses are given by a file; write 'file: poses.csv'", at)
+        if "file" not in stated:
+            continue
+        at = (*place, "file")
+        if len(stated) > 1:
+            raise file.error("a file of poses needs no other setting; remove the others", at)
+        path = find_file_beside(file, stated["file"], at)
+        if path is None:
+            raise file.error(f"there is no file {stated['file']!r} beside the study file", at)
+        try:
+            read = [load_poses(path, robot).tolist() for _, robot in robots.values()]
+        except LoopcalError as error:
+            raise file.error(f"the poses cannot be read: {error}", at) from None
+        if any(poses != read[0] for poses in read):
+            raise file.error("the robots of this study read other poses from this file", at)
+        coordinates = tuple(tuple(pose) for pose in read[0])
+        levels[name] = replace(levels[name], count=len(coordinates), coordinates=coordinates)
+    return levels
 
 
 def read_levels(content: StudyContent, key: str, record: type[T]) -> dict[str, T]:
