@@ -15,12 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evidence.study_interruption import read_contents
 from loopcal.cli import main
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
 from loopcal.studies.store import NAME, open_store
 from loopcal.studies.study_result import StudyResult
-from tests.studies.small_study import CELLS, read_contents, write_study
+from tests.studies.small_study import CELLS, write_study
 
 ROOT = str(Path(__file__).parents[2])
 ONE = "--workers 1"
@@ -141,7 +142,7 @@ def test_replayed_trial_is_a_normal_run_with_the_numbers_of_the_study(run, tmp_p
     for words in ("9/0", "0/4", "x"):
         code, _, err = run(f"replay f {words} -o other")
         assert code == 1
-        assert "there is no" in err or "such as 3/17" in err
+        assert "this study has no" in err or "such as 3/17" in err
 
 
 def test_folder_in_use_changed_study_other_version_and_two_drivers_are_refused(

@@ -8,11 +8,12 @@ from pathlib import Path
 import distributed
 import pytest
 
+from evidence.study_interruption import Contents, read_contents
 from loopcal.errors import FileError
 from loopcal.studies.execution import Dask, Executor, Processes, Ray, Serial
 from loopcal.studies.running import read_source, run_study
 from tests.studies.block_functions import die_once, draw_numbers, list_tasks, refuse_third
-from tests.studies.small_study import CELLS, Contents, read_contents, write_study
+from tests.studies.small_study import CELLS, write_study
 from tests.studies.test_execution import check_numbers, collect
 
 ROOT = str(Path(__file__).parents[2])

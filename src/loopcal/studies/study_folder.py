@@ -7,6 +7,7 @@ A new folder takes its name when it is complete, so a driver that is killed leav
 from __future__ import annotations
 
 from collections.abc import Iterator
+from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
 from loopcal.io.core.outputs import replace_folder, resolve_folder
+from loopcal.io.core.replacement import remove_leftovers
 from loopcal.io.core.text_file import read_bytes
 from loopcal.studies.changes import list_conflicts
 from loopcal.studies.keys import NUMERICS
@@ -118,6 +120,9 @@ def _refuse_versions(store: StudyStore) -> None:
 def _make_folder(folder: Path, source: StudySource) -> None:
     """Make the folder of a study, with an empty store."""
     refuse_network(folder)
+    names = {STUDY_FILE, *(f"{NAME}{end}" for end in ("", "-journal", "-wal", "-shm"))}
+    names |= {Path(name).parts[0] for name, _ in _list_files(source)}
+    remove_leftovers(resolve_folder(folder), lambda left: _has_only(left, names))
     _refuse_content(folder)
     files = {name: read_bytes(path, "file", YAML_SIZE) for name, path in _list_files(source)}
 
@@ -142,6 +147,11 @@ def _refuse_content(folder: Path) -> None:
     if target.is_dir() and any(target.iterdir()):
         code = "store.in-use" if (target / NAME).is_file() else "store.folder-of-others"
         raise FileError(report_finding(code), folder)
+
+
+def _has_only(folder: Path, names: AbstractSet[str]) -> bool:
+    """Return whether a folder contains nothing but these names."""
+    return folder.is_dir() and all(path.name in names for path in folder.iterdir())
 
 
 def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
