@@ -150,7 +150,7 @@ def test_poses_may_be_those_of_a_file(write, tmp_path):
             load_study(write(text.replace(old, new)))
         assert caught.value.line == 4
     robots = text.replace("poses.csv", "others.csv").replace("linear-delta", "hexapod-42")
-    with pytest.raises(FileError, match="4: the poses cannot be read: .*others.csv"):
+    with pytest.raises(FileError, match=r"4: the poses cannot be read: .*others\.csv"):
         load_study(write(robots))
 
 

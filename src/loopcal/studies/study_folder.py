@@ -155,12 +155,16 @@ def _has_only(folder: Path, names: AbstractSet[str]) -> bool:
 
 
 def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
-    """Yield the name in the folder, and the path, of the study file and of robots beside it."""
+    """Yield the name in the folder, and the path, of the study file and of the robots and the poses
+    in files beside it.
+    """
     if source.file is None:
         return
     yield STUDY_FILE, source.file
-    for robot in source.study.robots.values():
-        path = source.file.parent / robot.source
-        is_inside = not Path(robot.source).is_absolute() and ".." not in Path(robot.source).parts
-        if is_inside and path.is_file() and robot.source not in (STUDY_FILE, NAME):
-            yield robot.source, path
+    robots = (robot.source for robot in source.study.robots.values())
+    poses = (level.file for level in source.study.poses.values() if level.file is not None)
+    for name in dict.fromkeys((*robots, *poses)):
+        path = source.file.parent / name
+        is_inside = not Path(name).is_absolute() and ".." not in Path(name).parts
+        if is_inside and path.is_file() and name not in (STUDY_FILE, NAME):
+            yield name, path
