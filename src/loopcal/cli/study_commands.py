@@ -167,30 +167,95 @@ def status(folder: Path, as_json: bool) -> None:
 @click.option(
     "--score", "scores", multiple=True, metavar="NAME", help="Score to show; may be repeated."
 )
+@click.option(
+    "--against", metavar="FACTOR", help="Factor along the axis of figures, such as poses."
+)
 @json_option
-def summary(folder: Path, scores: tuple[str, ...], as_json: bool) -> None:
-    """Show medians and coverage of each cell, with intervals, and the failed trials by reason.
+def summary(folder: Path, scores: tuple[str, ...], against: str | None, as_json: bool) -> None:
+    """Show medians and coverage of each cell, with intervals, the failed trials by reason, and the
+    answers to the questions of the study file.
 
-    It also writes summary.json and summary.csv, with all scores, into FOLDER.
+    It also writes summary.json and summary.csv, with all scores, and a figure of each shown score
+    into FOLDER.
 
     \b
     Examples:
       loopcal study summary results
       loopcal study summary results --score position_max --score condition
+      loopcal study summary results --score position --against instrument
     """  # noqa: D301
+    from loopcal.studies.question_view import view_answers
     from loopcal.studies.study_result import StudyResult
-    from loopcal.studies.summary_view import view_summary, write_summary
+    from loopcal.studies.summary_drawing import render_figures
+    from loopcal.studies.summary_view import build_document, list_shown, view_summary, write_summary
 
     result = StudyResult(folder)
     with terminal.ProgressBar() as progress:
         progress(0, 1, "summarizing trials")
-        summarized = result.summarize()
-    page = view_summary(result.study, summarized, scores or None)
-    write_summary(folder, result.study, summarized)
+        summarized, answered = result.summarize(), result.answer_questions()
+        shown = list_shown(result.study, summarized, scores)
+        page = view_summary(result.study, summarized, shown)
+        figures = render_figures(result.study, summarized, shown, against)
+        write_summary(folder, result.study, summarized, answered, figures)
     if as_json:
-        terminal.print_json(summarized)
+        terminal.print_json(build_document(summarized, answered))
+        return
+    written = ", ".join(("summary.json", "summary.csv", *figures))
+    terminal.print_page([*page, "", *view_answers(answered), f"Written to {folder}: {written}"])
+
+
+@study.command()
+@folder_argument
+@click.option("--smallest", metavar="FACTOR", help="Ask for its smallest level, such as poses.")
+@click.option("--largest", metavar="FACTOR", help="Ask for its largest level, such as noise.")
+@click.option(
+    "--score", default="position", metavar="NAME", help="Score that stays within the limit."
+)
+@click.option(
+    "--limit", required=True, metavar="LIMIT", help="Of the score, with its unit, such as 10um."
+)
+@click.option(
+    "--share",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.95,
+    metavar="SHARE",
+    help="Share of the machines that stay within the limit.",
+)
+@json_option
+def ask(
+    folder: Path,
+    smallest: str | None,
+    largest: str | None,
+    score: str,
+    limit: str,
+    share: float,
+    as_json: bool,
+) -> None:
+    """Find the smallest or largest level of a factor that reaches a limit on a share of machines.
+
+    The answer says which levels reach it for certain, and which may. Run more replicates where it
+    is not certain, see loopcal study extend.
+
+    \b
+    Examples:
+      loopcal study ask results --smallest poses --limit 10um
+      loopcal study ask results --largest noise --score position_max --limit 0.05mm --share 0.9
+    """  # noqa: D301
+    from loopcal.studies.question_view import view_answers
+    from loopcal.studies.study_result import StudyResult
+
+    if (smallest is None) == (largest is None):
+        raise click.UsageError("give --smallest FACTOR or --largest FACTOR, one of them")
+    result = StudyResult(folder)
+    answered = (
+        result.find_smallest(smallest, score, limit, share)
+        if smallest is not None
+        else result.find_largest(largest or "", score, limit, share)
+    )
+    if as_json:
+        terminal.print_json(answered)
     else:
-        terminal.print_page([*page, "", f"Written to {folder}: summary.json, summary.csv"])
+        terminal.print_page(view_answers([answered]))
 
 
 @study.command()

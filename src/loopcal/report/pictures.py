@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,6 +22,25 @@ METADATA: dict[str, dict[str, None]] = {
     ".pdf": {"CreationDate": None},
 }
 """The time of writing, which is left out, by format."""
+
+TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Numbers on a logarithmic axis, times powers of ten."""
+
+WIDE, VERY_WIDE = 3.0, 100.0
+"""Ratio of its ends from which a logarithmic axis has these numbers, and from which it has powers
+of ten only; a shorter one has even steps.
+"""
+
+
+def label_logarithmic(axis: Any) -> None:
+    """Write plain numbers at a logarithmic axis of matplotlib."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+    low, high = axis.get_view_interval()
+    subs = TICKS if high < VERY_WIDE * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=subs) if high > WIDE * low else MaxNLocator(6))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def show_names(figure: Figure) -> Figure:

@@ -14,7 +14,7 @@ from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import DIMENSIONS
 from loopcal.planning.result import Plan
 from loopcal.planning.sample_size import ErrorCurve
-from loopcal.report.pictures import show_names
+from loopcal.report.pictures import label_logarithmic, show_names
 from loopcal.report.robot_drawing import COLORS
 from loopcal.units import Dimension, Unit, find_unit
 
@@ -23,12 +23,6 @@ if TYPE_CHECKING:
 
 CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 """Colors of calibration poses, of validation poses, and of the bound."""
-
-TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""Numbers on a logarithmic axis, times powers of ten."""
-
-WIDE = 3.0
-"""Ratio of its ends from which an axis has these numbers; a shorter one has even steps."""
 
 
 def draw_plan(plan: Plan) -> Figure:
@@ -84,7 +78,6 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     candidates can beat.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     dimension = DIMENSIONS[curve.target]
     unit = find_unit(robot.units[dimension])
@@ -104,10 +97,8 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
         )
     axes.set_xscale("log")
     axes.set_yscale("log")
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        axis.set_major_locator(LogLocator(subs=TICKS) if high > WIDE * low else MaxNLocator(6))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_locator(NullLocator())
+    label_logarithmic(axes.xaxis)
+    label_logarithmic(axes.yaxis)
     axes.set_xlabel(f"{curve.counted} for calibration [1]")
     words = f"expected {curve.target} error (rms)"
     words += ", rotations times robot size" if curve.target == "pose" else ""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.studies.level_chains import list_chains
 from loopcal.studies.specification import FACTORS, Question, Scores
 from loopcal.units import SI_SYMBOLS, Dimension, find_unit, parse_quantity
 
@@ -62,12 +63,17 @@ def list_columns(scores: Scores) -> tuple[ScoreColumn, ...]:
     return (*COLUMNS, *(VERDICT_COLUMNS if scores.verdict else ()))
 
 
+MORE_IS_BETTER = ("covered_", "rank")
+"""Beginning of the names of scores that have no upper limit."""
+
+
 def check_question(study: Study, question: Question) -> float:
     """Return the limit of a question [SI].
 
     Raises
     ------
-    DataError : a factor or a score that the study does not have, or a limit in another unit.
+    DataError : a factor or a score that the study does not have, a factor whose levels have no
+        order, a score of which more is better, or a limit in another unit.
     """
     factors = tuple(FACTORS.values())
     if question.factor not in factors:
@@ -75,16 +81,31 @@ def check_question(study: Study, question: Question) -> float:
             f"factor is {question.factor!r}{suggest_names(question.factor, factors)}; it must be "
             f"one of {', '.join(factors)}"
         )
-    columns = {column.name: column for column in list_columns(study.scores)[1:]}
+    chains = list_chains(study, question.factor)
+    if len(chains) > 1 and all(len(chain.levels) == 1 for chain in chains):
+        named = ", ".join(chain.levels[0] for chain in chains)
+        raise DataError(
+            f"factor is {question.factor!r}, whose levels ({named}) have no order, so none is the "
+            f"{question.wanted}; ask for a factor whose levels differ in a number"
+        )
+    columns = {
+        column.name: column
+        for column in list_columns(study.scores)[1:]
+        if not column.name.startswith(MORE_IS_BETTER)
+    }
     if question.score not in columns:
         raise DataError(
             f"score is {question.score!r}{suggest_names(question.score, columns)}; it must be one "
             f"of {', '.join(columns)}"
         )
     unit = columns[question.score].unit
-    if unit == SI_SYMBOLS[Dimension.RATIO] and isinstance(question.limit, float | int):
-        return float(question.limit)
     try:
+        if unit == SI_SYMBOLS[Dimension.RATIO]:
+            return float(question.limit)
         return parse_quantity(str(question.limit), find_unit(unit).dimension)
     except UnitError as error:
         raise DataError(f"limit: {error}") from None
+    except ValueError:
+        raise DataError(
+            f"limit is {question.limit!r}, but {question.score} has no unit; give a number"
+        ) from None

@@ -14,12 +14,16 @@ import numpy as np
 from loopcal.errors import DataError, suggest_names
 from loopcal.studies.cells import Cell, list_factors
 from loopcal.studies.execution.optional_packages import import_optional
+from loopcal.studies.specification import Question
 from loopcal.studies.store import StudyStore, read_store
 from loopcal.studies.study import Study
 from loopcal.studies.study_folder import load_specification, read_study
 from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from loopcal.studies.questions import AnsweredQuestion
     from loopcal.studies.summary import StudySummary
 
 
@@ -45,6 +49,58 @@ class StudyResult:
 
         with read_store(self.folder) as store:
             return summarize_study(load_specification(store), store)
+
+    def answer_questions(self) -> tuple[AnsweredQuestion, ...]:
+        """Return the answers to the questions of the study file."""
+        from loopcal.studies.questions import answer_all
+
+        with read_store(self.folder) as store:
+            return answer_all(load_specification(store), store)
+
+    def find_smallest(
+        self, factor: str, score: str, limit: str | float, share: float = 0.95
+    ) -> AnsweredQuestion:
+        """Return the smallest level of a factor with which a score stays within a limit on a share
+        of the machines, for each combination of the other factors.
+
+        Parameters
+        ----------
+        factor : such as "poses". score : such as "position". limit : with its unit, "10 um".
+        share : of the machines.
+
+        Raises
+        ------
+        DataError : a factor, a score or a limit that does not fit.
+        """
+        return self._ask(Question(factor, score, limit, share, "smallest"))
+
+    def find_largest(
+        self, factor: str, score: str, limit: str | float, share: float = 0.95
+    ) -> AnsweredQuestion:
+        """Return the largest level that still does; see `find_smallest`."""
+        return self._ask(Question(factor, score, limit, share, "largest"))
+
+    def draw(self, score: str = "position", factor: str | None = None) -> Figure:
+        """Draw a score against a factor, with the intervals of the number of trials.
+
+        Parameters
+        ----------
+        score : its name. factor : along the axis; default: that with the most ordered levels.
+
+        Raises
+        ------
+        DataError : an unknown score or factor, or too many combinations for one figure.
+        """
+        from loopcal.studies.summary_drawing import draw_score
+
+        return draw_score(self.study, self.summarize(), score, factor)
+
+    def _ask(self, question: Question) -> AnsweredQuestion:
+        """Return the answers to a question."""
+        from loopcal.studies.questions import answer_question
+
+        with read_store(self.folder) as store:
+            return answer_question(load_specification(store), store, question)
 
     def read_scores(self, cell: Cell | int, columns: Sequence[str] | None = None) -> FloatArray:
         """Return the scores of the stored trials of a cell: (t, s), SI.

@@ -30,7 +30,7 @@ HIGH = 0.95
 """The quantile beside the median: 95 % of the machines are better."""
 
 SHARE = "covered_"
-"""Beginning of the names of scores that are shares; their mean is given in place of quantiles."""
+"""Beginning of the names of scores that are shares; they have no quantiles."""
 
 MEMORY = 2**26
 """Bytes of scores that are held at once."""
@@ -51,8 +51,8 @@ class ScoreSummary:
 
     Attributes
     ----------
-    name, unit : of the score. median, high : quantiles 0.5 and 0.95. mean : of a share. What does
-        not exist is None.
+    name, unit : of the score. median, high : quantiles 0.5 and 0.95; None of a share.
+    mean : with its Monte-Carlo interval. What does not exist is None.
     """
 
     name: str
@@ -137,7 +137,7 @@ def summarize_score(column: ScoreColumn, values: FloatArray) -> ScoreSummary:
         return ScoreSummary(column.name, column.unit, mean=estimate_share(values))
     ordered = np.sort(values)
     median, high = (estimate_quantile(ordered, share) for share in (0.5, HIGH))
-    return ScoreSummary(column.name, column.unit, median, high)
+    return ScoreSummary(column.name, column.unit, median, high, estimate_mean(values))
 
 
 def estimate_quantile(ordered: FloatArray, share: float) -> Interval:
@@ -161,20 +161,44 @@ def estimate_quantile(ordered: FloatArray, share: float) -> Interval:
     )
 
 
+def estimate_mean(values: FloatArray) -> Interval:
+    """Return the mean of values (t,) of independent trials, with its interval by Student's t.
+
+    The interval of a single value is infinite.
+    """
+    from scipy.special import stdtrit
+
+    n, mean = len(values), float(np.mean(values))
+    if n < 2:
+        return Interval(mean, -np.inf, np.inf)
+    reach = stdtrit(n - 1, 0.5 + LEVEL / 2.0) * float(np.std(values, ddof=1)) / np.sqrt(n)
+    return Interval(mean, mean - reach, mean + reach)
+
+
 def estimate_share(shares: FloatArray) -> Interval:
     """Return the mean of the shares (t,) of independent trials, with its interval.
 
     Shares of 0 and 1 alone give the interval of Clopper and Pearson.
     """
-    from scipy.special import betaincinv
-
     n = len(shares)
     if n == 0:
         return Interval(np.nan, 0.0, 1.0)
     mean = float(np.mean(shares))
     variance = float(np.var(shares)) / n
     effective = mean * (1.0 - mean) / variance if variance > 0.0 else float(n)
-    count, tail = mean * effective, (1.0 - LEVEL) / 2.0
-    low = betaincinv(count, effective - count + 1.0, tail) if count > 0.0 else 0.0
-    high = betaincinv(count + 1.0, effective - count, 1.0 - tail) if count < effective else 1.0
-    return Interval(mean, float(low), float(high))
+    return compute_binomial_interval(mean * effective, effective)
+
+
+def compute_binomial_interval(count: float, number: float, confidence: float = LEVEL) -> Interval:
+    """Return the share of `count` in `number` trials, with the interval of Clopper and Pearson.
+
+    Numbers that are not whole are effective ones.
+    """
+    from scipy.special import betaincinv
+
+    if number <= 0.0:
+        return Interval(np.nan, 0.0, 1.0)
+    tail = (1.0 - confidence) / 2.0
+    low = betaincinv(count, number - count + 1.0, tail) if count > 0.0 else 0.0
+    high = betaincinv(count + 1.0, number - count, 1.0 - tail) if count < number else 1.0
+    return Interval(count / number, float(low), float(high))

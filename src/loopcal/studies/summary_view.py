@@ -5,16 +5,17 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from loopcal.findings import report_finding
 from loopcal.io.core.json_text import read_json, to_json
-from loopcal.io.core.text_file import write_text
+from loopcal.io.core.text_file import write_bytes, write_text
 from loopcal.report.numbers import ABSENT, format_number
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block
 from loopcal.studies.cells import list_factors, list_varied_factors
+from loopcal.studies.questions import AnsweredQuestion
 from loopcal.studies.study import Study
 from loopcal.studies.study_result import find_columns
 from loopcal.studies.summary import CellSummary, Interval, StudySummary
@@ -22,6 +23,8 @@ from loopcal.units import Unit, find_unit
 
 JSON, CSV = "summary.json", "summary.csv"
 """Files of a summary in the folder of its study."""
+
+NO_FIGURES: Mapping[str, bytes] = {}
 
 NOTE = (
     "Medians of the converged trials, and their 95 % intervals by the number of trials. Shares of "
@@ -34,17 +37,19 @@ UNITS = {"m": find_unit("mm"), "rad": find_unit("mrad"), "1": find_unit("1")}
 """SI symbol -> unit on the screen."""
 
 
-def view_summary(
-    study: Study, summary: StudySummary, names: Sequence[str] | None = None
-) -> list[Block]:
-    """Return the page of a summary.
+def list_shown(study: Study, summary: StudySummary, names: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the scores to show: those with these names, or `SHOWN` as far as they differ from 0.
 
-    Parameters
-    ----------
-    names : of the scores to show; default: `SHOWN`, as far as they differ from 0.
+    Raises
+    ------
+    DataError : a score that the study does not have.
     """
     find_columns(study, names)
-    shown = list(names or (name for name in SHOWN if _is_shown(summary, name)))
+    return tuple(names or (name for name in SHOWN if _is_shown(summary, name)))
+
+
+def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> list[Block]:
+    """Return the page of a summary with the named scores."""
     total = study.replicates * len(study.cells)
     state = "" if summary.is_complete else f" (of {total}; the study is not complete)"
     page: list[Block] = [
@@ -61,12 +66,29 @@ def view_summary(
     return page
 
 
-def write_summary(folder: Path, study: Study, summary: StudySummary) -> None:
-    """Write summary.json and summary.csv into the folder of a study."""
+def build_document(
+    summary: StudySummary, answered: Sequence[AnsweredQuestion]
+) -> dict[str, object]:
+    """Return the content of summary.json."""
+    return {**vars(summary), "questions": list(answered)}
+
+
+def write_summary(
+    folder: Path,
+    study: Study,
+    summary: StudySummary,
+    answered: Sequence[AnsweredQuestion] = (),
+    figures: Mapping[str, bytes] = NO_FIGURES,
+) -> None:
+    """Write summary.json, with the answered questions, summary.csv, and figures (name -> content)
+    into the folder of a study.
+    """
     table = tabulate_all(study, summary)
-    text = to_json(summary)  # type: ignore[arg-type]  # a dataclass is a document, too
+    text = to_json(build_document(summary, answered))
     write_text(folder / JSON, text, read_back=lambda path: read_json(path, "summary", "repeat it"))
     write_text(folder / CSV, table.to_csv(), read_back=lambda path: check_table(path, table))
+    for name, content in figures.items():
+        write_bytes(folder / name, content)
 
 
 def check_table(path: Path, table: Table) -> None:
@@ -112,7 +134,7 @@ def tabulate_all(study: Study, summary: StudySummary) -> Table:
         for kind in kinds
         if any(getattr(x.find_score(c.name), kind, None) for x in summary.cells)
     ]
-    words = {"median": "", "high": " 95 %", "mean": ""}
+    words = {"median": " median", "high": " 95 %", "mean": " mean"}
     columns += [
         Column(f"{c.name}{words[kind]}{part}", "" if c.unit == "1" else c.unit)
         for c, kind in present
@@ -137,7 +159,7 @@ def tabulate_all(study: Study, summary: StudySummary) -> Table:
 def _is_shown(summary: StudySummary, name: str) -> bool:
     """Return whether a score is more than rounding in some cell."""
     scores = [score for cell in summary.cells if (score := cell.find_score(name))]
-    return any(score.mean or (score.median and score.median.value > 1e-12) for score in scores)
+    return any(score.median is None or score.median.value > 1e-12 for score in scores)
 
 
 def _format_score(cell: CellSummary, name: str, unit: Unit) -> str:

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Summaries: intervals that hold, failed trials by code, tables, views and figures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import beta, binom
+
+from loopcal.errors import DataError
+from loopcal.report.pictures import render_figure
+from loopcal.report.text_page import render_text
+from loopcal.studies.cells import Cell
+from loopcal.studies.fits import OUTCOMES
+from loopcal.studies.store import read_store
+from loopcal.studies.study_result import StudyResult
+from loopcal.studies.summary import (
+    compute_binomial_interval,
+    estimate_mean,
+    estimate_quantile,
+    estimate_share,
+    summarize_study,
+)
+from loopcal.studies.summary_drawing import choose_layout, render_figures
+from loopcal.studies.summary_view import list_shown, view_summary, write_summary
+from tests.studies.stored_scores import Scores, make_study, store_scores
+
+FAILED, RATE = 1, 0.1
+"""Code of the failed trials of the stored study, and their rate."""
+
+
+def median_error(cell: Cell) -> float:
+    """Return the true median of the position errors of a cell [m]."""
+    return 1e-4 * float(cell.levels["noise"]) / np.sqrt(float(cell.levels["poses"]))
+
+
+def draw_scores(cell: Cell) -> Scores:
+    """Return log-normal errors, coverage of ten parameters each, and outcomes."""
+    stream = np.random.default_rng([7, cell.number])
+    t = 400
+    outcome = np.where(stream.random(t) < RATE, float(FAILED), 0.0)
+    position = median_error(cell) * np.exp(0.5 * stream.standard_normal(t))
+    position[outcome != 0.0] = np.nan
+    covered = stream.binomial(10, 0.95, t) / 10.0
+    return {"outcome": outcome, "position": position, "covered_parameters": covered}
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
+    folder = tmp_path_factory.mktemp("summary") / "study"
+    return store_scores(folder, make_study(), draw_scores)
+
+
+@pytest.mark.parametrize(("share", "n"), [(0.5, 9), (0.5, 101), (0.95, 40), (0.95, 400)])
+def test_intervals_of_quantiles_cover_95_percent_or_more(share: float, n: int) -> None:
+    draws = np.sort(np.random.default_rng(n).standard_exponential((4000, n)), axis=1)
+    truth = -np.log(1.0 - share)
+    intervals = [estimate_quantile(row, share) for row in draws]
+    covered = sum(i.low <= truth <= i.high for i in intervals)
+    # 0.1 % quantile of the number of intervals that cover, at a coverage of exactly 95 %
+    assert covered >= binom.ppf(0.001, 4000, 0.95)
+    # not wider than needed: the next narrower pair of order statistics would fall short
+    assert covered <= binom.ppf(0.999, 4000, 0.995)
+
+
+def test_intervals_of_shares_are_those_of_clopper_and_pearson_and_have_known_ends() -> None:
+    interval = compute_binomial_interval(7, 20)
+    assert interval.value == 0.35
+    # R 4.3, binom.test(7, 20): 0.1539092 0.5921885
+    assert (interval.low, interval.high) == pytest.approx((0.1539092, 0.5921885), abs=5e-8)
+    assert compute_binomial_interval(0, 10).high == pytest.approx(1.0 - 0.025**0.1)
+    assert compute_binomial_interval(10, 10).low == pytest.approx(0.025**0.1)
+    assert compute_binomial_interval(3, 9, 0.99).low == pytest.approx(beta.ppf(0.005, 3, 7))
+    assert np.isnan(compute_binomial_interval(0, 0).value)
+
+
+def test_coverage_of_dependent_parameters_has_the_interval_of_independent_trials() -> None:
+    # all ten parameters of a trial are covered together, so that a trial is one observation
+    stream = np.random.default_rng(3)
+    shares = np.repeat(stream.random((1000, 1, 200)) < 0.9, 10, axis=1).mean(axis=1)
+    covered = sum((i := estimate_share(row)).low <= 0.9 <= i.high for row in shares)
+    assert covered >= binom.ppf(0.001, 1000, 0.95)
+
+
+def test_intervals_of_means_cover_95_percent() -> None:
+    draws = np.random.default_rng(5).normal(3.0, 2.0, (4000, 12))
+    covered = sum((i := estimate_mean(row)).low <= 3.0 <= i.high for row in draws)
+    assert binom.ppf(0.001, 4000, 0.95) <= covered <= binom.ppf(0.999, 4000, 0.95)
+    assert estimate_mean(np.array([2.0])).high == np.inf
+
+
+def test_every_cell_has_its_numbers_and_its_failed_trials_by_code(result: StudyResult) -> None:
+    summary = result.summarize()
+    assert summary.is_complete
+    assert summary.trials == 12 * 400
+    medians_in = shares_in = 0
+    for cell, summarized in zip(result.study.cells, summary.cells, strict=True):
+        assert summarized.levels == cell.levels
+        scores = draw_scores(cell)
+        failed = int((scores["outcome"] == FAILED).sum())
+        assert summarized.failed == {OUTCOMES[FAILED]: failed}
+        assert summarized.converged.value == pytest.approx(1.0 - failed / 400)
+        position = summarized.find_score("position")
+        good = scores["position"][scores["outcome"] == 0.0]
+        assert position is not None
+        assert position.median is not None
+        assert position.high is not None
+        assert position.mean is not None
+        assert position.median.value == np.median(good)
+        assert position.high.value == np.quantile(good, 0.95)
+        assert position.mean.value == pytest.approx(good.mean())
+        medians_in += position.median.low <= median_error(cell) <= position.median.high
+        covered = summarized.find_score("covered_parameters")
+        assert covered is not None
+        assert covered.median is None
+        assert covered.mean is not None
+        shares_in += covered.mean.low < 0.95 < covered.mean.high
+    assert min(medians_in, shares_in) >= binom.ppf(0.001, 12, 0.95)
+
+
+def test_the_page_explains_failed_trials(result: StudyResult) -> None:
+    summary = result.summarize()
+    page = render_text(view_summary(result.study, summary, ["position"]), 100)
+    count = sum(cell.failed[OUTCOMES[FAILED]] for cell in summary.cells)
+    assert f"Failed trials: {count} of 4800." in page
+    assert "poses  noise  method" in page
+    assert list_shown(result.study, summary) == ("position", "orientation", "covered_parameters")
+    with pytest.raises(DataError, match="'positon' is not a score .did you mean 'position'"):
+        list_shown(result.study, summary, ["positon"])
+
+
+def test_files_have_every_factor_as_a_column_and_are_read_back(result: StudyResult) -> None:
+    summary = result.summarize()
+    write_summary(result.folder, result.study, summary)
+    with (result.folder / "summary.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 12
+    for row, cell in zip(rows, summary.cells, strict=True):
+        assert {name: row[name] for name in cell.levels} == cell.levels
+        position = cell.find_score("position")
+        assert position is not None
+        assert position.median is not None
+        assert position.mean is not None
+        assert float(row["position median [m]"]) == position.median.value
+        assert float(row["position median low [m]"]) == position.median.low
+        assert float(row["position mean high [m]"]) == position.mean.high
+    document = json.loads((result.folder / "summary.json").read_text("utf-8"))
+    assert [cell["levels"] for cell in document["cells"]] == [c.levels for c in summary.cells]
+    assert document["questions"] == []
+
+
+def test_figures_show_medians_against_poses_with_their_intervals(result: StudyResult) -> None:
+    layout = choose_layout(result.study)
+    assert (layout.axis, layout.color, layout.panels) == ("poses", "noise", ("method",))
+    figure = result.draw("position")
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title() for axes in panels] == ["method map", "method least-squares"]
+    summary = result.summarize()
+    first = [c for c in summary.cells if c.levels["method"] == "map" and c.levels["noise"] == "1"]
+    first.sort(key=lambda cell: float(cell.levels["poses"]))
+    line, _, (bars,) = panels[0].containers[0]
+    assert list(line.get_xdata()) == [10.0, 20.0, 40.0]
+    medians = [s.median for c in first if (s := c.find_score("position")) and s.median]
+    np.testing.assert_allclose(line.get_ydata(), [1e3 * m.value for m in medians])  # in mm
+    ends = [segment[:, 1] for segment in bars.get_segments()]
+    np.testing.assert_allclose(ends, [[1e3 * m.low, 1e3 * m.high] for m in medians])
+    assert panels[0].get_ylabel() == "position [mm]"
+    assert panels[0].get_xlabel() == "poses [1]"
+
+
+def test_figures_are_written_by_level_and_refused_where_there_are_too_many_panels(
+    result: StudyResult,
+) -> None:
+    summary = result.summarize()
+    figures = render_figures(result.study, summary, ["covered_parameters"], "method")
+    assert list(figures) == ["covered_parameters.png"]
+    assert figures["covered_parameters.png"].startswith(b"\x89PNG")
+    labels = [text.get_text() for text in result.draw(factor="method").axes[0].get_xticklabels()]
+    assert labels == ["map", "least-squares"]
+    with pytest.raises(DataError, match="'pose' is not a factor .did you mean 'poses'"):
+        result.draw("position", "pose")
+
+
+def test_a_cell_without_trials_and_one_with_few_have_no_false_bounds(tmp_path: Path) -> None:
+    few = store_scores(tmp_path / "few", make_study(replicates=3), draw_scores)
+    summary = few.summarize()
+    assert {cell.trials for cell in summary.cells} == {3}
+    position = summary.cells[0].find_score("position")
+    assert position is not None
+    assert position.high is not None
+    assert position.high.high == np.inf  # three trials bound no 95 % quantile
+    assert len(render_figure(few.draw("position"), ".svg")) > 1000
+
+
+def test_views_contain_every_trial_with_its_factors(result: StudyResult) -> None:
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    table, data = result.to_pandas(), result.to_xarray()
+    assert len(table) == 4800
+    cell = result.study.cells[5]
+    expected = draw_scores(cell)["position"]
+    chosen = table[(table[list(cell.levels)] == list(cell.levels.values())).all(axis=1)]
+    np.testing.assert_array_equal(chosen["position"], expected)
+    np.testing.assert_array_equal(data.position.sel(cell.levels), expected)
+    assert data.position.attrs["units"] == "m"
+    medians = table[table["outcome"] == 0].groupby("poses", observed=True)["position"].median()
+    assert medians["10"] > medians["20"] > medians["40"]
+
+
+def test_memory_does_not_grow_with_the_number_of_cells(result: StudyResult, tmp_path: Path) -> None:
+    study = result.study
+    with read_store(result.folder) as store:
+        summarize_study(study, store)  # imports
+        tracemalloc.start()
+        try:
+            summarize_study(study, store)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    one_cell = 8 * 400 * len(study.columns)
+    assert peak < 10 * one_cell < 12 * one_cell
