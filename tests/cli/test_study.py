@@ -65,7 +65,7 @@ def test_new_file_leads_to_results_by_the_commands_that_each_step_names(run, tmp
     factors = {"robot", "instrument", "noise", "poses", "errors", "method", "effects"}
     assert factors <= set(rows[0])
     row = rows[0]
-    low, median, high = (row[f"position{part} [m]"] for part in (" low", "", " high"))
+    low, median, high = (row[f"position median{part} [m]"] for part in (" low", "", " high"))
     assert float(low) <= float(median) <= float(high)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -88,7 +89,7 @@ def write_summary(
     write_text(folder / JSON, text, read_back=lambda path: read_json(path, "summary", "repeat it"))
     write_text(folder / CSV, table.to_csv(), read_back=lambda path: check_table(path, table))
     for name, content in figures.items():
-        write_bytes(folder / name, content)
+        write_bytes(folder / name, content, functools.partial(_check_content, content=content))
 
 
 def check_table(path: Path, table: Table) -> None:
@@ -96,6 +97,12 @@ def check_table(path: Path, table: Table) -> None:
     rows = list(csv.reader(path.read_text("utf-8").splitlines()))
     if [tuple(row) for row in rows[1:]] != list(table.rows):
         raise ValueError("the rows of the table differ")
+
+
+def _check_content(path: Path, content: bytes) -> None:
+    """Raise ValueError where a file does not contain what was written."""
+    if path.read_bytes() != content:
+        raise ValueError("the content of the picture differs")
 
 
 def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) -> Table:
