@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import (
+    BlockStream,
     Component,
     Gaussian,
     Instrument,
@@ -248,3 +249,26 @@ def test_sensors_measure_selected_poses_pairs_and_sessions(robot):
     part = data.take([1, 3, 2])
     assert part.observations[0].rows.tolist() == [[1, 0]]
     assert part.observations[1].session.tolist() == ["a", "a"]
+
+
+def test_streams_of_blocks_are_parts_of_one_philox_stream():
+    stream = BlockStream(key=7, block=3)
+    first = make_random_stream(stream, 2, 1).standard_normal(5)
+    assert_allclose(make_random_stream(stream, 2, 1).standard_normal(5), first)
+    others = [
+        make_random_stream(stream, 2, 0),
+        make_random_stream(stream, 1, 1),
+        make_random_stream(BlockStream(7, 4), 2, 1),
+        make_random_stream(BlockStream(8, 3), 2, 1),
+    ]
+    assert all(np.all(other.standard_normal(5) != first) for other in others)
+    counter = make_random_stream(stream, 2, 1).bit_generator.state["state"]["counter"]
+    assert counter.tolist() == [0, 1, 2, 3]  # 2^64 counts before the next purpose begins
+
+
+def test_uniform_errors_have_the_tolerances_as_standard_deviations(robot):
+    table = robot.parameters
+    truth = sample_truth(robot, 3000, 5, "uniform")
+    scaled = (truth - table.nominal)[:, table.free] / table.tolerance[table.free]
+    assert np.abs(scaled).max() <= np.sqrt(3.0)
+    assert_allclose(scaled.std(axis=0), 1.0, rtol=0.05)
