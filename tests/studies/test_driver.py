@@ -109,6 +109,20 @@ def test_store_of_other_numbers_is_refused(undisturbed, tmp_path) -> None:
         run_study(source, tmp_path / "study", Serial(), resume=True)
 
 
+def test_settings_of_later_versions_are_no_change_and_unknown_ones_are_refused(tmp_path) -> None:
+    source = read_source(write_study(tmp_path))
+    with open_study(tmp_path / "study", source) as store:
+        earlier = json.loads(store.header.specification)
+        del earlier["scores"]["limit_angle"]  # as before this setting existed
+        store.set_header(replace(store.header, specification=json.dumps(earlier)))
+    with open_study(tmp_path / "study", source, resume=True) as store:
+        assert store.header.specification == source.study.to_json()
+        earlier["seed"] = "not a number"
+        store.set_header(replace(store.header, specification=json.dumps(earlier)))
+    with expect_refusal("store.other-numbers", FileError, part="loopcal"):
+        read_study(tmp_path / "study")
+
+
 def test_folder_contains_the_study_file_and_its_robots(tmp_path) -> None:
     shipped = Path(loopcal.__file__).parent / "robots" / "five-bar.yaml"
     (tmp_path / "mine.yaml").write_bytes(shipped.read_bytes())

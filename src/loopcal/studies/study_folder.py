@@ -35,7 +35,8 @@ from loopcal.studies.study import Study
 STUDY_FILE = "study.yaml"
 """Name of the study file in the folder."""
 
-NUMERICS_PART = "numerics"
+PROGRAM, NUMERICS_PART = "loopcal", "numerics"
+"""What has a version in a store."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,7 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
         raise FileError(report_finding("store.in-use"), folder)
     with open_store(folder) as store:
         header, study = store.header, source.study
-        _refuse_versions(store)
-        if changes := list_conflicts(header.specification, study.to_json()):
+        if changes := list_conflicts(load_specification(store).to_json(), study.to_json()):
             finding = report_finding("store.specification-changed", changes=changes)
             raise FileError(finding, folder)
         if header.specification != study.to_json():
@@ -97,14 +97,25 @@ def read_study(folder: Path) -> Study:
 
 
 def load_specification(store: StudyStore) -> Study:
-    """Return the study of a store."""
+    """Return the study of a store; settings that are new in this version have their defaults.
+
+    Raises
+    ------
+    FileError : another version made it, whose blocks or settings differ.
+    """
     _refuse_versions(store)
-    return Study.from_json(store.header.specification)
+    try:
+        return Study.from_json(store.header.specification)
+    except ValueError:  # it has settings that this version does not know
+        made_by = store.header.versions.get(PROGRAM, "")
+        code, known = "store.other-numbers", loopcal.__version__
+        finding = report_finding(code, part=PROGRAM, found=made_by, known=known)
+        raise FileError(finding, store.path) from None
 
 
 def make_header(study: Study) -> StoreHeader:
     """Return what the store of a study says about it."""
-    versions = {"loopcal": loopcal.__version__, NUMERICS_PART: str(NUMERICS)}
+    versions = {PROGRAM: loopcal.__version__, NUMERICS_PART: str(NUMERICS)}
     return StoreHeader(study.to_json(), tuple(c.name for c in study.columns), versions)
 
 
