@@ -55,7 +55,8 @@ class StudySettings:
     Parameters
     ----------
     title : what the study is about. seed : of all random numbers, 0 or more.
-    replicates : trials of each cell. block : trials of a block, the unit of work; at most 10000.
+    replicates : trials of each cell. block : trials of a block, the unit of work; at most 2000, as
+        a block of a hexapod needs about half a megabyte of memory for each trial.
     scores : what is computed of every trial. questions : name -> what the summary answers.
     """
 
@@ -70,12 +71,15 @@ class StudySettings:
         for key, lowest, highest in (
             ("seed", 0, 2**63),
             ("replicates", 1, 10**9),
-            ("block", 1, 10**4),
+            ("block", 1, MOST_TRIALS),
         ):
             value = getattr(self, key)
             if not lowest <= value <= highest:
                 raise ValueError(f"{key} is {value}; it must be from {lowest} to {highest}")
 
+
+MOST_TRIALS = 2000
+"""Largest number of trials of a block."""
 
 SETTINGS = ("title", "seed", "replicates", "block", "scores", "questions")
 QUICK = "quick"
