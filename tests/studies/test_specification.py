@@ -54,7 +54,7 @@ effects:
   wrong: {outliers: {share: 0.1}, drift: 50 um}
 scores: {held_out: 8, frame: base}
 questions:
-  poses: {factor: poses, score: position, limit: 30 um, share: 0.9}
+  poses: {factor: noise, score: position, limit: 30 um, share: 0.9}
 quick: {replicates: 20, noise: 1}
 """
 
@@ -108,7 +108,7 @@ def test_the_documented_study_is_read(write):
     page = (Path(__file__).parents[2] / "docs" / "files.md").read_text("utf-8")
     text = page.split("## Study files")[1].split("```yaml\n")[1].split("```")[0]
     study = load_study(write(text), quick=True)
-    assert (len(study.cells), study.replicates) == (4, 50)
+    assert (len(study.cells), study.replicates) == (8, 50)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -257,7 +257,8 @@ DAMAGES = {
     "frame": ("frame: base", "frame: world", 27, "'base'"),
     "held out": ("held_out: 8", "held_out: 0", 27, "held_out' is 0"),
     "limit": ("scores: {held_out: 8", "scores: {limit_position: 1 mm", 27, "verdict: true"),
-    "factor": ("factor: poses", "factor: poeses", 29, "poses"),
+    "factor": ("factor: noise", "factor: noize", 29, "noise"),
+    "no order": ("factor: noise", "factor: method", 29, "no order"),
     "score": ("score: position", "score: positoin", 29, "position"),
     "limit unit": ("limit: 30 um", "limit: 30 deg", 29, "length"),
     "quick": ("quick: {replicates: 20", "quick: {replicate: 20", 30, "replicates"),
