@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import Identifiability as Identifiability
     from loopcal.diagnose import ModelChoice as ModelChoice
     from loopcal.diagnose import OutlierCheck as OutlierCheck
+    from loopcal.diagnose import RegularizationCurves as RegularizationCurves
     from loopcal.diagnose import ValueComparison as ValueComparison
     from loopcal.diagnose import check_conventions as check_conventions
     from loopcal.diagnose import choose_identifiable_subset as choose_identifiable_subset
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import compare_conventions as compare_conventions
     from loopcal.diagnose import compare_with_truth as compare_with_truth
     from loopcal.diagnose import compare_with_values as compare_with_values
+    from loopcal.diagnose import compute_regularization_curves as compute_regularization_curves
     from loopcal.diagnose import cross_validate as cross_validate
     from loopcal.diagnose import examine_fit as examine_fit
     from loopcal.diagnose import find_outliers as find_outliers
@@ -158,9 +160,10 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.diagnose": """
             ConventionCheck CrossValidation FitExamination Identifiability ModelChoice
-            OutlierCheck ValueComparison check_conventions choose_identifiable_subset
-            choose_model compare_conventions compare_with_truth compare_with_values
-            cross_validate examine_fit find_outliers identifiability suggest_measurements
+            OutlierCheck RegularizationCurves ValueComparison check_conventions
+            choose_identifiable_subset choose_model compare_conventions compare_with_truth
+            compare_with_values compute_regularization_curves cross_validate examine_fit
+            find_outliers identifiability suggest_measurements
         """,
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError

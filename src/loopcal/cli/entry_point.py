@@ -44,6 +44,7 @@ SECTIONS = {
         "validate": "Validate a calibration, or a robot file, with measurements.",
         "budget": "Show the uncertainty of a calibration by source.",
         "compensate": "Compute readings or commands that reach targets.",
+        "regularize": "Show the error at held-out poses by the strength of regularization.",
     },
     "Examine the uncertainty": {
         "bootstrap": "Resample a calibration and compare the scatter with its intervals.",
@@ -66,6 +67,7 @@ MODULES = {
     "measurement_commands": ("identifiability", "simulate"),
     "plan_command": ("plan",),
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
+    "regularize_command": ("regularize",),
     "sampling_commands": ("bootstrap", "sample", "region"),
     "study_commands": ("study",),
     "paper_commands": ("reproduce", "per-leg"),

@@ -58,6 +58,11 @@ from loopcal.diagnose.prediction_errors import PosePredictions as PosePrediction
 from loopcal.diagnose.prediction_errors import PredictionComparison as PredictionComparison
 from loopcal.diagnose.prediction_errors import compare_predictions as compare_predictions
 from loopcal.diagnose.prediction_errors import predict_poses as predict_poses
+from loopcal.diagnose.regularization_curves import RegularizationCurve as RegularizationCurve
+from loopcal.diagnose.regularization_curves import RegularizationCurves as RegularizationCurves
+from loopcal.diagnose.regularization_curves import (
+    compute_regularization_curves as compute_regularization_curves,
+)
 from loopcal.diagnose.residuals.adjusted_uncertainty import adjust_uncertainty as adjust_uncertainty
 from loopcal.diagnose.residuals.heavy_tails import HeavyTails as HeavyTails
 from loopcal.diagnose.residuals.heavy_tails import check_heavy_tails as check_heavy_tails

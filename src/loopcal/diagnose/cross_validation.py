@@ -89,7 +89,8 @@ class LeaveOneOut:
     Attributes
     ----------
     methods : the methods. score : (k,) mean square of whitened leave-one-block-out residuals (1:
-        noise alone), infinite where a block cannot be left out.
+        noise alone), infinite where a block cannot be left out. standard_error : (k,) of the score,
+        from the scatter over blocks. blocks : number of those with rows.
     dof : (k,) effective number of parameters. estimate : (k, p) their estimates [SI].
     """
 
@@ -97,6 +98,8 @@ class LeaveOneOut:
     score: FloatArray
     dof: FloatArray
     estimate: FloatArray
+    standard_error: FloatArray
+    blocks: int
 
     @property
     def best(self) -> Method:
@@ -230,12 +233,12 @@ def score_leave_one_out(
     weight = np.divide(1.0, total, out=np.zeros_like(total), where=used)
     y = weight * (s * d.projections[0])
     blocks, member = np.unique(linked_blocks(data), return_inverse=True)
-    square = np.zeros(len(penalty))
+    square, equations = np.zeros((len(blocks), len(penalty))), np.zeros(len(blocks))
     total, rows = (
         problem.count_leverage_rows(member, len(blocks)),
         problem.leverage_rows(linearization),
     )
-    for _, A, r in iterate_blocks(rows, member, total):
+    for numbers, A, r in iterate_blocks(rows, member, total):
         B = A @ d.directions[0]  # (blocks, m, p)
         residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
         H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))
@@ -243,10 +246,14 @@ def score_leave_one_out(
         singular = np.linalg.det(remaining) <= NOTHING_LEFT
         remaining = np.where(singular[..., None, None], np.eye(A.shape[1]), remaining)
         deleted = np.linalg.solve(remaining, residual[..., None])[..., 0]
-        square += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)
+        square[numbers] = np.where(singular, np.inf, (deleted**2).sum(axis=2)).T
+        equations[numbers] = ((A != 0.0).any(axis=2) | (r != 0.0)).sum(axis=1)
+    score = square.sum(axis=0) / int(linearization.equations[0])
     dof = d.filter_factors(penalty).sum(axis=1)
     estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
-    return LeaveOneOut(tuple(methods), square / int(linearization.equations[0]), dof, estimate)
+    error = _ratio_error(square, equations, score)
+    used = int((equations > 0).sum())
+    return LeaveOneOut(tuple(methods), score, dof, estimate, error, used)
 
 
 def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
@@ -258,6 +265,19 @@ def build_regularization_path(data_scale: float, count: int, parameters: int) ->
         *(Ridge(float(value)) for value in lam),
         *(TruncatedSVD(k) for k in range(parameters + 1)),
     )
+
+
+def _ratio_error(square: FloatArray, equations: FloatArray, score: FloatArray) -> FloatArray:
+    """Return the standard errors (k,) of scores, which are sums of squares (b, k) of b blocks over
+    their equations (b,); NaN of a score that is infinite or of one block.
+    """
+    b = int((equations > 0).sum())
+    if b < 2:
+        return np.full(len(score), np.nan)
+    with np.errstate(invalid="ignore"):
+        residual = square - equations[:, None] * score
+    residual = np.where(np.isfinite(score), residual, np.nan)
+    return np.sqrt(b / (b - 1) * (residual**2).sum(axis=0)) / equations.sum()
 
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:

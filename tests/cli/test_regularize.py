@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""loopcal regularize: curves of the user's own data, on the screen and as a folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+
+from loopcal.cli import main
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run a command line in a folder with measurements; return exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        code = main(words.split())
+        return code, *capsys.readouterr()
+
+    options = "--kind position --sigma-position 60um --draw-errors --draw 16"
+    assert run(f"simulate linear-delta {options} -o data.csv")[0] == 0
+    return run
+
+
+def test_page_shows_both_curves_and_what_rules_choose(run) -> None:
+    code, out, err = run("regularize linear-delta data.csv")
+    assert (code, err) == (0, "")
+    assert "linear-delta: 16 poses, 9 parameters; each pose was left out in turn" in out
+    for words in ("given robot", "GCV", "marginal likelihood", "one standard error", "lam", "k ="):
+        assert words in out
+
+
+def test_folder_has_the_points_the_choices_and_the_picture(run, tmp_path) -> None:
+    code, out, _ = run("regularize linear-delta data.csv -o curves")
+    assert (code, out.splitlines()[-1]) == (
+        0,
+        "Written to curves: curves.json, curves.csv, curves.png",
+    )
+    folder = tmp_path / "curves"
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    document = json.loads((folder / "curves.json").read_text())
+    assert document["made_by"]["inputs"]["data"]["path"] == "data.csv"
+    rows = list(csv.DictReader((folder / "curves.csv").open()))
+    points = [float(row["score"]) for row in rows if row["parameter"] == "k"]
+    assert points == document["truncation"]["score"]
+    assert len(points) == 10
+    first = (folder / "curves.png").read_bytes()
+    code, _, err = run("regularize linear-delta data.csv -o curves")
+    assert code == 1
+    assert "curves" in err
+    assert run("regularize linear-delta data.csv -o curves --force")[0] == 0
+    assert (folder / "curves.png").read_bytes() == first
+
+
+def test_chosen_values_are_those_of_calibrate(run) -> None:
+    code, out, _ = run("regularize linear-delta data.csv --json")
+    assert code == 0
+    chosen = {c["rule"]: c["value"] for c in json.loads(out)["ridge"]["chosen"]}
+    code, out, _ = run("calibrate linear-delta data.csv -o run --method ridge --json")
+    fitted = json.loads(out)["fit"]["regularization"]
+    assert chosen["GCV"] == pytest.approx(fitted["value"], rel=2e-2)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("linear-delta", "Missing argument 'DATA...'"),
+        ("linear-delta missing.csv", "missing.csv"),
+        ("linear-delta data.csv --drop nothing", "nothing"),
+        ("linear-delta data.csv --folds 1", "--folds"),
+        ("linear-delta robot.yaml", "robot.yaml is a YAML file"),
+        ("linear-delta data.csv -o .", "working folder"),
+    ],
+)
+def test_wrong_use_gets_a_sentence(run, words, sentence) -> None:
+    code, out, err = run(f"regularize {words}")
+    assert (code, out) == (1, "")
+    assert sentence in " ".join(err.split())
+    assert "Traceback" not in err
