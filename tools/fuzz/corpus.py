@@ -211,6 +211,8 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         6 identifiability robot.yaml data.csv
         1 identifiability robot.yaml --poses targets.csv {plan}
         1 identifiability robot.yaml data.csv --reduce -o reduced.yaml
+        2 regularize robot.yaml data.csv
+        1 regularize robot.yaml data.csv -o out --folds 2 --json
         3 calibrate robot.yaml data.csv -o out --hold-out 0.3
         1 calibrate robot.yaml data.csv -o out --hold-out 0.3 --json
         1 calibrate robot.yaml values.csv -o out
