@@ -61,6 +61,7 @@ def forward_trials(
     q: FloatArray,
     start: State | None = None,
     follow: bool = True,
+    goal: State | None = None,
 ) -> State:
     """Solve forward kinematics for readings q (t | 1, n, a) and values (t | 1, p).
 
@@ -68,7 +69,8 @@ def forward_trials(
     singularity, is solved again along the straight path from the start's readings. Rows that still
     fail are marked, see `Status`. Redundant readings contradict each other by their errors; a row
     that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
-    these rows are marked at once, in a fraction of the time.
+    these rows are marked at once, in a fraction of the time. With a `goal` (t, n), a row that comes
+    close to it ends there as `engine.NEAR_GOAL`.
     """
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
@@ -77,7 +79,7 @@ def forward_trials(
         # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
     begin = clear_sign(robot, start or robot.home_state)
-    state = clear_sign(robot, engine.solve(robot.program, e, joints, begin))
+    state = clear_sign(robot, engine.solve(robot.program, e, joints, begin, goal=goal))
     wrong = _find_wrong_rows(robot, state, begin)
     if not wrong.any():
         return state
@@ -170,7 +172,8 @@ def _find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
     """Return the rows that failed, ended beyond a singularity or left a wide gap."""
     closed = state.status == Status.CONVERGED
     beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
-    return ~closed & (state.status != Status.NOT_FINITE) | closed & beyond
+    failed = ~closed & (state.status != Status.NOT_FINITE) & (state.status != engine.NEAR_GOAL)
+    return failed | closed & beyond
 
 
 def _follow_path(
