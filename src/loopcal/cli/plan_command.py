@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -282,7 +281,7 @@ def _write_plan(
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
-    from loopcal.report.pictures import render_figure
+    from loopcal.report.pictures import check_picture, render_figure
     from loopcal.report.plan_drawing import draw_curve, draw_plan
 
     figures = {}
@@ -295,8 +294,13 @@ def _write_plan(
         texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
     document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
     pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
-    read_back = functools.partial(check_written_plan, plan=result)
-    write_plan_folder(output, texts, document, pictures, force, read_back)
+
+    def read_back(folder: Path) -> None:
+        check_written_plan(folder, result)
+        for name in pictures:
+            check_picture(folder / name)
+
+    write_plan_folder(output, texts, document, pictures, read_back, force)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files
 

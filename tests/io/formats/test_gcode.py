@@ -13,20 +13,7 @@ from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from loopcal.mechanism import Mechanism
-
-REPRAP = """\
-; config-override.g, ours ; keep
-M665 L269.100:269.200:269.300 R130.250 H301.500 B140.0 X-0.100 Y0.200 Z0.000
-G28 ; home
-M666 X0.500 Y-0.200 Z-0.300 A0.00 B0.00
-M307 H0 A139.0 X9
-"""
-MARLIN = """\
-echo:; Delta settings:
-echo:  M665 L269.10 R130.25 H300.00 S100.00 X-0.10 Y0.20 Z0.00 A0.00 B0.10 C-0.10
-echo:  M666 X-0.50 Y0.00 Z-0.25
-echo:  M851 X0.00 Y0.00 Z-1.50 ; (mm)
-"""
+from tools.fuzz.sources import MARLIN, REPRAP
 
 
 def import_robot(folder: Path, name: str, text: str) -> Mechanism:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -227,6 +227,11 @@ def suggest_header(header: str, symbol: str | None, known: Iterable[str]) -> str
     if name is None:
         return ""
     return f" (did you mean {name if written is None else f'{name} [{written}]'!r}?)"
+
+
+def format_header(units: Mapping[str, str | None]) -> tuple[str, ...]:
+    """Return the cells of a header from column -> symbol of its unit, None for text."""
+    return tuple(name if unit is None else f"{name} [{unit}]" for name, unit in units.items())
 
 
 def format_row(cells: Iterable[str]) -> str:

@@ -89,9 +89,7 @@ def resolve_folder(path: Path) -> Path:
 
 @contextmanager
 def replace_folder(
-    path: Path,
-    read_back: Callable[[Path], object] | None = None,
-    check: Callable[[Path], None] | None = None,
+    path: Path, read_back: Callable[[Path], object], check: Callable[[Path], None] | None = None
 ) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 

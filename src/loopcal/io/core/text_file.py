@@ -140,25 +140,19 @@ def resolve_target(path: str | Path) -> Path:
         raise FileError("this symbolic link has no target; choose another name", path) from None
 
 
-def write_text(
-    path: str | Path, text: str, read_back: Callable[[Path], object] | None = None
-) -> None:
+def write_text(path: str | Path, text: str, read_back: Callable[[Path], object]) -> None:
     """Write a UTF-8 file whole or not at all; see `write_bytes`."""
     write_bytes(path, text.encode("utf-8"), read_back)
 
 
-def write_bytes(
-    path: str | Path, content: bytes, read_back: Callable[[Path], object] | None = None
-) -> None:
+def write_bytes(path: str | Path, content: bytes, read_back: Callable[[Path], object]) -> None:
     """Write a file whole or not at all; see `replace_file`."""
     with replace_file(path, read_back) as temporary:
         temporary.write_bytes(content)
 
 
 @contextmanager
-def replace_file(
-    path: str | Path, read_back: Callable[[Path], object] | None = None
-) -> Iterator[Path]:
+def replace_file(path: str | Path, read_back: Callable[[Path], object]) -> Iterator[Path]:
     """Yield an empty temporary file that takes the place of `path` where the body succeeds.
 
     A symbolic link stays a link; its target is written. An old file keeps its permissions.
@@ -185,17 +179,13 @@ def replace_file(
             place_file(temporary, target, Path(path))
 
 
-def check_readable(
-    path: str | Path, temporary: Path, read_back: Callable[[Path], object] | None
-) -> None:
+def check_readable(path: str | Path, temporary: Path, read_back: Callable[[Path], object]) -> None:
     """Read a file or folder before it takes the name `path`.
 
     Raises
     ------
     FileError : `read_back` raises, which is a defect of loopcal.
     """
-    if read_back is None:
-        return
     try:
         read_back(temporary)
     except MemoryError:

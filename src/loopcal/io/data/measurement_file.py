@@ -320,7 +320,7 @@ def load_instrument(path: str | Path, robot: Mechanism) -> Instrument:
     FileError : a value that does not fit, at its line; noise that the settings do not state.
     """
     table = read_table(path)
-    return _build_instrument(table, read_kinds(table, robot))
+    return build_instrument(table, read_kinds(table, robot))
 
 
 def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
@@ -349,7 +349,7 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
                 report_finding(code, kind=entry.kind.name, parameters=tuple(parameters)),
                 entry.location,
             )
-    return _build_instrument(table, kinds)
+    return build_instrument(table, kinds)
 
 
 def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
@@ -360,7 +360,7 @@ def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
     return bool(columns and table.rows) and not any(cells)
 
 
-def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
+def build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
     from loopcal.measure import Gaussian, Instrument, Sensor
 

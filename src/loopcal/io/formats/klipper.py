@@ -93,7 +93,7 @@ class KlipperConfig(ValueFile):
         (section, option), end = name, self.line_end
         line = f"{MARK} {option} = {text}{end}"
         if self.header is None:
-            lines += [end, *(line + end for line in NEW_BLOCK)]
+            lines += [*([end] if lines else []), *(line + end for line in NEW_BLOCK)]
         if section in self.saved:
             lines.insert(self.saved[section] + 1, line)
             return
@@ -226,8 +226,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     if into is not None:
         return read_config(into).export(into, wanted, defaults)
     new = parse_config((), Path("printer.cfg"))
-    written = new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
-    return replace(written, text=written.text.lstrip("\n"))
+    return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
 
 
 def _parse_probes(cfg: KlipperConfig) -> _Probes:

@@ -114,13 +114,13 @@ class Exported:
 
     Attributes
     ----------
-    findings : changes, and what it cannot express.
     read_back : reads the written file; raises LoopcalError where it does not state the values.
+    findings : changes, and what it cannot express.
     """
 
     text: str
+    read_back: Callable[[Path], object]
     findings: tuple[Finding, ...] = ()
-    read_back: Callable[[Path], object] | None = None
 
 
 @dataclass(frozen=True)

@@ -122,14 +122,16 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
 
 def write_robot(path: str | Path, text: str, robot: Mechanism) -> None:
     """Write the text of a robot file, which is read back as this robot; raise as `save_robot`."""
-    write_text(path, text, lambda written: check_same_robot(robot, load_robot(written)))
+    write_text(path, text, lambda written: check_same_robot(robot, text, load_robot(written)))
 
 
-def check_same_robot(robot: Mechanism, read: Mechanism) -> None:
+def check_same_robot(robot: Mechanism, text: str, read: Mechanism) -> None:
     """Raise DataError where a robot that was read from a file is not the one that was written.
 
-    Values may differ by the rounding of one number, because a file states them in its unit.
+    `text` was to be written. Values may differ by the rounding of one number, because a file states
+    them in its unit.
     """
+    require_same("the text is complete", True, get_source(read).file.text == text)
     require_same("actuators", robot.actuators, read.actuators)
     require_same("parameters", robot.parameters.names, read.parameters.names)
     require_same_numbers("nominal values", robot.parameters.nominal, read.parameters.nominal)
