@@ -28,6 +28,7 @@ ROWS = "a,180,190,200,1,2,3\nb,190,180,200,1,2,3\n"
 SEPARATION = DATA.format(kind="separation", noise="{separation: 20 um}", columns="separation [mm]")
 TRIPOD = Path(find_robot_file("3-prs")).read_text("utf-8")
 SAMPLES = Path(__file__).parents[2] / "examples" / "cable-robot" / "samples.json"
+EXPORTS = Path(__file__).parents[2] / "examples" / "exports"
 LIMB = '<link name="{0}"/><joint name="{0}j" type="revolute"><parent link="base"/><child link="{0}"/><axis xyz="0 0 1"/></joint>'  # noqa: E501
 URDF = f"<robot name='r'><link name='base'/>{LIMB.format('a')}{LIMB.format('b')}</robot>"
 
@@ -75,6 +76,24 @@ FINDS = {
         "check robot.yaml",
         {"robot.yaml": "a: &x 1\nb: &x 2\nc: *x\n"},
         says="robot.yaml: this file states no format",
+    ),
+    "key that is a mapping in a list": Find(
+        "check robot.yaml",
+        {"robot.yaml": "format: 1\nlegs:\n  ? [{a: 1}]\n  : 2\n"},
+        says="robot.yaml:3: a key is a list or a mapping; write text there",
+    ),
+    "key that an alias makes a mapping": Find(
+        "check robot.yaml",
+        {"robot.yaml": "format: 1\nlegs: &x {a: 1}\n*x : 2\n"},
+        says="robot.yaml:3: a key is a list or a mapping; write text there",
+    ),
+    "format of times that states the year twice": Find(
+        "import e.txt --profile p.yaml -o new.csv",
+        {
+            "e.txt": (EXPORTS / "six-dof.txt").read_text("utf-8"),
+            "p.yaml": (EXPORTS / "six-dof.yaml").read_text("utf-8").replace("%S'", "%S %Y'"),
+        },
+        says="p.yaml:14: '%Y-%m-%d %H:%M:%S %Y' is not a format of times",
     ),
     "closure of a list": Find(
         "import r.urdf --closures c.yaml -o new.yaml",

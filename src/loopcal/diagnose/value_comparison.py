@@ -243,18 +243,26 @@ def _refuse_other_fixed_values(fit: Identification, values: Mapping[str, float])
 
 
 def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
-    """Refuse a machine that has other poses with the same values of all parameters."""
+    """Refuse a machine that has other poses with the same values of all parameters: those of the
+    robot or, where it reaches no pose with them, the stored ones.
+    """
     if stored.parameters.names != robot.parameters.names:
         raise EstimationError(
             f"{stored.name!r} does not have the parameters of {robot.name!r}; give a robot file of "
             "the same family and structure, or only the values to compare"
         )
-    known, q = robot.values[None], draw_readings(robot)
-    states = [forward_trials(one, known, q) for one in (robot, stored)]
-    is_reached = np.all([s.status[0] == Status.CONVERGED for s in states], axis=0)
+    for machine in (robot, stored):
+        known, q = machine.values[None], draw_readings(machine)
+        states = [forward_trials(one, known, q) for one in (robot, stored)]
+        is_reached = np.all([s.status[0] == Status.CONVERGED for s in states], axis=0)
+        if is_reached.any():
+            break
+    else:
+        data = {"stored": stored.name, "robot": robot.name}
+        raise EstimationError(report_finding("comparison.nothing-reached", **data))
     mine, theirs = (state.T[0][is_reached] for state in states)
-    apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max(initial=0.0)
-    if is_reached.any() and apart <= EQUAL * robot.size:
+    apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max()
+    if apart <= EQUAL * robot.size:
         return
     own = forward_trials(stored, stored.values[None], q).T[0][is_reached]
     rotation = align_point_sets(own[:, :3, 3], mine[:, :3, 3])[:3, :3]

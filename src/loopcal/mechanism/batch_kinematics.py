@@ -168,6 +168,11 @@ def clear_sign(robot: Mechanism, state: State) -> State:
     return replace(state, closure_sign=np.zeros_like(state.closure_sign))
 
 
+def _find_open_rows(robot: Mechanism, state: State) -> BoolArray:
+    """Return the rows that failed or left a wide gap."""
+    return (state.status != Status.CONVERGED) | (state.residual > WIDE * robot.size)
+
+
 def _find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
     """Return the rows that failed, ended beyond a singularity or left a wide gap."""
     closed = state.status == Status.CONVERGED
@@ -224,8 +229,8 @@ def _take_steps(
 ) -> State:
     """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
 
-    With `leave`, a row that fails on the way goes to the end at once: there the path leaves the
-    reach of the robot, and each further step would use all its iterations.
+    With `leave`, a row that fails or opens wide on the way goes to the end at once: there the path
+    leaves the reach of the robot, and each further step would use many iterations for nothing.
     """
     origin, target = path
     current, moving = begin, np.arange(len(target))
@@ -237,7 +242,7 @@ def _take_steps(
         )
         current = replace_rows(current, moving, zero, clear_sign(robot, solved))
         if leave and step < count:
-            failed = moving[current.status[moving, 0] != Status.CONVERGED]
+            failed = moving[_find_open_rows(robot, current)[moving, 0]]
             if len(failed):
                 zero = np.zeros(len(failed), int)
                 state = select_rows(current, (len(target), 1), failed, zero)

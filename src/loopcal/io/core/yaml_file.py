@@ -133,7 +133,7 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-    from loopcal.io.core.bounded_yaml import LimitError
+    from loopcal.io.core.bounded_yaml import KeyTypeError, LimitError
 
     try:
         return make_round_trip_yaml().load(text)
@@ -143,6 +143,8 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
     except LimitError as error:
         raise error.limit.make_error(what, path, line=error.line + first_line) from None
+    except KeyTypeError as error:
+        raise FileError(f"{error}; write text there", path, error.line + first_line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = _shorten(error.problem or error.context or "not YAML")
