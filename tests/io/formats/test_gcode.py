@@ -205,3 +205,22 @@ def test_corrected_and_added_words_update_the_checksum(tmp_path) -> None:
     for byte in code.encode():
         checksum ^= byte
     assert written == f"{code}*{checksum} ; ours\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("reprap", MARLIN, ":2: 'echo:' in front of M665 belongs to Marlin, whose end stops count"),
+        ("reprap", MARLIN.replace("echo:", ""), ":4: M851 belongs to Marlin.*format marlin"),
+        ("marlin", REPRAP, ":2: a list of lengths in M665 L belongs to RepRap.*format reprap"),
+        ("marlin", "M665 L250 R130 H300\nM584 X0\n", ":2: M584 belongs to RepRapFirmware"),
+    ],
+)
+def test_a_file_of_the_other_firmware_is_refused(tmp_path, name, text, sentence) -> None:
+    """Their adjustments of end stops have opposite signs."""
+    with pytest.raises(FileError, match=sentence):
+        import_robot(tmp_path, name, text)
+    robot = import_robot(tmp_path, "marlin", MARLIN)
+    (tmp_path / "into.g").write_text(text)
+    with pytest.raises(FileError, match=sentence):
+        export_robot(robot, name, tmp_path / "into.g")

@@ -202,7 +202,7 @@ def refuse_other_parameters(
     ----------
     result : of `read_result`, which states the identified parameters. count : number of all
         parameters before the calibration. robot : read from the file `path`; others may be free,
-        too, because `--choose-model` identifies some of them.
+        too, because a choice of the model identifies some of them.
 
     Raises
     ------
