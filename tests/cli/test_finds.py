@@ -95,6 +95,19 @@ FINDS = {
         },
         says="p.yaml:14: '%Y-%m-%d %H:%M:%S %Y' is not a format of times",
     ),
+    "target whose name no column can have": Find(
+        "import e.txt --profile p.yaml -o new.csv",
+        {
+            "e.txt": (EXPORTS / "tracker-points.txt").read_text("utf-8"),
+            "p.yaml": (EXPORTS / "tracker-points.yaml").read_text("utf-8").replace("SMR2", "'[a'"),
+        },
+        says="the measured value '[a.x' cannot be the name of a column",
+    ),
+    "measurements with such a target": Find(
+        "identifiability linear-delta d.csv",
+        {"d.csv": "# targets: [a, 'b]']\n" + POSITION + ROWS},
+        says="the measured value 'b].x' cannot be the name of a column",
+    ),
     "closure of a list": Find(
         "import r.urdf --closures c.yaml -o new.yaml",
         {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
@@ -122,6 +135,25 @@ def test_link_to_itself_is_refused_as_an_output(tmp_path, monkeypatch, capsys) -
     (tmp_path / "loop.yaml").symlink_to("loop.yaml")
     assert main(["new", "limbs", "-o", "loop.yaml"]) == 1
     assert "loop.yaml: this symbolic link has no target" in capsys.readouterr().err
+
+
+def test_paths_that_the_system_does_not_open_state_what_is_wrong(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    (tmp_path / "file").touch()
+    for path, says in (
+        ("a", "a symbolic link that leads back to itself"),
+        ("b/c.csv", "a symbolic link that leads back to itself"),
+        ("file/c.csv", "part of its path is a file"),
+    ):
+        for command in (["compensate", "linear-delta", path], ["validate", "linear-delta", path]):
+            assert main(command) == 1
+            printed = " ".join(capsys.readouterr().err.split())
+            assert says in printed
+            assert "permissions" not in printed
 
 
 def test_motions_that_move_nothing_fit_nothing() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import stat
@@ -20,6 +21,15 @@ from loopcal.io.core.replacement import create_temporary, place_file, remove_lef
 
 OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """To open a file without waiting; not every system has all of these flags."""
+
+ACTIONS = {
+    errno.EACCES: "check its permissions",
+    errno.EPERM: "check its permissions",
+    errno.ELOOP: "this path contains a symbolic link that leads back to itself: make it anew, or "
+    "name the file itself",
+    errno.ENOTDIR: "part of its path is a file, not a folder: correct the path",
+}
+"""What to do about a file that the operating system does not open, by the number of its error."""
 
 
 def as_path(path: Any, what: str) -> Path:
@@ -94,8 +104,8 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
             f"this {what} does not exist; check the name and the folder", path
         ) from None
     except OSError as error:
-        sentence = f"this {what} cannot be read ({_reason(error)}); check its permissions"
-        raise FileError(sentence, path) from error
+        action = ACTIONS.get(error.errno or 0, "check the file, its path and its permissions")
+        raise FileError(f"this {what} cannot be read ({_reason(error)}); {action}", path) from error
 
 
 def _open_ordinary_file(path: Path, what: str) -> int:
