@@ -182,3 +182,23 @@ def test_template_of_a_kind_that_compares_poses_explains_their_names(run) -> Non
     assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
     assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0
     assert "compares two poses" not in Path("n.csv").read_text()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a working folder cannot be removed there")
+def test_removed_working_folder_is_named_as_the_cause(run, tmp_path, monkeypatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    robot = find_robot_file("five-bar")
+    for words in ("plan {} -o plan", "simulate {} -o data.csv", "check {}"):
+        code, _, said = run(words.format(robot))
+        assert code == 1
+        assert said == "loopcal: the working folder was removed; change to a folder that exists.\n"
+
+
+def test_folder_that_refuses_new_entries_is_not_called_missing(run) -> None:
+    if not Path("/proc/self").is_dir():
+        pytest.skip("needs a file system in which nothing can be made")
+    code, _, said = run("simulate five-bar -o /proc/data.csv")
+    assert code == 1
+    assert "does not exist" not in said

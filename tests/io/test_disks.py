@@ -107,6 +107,32 @@ def test_read_only_folder_is_refused_before_work_begins() -> None:
         shutil.rmtree(place)
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs permissions to drop")
+def test_folder_that_cannot_be_removed_is_not_replaced() -> None:
+    place = Path(tempfile.mkdtemp())
+    path = place / "run"
+    try:
+        os.chown(place, NOBODY, NOBODY)
+
+        def replace_protected() -> list[str]:
+            said = [write(path, 1, force=True), write(path, 1, force=True)]
+            for entry in (path, *path.iterdir()):
+                os.chown(entry, NOBODY, NOBODY)
+            os.setuid(NOBODY)
+            path.chmod(0o555)
+            said.append(write(path, 2, force=True))
+            path.chmod(0o755)
+            return [*said, write(path, 3, force=True)]
+
+        code, said = run_in_copy(replace_protected)
+        assert code == 0
+        assert (said[0], said[1], said[3]) == ("", "", "")
+        assert said[2].startswith(f"{path}: this folder is protected against changes")
+        assert (read_value(path), [p.name for p in place.iterdir()]) == (3, ["run"])
+    finally:
+        shutil.rmtree(place)
+
+
 @pytest.mark.parametrize("exists", [False, True])
 def test_of_four_writers_at_once_exactly_one_wins_without_force(tmp_path, exists) -> None:
     for n in range(8):

@@ -163,6 +163,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with record_outputs() as list_outputs:
         try:
             command = find_command(words[0]) if words else None
+            if command is not None and not _has_working_folder():
+                return _refuse("the working folder was removed; change to a folder that exists.")
             code = commands.main(words, prog_name="loopcal", standalone_mode=False)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
@@ -171,6 +173,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         except (Exception, KeyboardInterrupt, TimeLimitError) as error:  # noqa: BLE001 the one place for all of them
             return _report(error, command, words, list_outputs())
+
+
+def _has_working_folder() -> bool:
+    """Return whether the working folder exists, from which relative paths count."""
+    try:
+        return Path.cwd().is_dir()
+    except OSError:
+        return False
 
 
 def _report(

@@ -72,8 +72,8 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
     ------
     FileError
         The path is a file, or the working folder; its place is not writable; the folder is in use
-        (without `force`); or it contains an input, or anything but an unchanged result of this
-        kind.
+        (without `force`), or protected; or it contains an input, or anything but an unchanged
+        result of this kind.
     """
     target = resolve_folder(path)
     with report_write_errors(path):
@@ -91,6 +91,14 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
                 finding = report_finding("files.folder-in-use", content=kind.content)
                 raise FileError(finding, path)
             refuse_other_content(path, kind)
+            _refuse_protected(path, target)
+
+
+def _refuse_protected(path: Path, target: Path) -> None:
+    """Raise FileError where a folder, known to be loopcal's, could not be removed once replaced."""
+    if not all(os.access(place, os.W_OK | os.X_OK) for place, _, _ in os.walk(target)):
+        sentence = "this folder is protected against changes, so it cannot be replaced"
+        raise FileError(f"{sentence}; choose another name, or permit writing in it", path)
 
 
 def _refuse_place(path: Path, target: Path) -> None:

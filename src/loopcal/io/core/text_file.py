@@ -221,11 +221,11 @@ def report_write_errors(path: str | Path) -> Iterator[None]:
     """Raise FileError in place of every OSError of the body, which writes `path`."""
     try:
         yield
-    except FileNotFoundError:
-        folder = Path(path).parent
-        sentence = f"cannot write here: folder {folder} does not exist; create it first"
-        raise FileError(sentence, path) from None
     except OSError as error:
+        folder = Path(path).parent
+        if isinstance(error, FileNotFoundError) and not folder.is_dir():
+            sentence = f"cannot write here: folder {folder} does not exist; create it first"
+            raise FileError(sentence, path) from None
         raise FileError(
             f"cannot write here ({_reason(error)}); choose another place", path
         ) from error
