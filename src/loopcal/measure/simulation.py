@@ -5,6 +5,8 @@ The controller's inverse kinematics turns commanded poses into readings. The for
 the true machine turns readings into true poses. The instrument measures these poses with noise.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -112,7 +112,7 @@ def inverse_trials(
     names, size = robot.controlled, robot.size
     t, n = max(len(values), len(target)), target.shape[1]
     wanted = np.broadcast_to(target, (t, n, target.shape[2]))
-    flat = wanted.reshape(t * n, -1)
+    flat = wanted.reshape(t * n, target.shape[2])
 
     def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         return compare_coordinates(T, flat[rows], names, size)

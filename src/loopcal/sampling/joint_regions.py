@@ -158,7 +158,7 @@ class SimultaneousIntervals:
 
 def compute_joint_region(
     fit: Identification | Posterior,
-    names: Sequence[str] | None = None,
+    names: str | Sequence[str] | None = None,
     level: float = LEVEL,
     combinations: FloatArray | None = None,
 ) -> JointRegion:
@@ -189,7 +189,7 @@ def compute_joint_region(
 
 def compute_simultaneous_intervals(
     fit: Identification | Posterior,
-    names: Sequence[str] | None = None,
+    names: str | Sequence[str] | None = None,
     level: float = LEVEL,
     rule: Rule = "maximum",
     combinations: FloatArray | None = None,
@@ -258,7 +258,7 @@ class _Selection:
 
 def _select(
     fit: Identification | Posterior,
-    names: Sequence[str] | None,
+    names: str | Sequence[str] | None,
     level: float,
     combinations: FloatArray | None,
 ) -> _Selection:
@@ -280,10 +280,15 @@ def _select(
     labels = tuple(posterior.names[i] for i in places)
     if combinations is not None:
         rows = np.atleast_2d(np.asarray(combinations, dtype=np.float64))
-        if rows.shape[1] != len(places):
+        if rows.ndim != 2 or rows.shape[1] != len(places):
             raise EstimationError(
-                f"combinations have {rows.shape[1]} columns for {len(places)} parameters; give one "
-                "factor for each"
+                f"combinations have shape {rows.shape} for {len(places)} parameters; give rows "
+                "with one factor for each"
+            )
+        if not np.isfinite(rows).all() or not rows.any(axis=1).all():
+            raise EstimationError(
+                "combinations have a row of zeros, or a number that is not finite; give finite "
+                "factors, not all of them 0"
             )
         effect, labels = rows @ effect, tuple(f"combination {i + 1}" for i in range(len(rows)))
         open_part = effect * posterior.unit @ posterior.directions[:, np.isinf(posterior.variance)]
@@ -294,7 +299,7 @@ def _select(
     return _Selection(posterior, labels, center, effect, effect @ posterior.root)
 
 
-def _find_places(available: tuple[str, ...], names: Sequence[str]) -> IntArray:
+def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntArray:
     """Return the places of names or patterns among the available names, in the order of these."""
     if isinstance(names, str):
         names = [names]

@@ -42,6 +42,13 @@ def as_path(path: Any, what: str) -> Path:
     if not isinstance(path, (str, os.PathLike)):
         sentence = f"the path of a {what} is needed here, not {type(path).__name__}"
         raise ArgumentTypeError(f"{sentence}; pass text or a Path")
+    try:
+        name = os.fsencode(path)
+    except UnicodeEncodeError:
+        name = b"\0"
+    if b"\0" in name:
+        sentence = f"the path of a {what} contains a null character or half of a character"
+        raise ArgumentTypeError(f"{sentence}, which no file name can have; correct the path")
     return Path(path)
 
 

@@ -116,7 +116,14 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
     Raises
     ------
     FileError : the file cannot be written. MechanismError : the robot was not loaded from a file.
+    ArgumentTypeError : there is not one uncertainty for each parameter.
     """
+    count = len(robot.parameters.names)
+    if plus_minus is not None and np.shape(plus_minus) != (count,):
+        raise ArgumentTypeError(
+            f"plus_minus has shape {np.shape(plus_minus)}; give one uncertainty for each of the "
+            f"{count} parameters, such as fit.plus_minus"
+        )
     write_robot(path, format_robot(robot, plus_minus), robot)
 
 
