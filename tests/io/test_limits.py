@@ -8,9 +8,13 @@ import time
 import zipfile
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
+from loopcal.cli import main
+from loopcal.cli.entry_point import SECTIONS, find_command
+from loopcal.cli.options import Count
 from loopcal.errors import FileError, MechanismError
 from loopcal.io.core import limits
 from loopcal.io.core.csv_table import read_table
@@ -220,3 +224,40 @@ def test_documentation_lists_every_limit() -> None:
     assert set(stated) == set(limits.LIMITS)
     for limit in limits.LIMITS:
         assert f"| {limit.of} | {limit} |" in page
+
+
+COUNTED = {
+    "DRAWN_POSES": ("simulate linear-delta -o d.csv --draw", "identifiability linear-delta --draw"),
+    "PLANNED_POSES": ("plan linear-delta -o p --poses", "plan linear-delta -o p --hold-out"),
+    "CANDIDATES": ("plan linear-delta -o p --candidates",),
+    "GROUPS": ("plan linear-delta -o p --groups",),
+    "POINTS": ("plan linear-delta -o p --points",),
+    "RESAMPLES": ("bootstrap linear-delta d.csv --count",),
+    "DRAWS": ("sample linear-delta d.csv --count",),
+    "TRIALS": ("reproduce hexapod-42 --trials",),
+    "STEPS": ("compensate run t.csv --steps", "per-leg hexapod-42 d.csv --steps"),
+}
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_counts_on_the_command_line_are_refused_above_their_limit(name, capsys) -> None:
+    """No file of these command lines exists: the number is refused before any is read."""
+    limit = getattr(limits, name)
+    for words in COUNTED[name]:
+        for number in (limit.most + 1, 10**9 + 1, 10**400):
+            assert main([*words.split(), str(number)]) == 1
+            assert f"the limit is {limit}; give a smaller number" in capsys.readouterr().err
+
+
+def test_every_option_that_takes_a_count_has_a_limit() -> None:
+    """A seed and the number of directions of --keep take no memory."""
+    unlimited, used = set(), set()
+    for name in (name for members in SECTIONS.values() for name in members):
+        for option in find_command(name).params:
+            if isinstance(option.type, Count):
+                used.add(option.type.limit)
+            elif isinstance(option.type, click.types.IntParamType):
+                unlimited.add(option.name)
+    assert unlimited == {"seed", "keep"}
+    assert used == set(COUNTED)
+    assert [getattr(limits, name) for name in COUNTED] == list(limits.COUNT_LIMITS)

@@ -21,6 +21,7 @@ from loopcal.cli.instrument_options import (
     unknown_options,
 )
 from loopcal.cli.options import (
+    Count,
     data_option,
     file_option,
     flag_option,
@@ -64,7 +65,10 @@ EXCLUDED_BY_PLANE_LINE = {
 @robot_argument
 @file_option("-o", "--output", help="Folder to make.", required=True)
 @click.option(
-    "--poses", type=int, metavar="N", help="Number of poses for the calibration.  [default: 40]"
+    "--poses",
+    type=Count("PLANNED_POSES"),
+    metavar="N",
+    help="Number of poses for the calibration.  [default: 40]",
 )
 @click.option(
     "--accuracy",
@@ -80,7 +84,7 @@ EXCLUDED_BY_PLANE_LINE = {
 )
 @click.option(
     "--hold-out",
-    type=int,
+    type=Count("PLANNED_POSES"),
     metavar="N",
     help="Number of further poses for validation, drawn evenly.  "
     "[default: one for four, at least 5]",
@@ -90,13 +94,13 @@ EXCLUDED_BY_PLANE_LINE = {
 @instrument_options
 @click.option(
     "--groups",
-    type=int,
+    type=Count("GROUPS"),
     metavar="N",
     help="With --measure plane-line: number of planes with a line.  [default: 10]",
 )
 @click.option(
     "--points",
-    type=int,
+    type=Count("POINTS"),
     metavar="N",
     help="With --measure plane-line: number of points on each.  [default: 8]",
 )
@@ -109,7 +113,7 @@ EXCLUDED_BY_PLANE_LINE = {
 @constraint_options
 @click.option(
     "--candidates",
-    type=click.IntRange(min=10),
+    type=Count("CANDIDATES", 10),
     default=1000,
     metavar="N",
     help="Number of candidate poses to draw.",

@@ -12,6 +12,7 @@ from loopcal.cli import terminal
 from loopcal.cli.fit_options import fit_options
 from loopcal.cli.fit_source import load_fit
 from loopcal.cli.options import (
+    Count,
     add_options,
     data_argument,
     data_options,
@@ -24,6 +25,9 @@ from loopcal.cli.options import (
 if TYPE_CHECKING:
     from loopcal.estimate import Identification
     from loopcal.typing import FloatArray
+
+MOST_DIGITS = 10
+"""Digits of a number of poses; a longer text is no unit of resampling."""
 
 level_option = click.option(
     "--level",
@@ -46,12 +50,12 @@ draw_options = add_options(
 )
 """Decorator of a command that draws."""
 
-COUNT = click.IntRange(min=2)
-
 
 @click.command()
 @source_options
-@click.option("--count", type=COUNT, default=1000, metavar="N", help="Number of resamples.")
+@click.option(
+    "--count", type=Count("RESAMPLES", 2), default=1000, metavar="N", help="Number of resamples."
+)
 @click.option(
     "--scheme",
     type=click.Choice(("wild", "pairs", "normal")),
@@ -107,7 +111,8 @@ def bootstrap(
 
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
-    chosen = int(unit) if unit is not None and unit.isdecimal() else unit
+    is_number = unit is not None and unit.isdecimal() and len(unit) < MOST_DIGITS
+    chosen = int(unit) if unit is not None and is_number else unit
     with terminal.ProgressBar() as progress:
         result = resample(
             fit, measurements, count, scheme=scheme, unit=chosen, seed=seed, progress=progress
@@ -123,7 +128,7 @@ def bootstrap(
 @click.command()
 @source_options
 @click.option(
-    "--count", type=click.IntRange(min=100), default=4000, metavar="N", help="Number of draws."
+    "--count", type=Count("DRAWS", 100), default=4000, metavar="N", help="Number of draws."
 )
 @draw_options
 @fit_options
