@@ -24,7 +24,6 @@ from loopcal.engine.program import (
     NEAR_GOAL,
     NOT_FINITE,
     STALLED,
-    Group,
     Program,
     State,
 )
@@ -36,10 +35,9 @@ RESIDUAL, STEP = 1e-13, 1e-7
 """Residual and last step of a converged row, relative to the robot's size."""
 NEAR, NEARER = 1e-2, 0.1
 """Distance from a goal, relative to the robot's size and to the step towards it, below which
-Newton's method ends there.
-
-A step that ends so much closer than it was long converges quadratically. Other solutions of the
-same readings are at least ten times as far from each other, except close to a singularity.
+Newton's method ends there. A step that ends so much closer than it was long converges
+quadratically. Other solutions of the same readings are at least ten times as far from each other,
+except close to a singularity.
 """
 SINGULAR = 1e-11
 """Smallest pivot of a limb's joints, relative to its largest, below which a limb is singular."""
@@ -133,10 +131,7 @@ def solve(
 def _iterate(
     equations: _Equations, coordinates: FloatArray, max_iterations: int, goal: FloatArray | None
 ) -> Solved:
-    """Iterate one chunk until every row has converged, come close to its goal, or failed.
-
-    goal : (3, 4, N) platforms.
-    """
+    """Iterate one chunk until every row has converged, is near its goal (3, 4, N), or failed."""
     size, N = equations.program.size, coordinates.shape[1]
     may_stay_open = equations.program.sigma is not None
     status, steps, alive = np.full(N, EXHAUSTED, np.int8), np.zeros(N, np.int64), np.arange(N)
@@ -152,12 +147,14 @@ def _iterate(
             finite = np.isfinite(now.reducible) & np.isfinite(now.length)
             broken = ~(finite & (now.pivot > SINGULAR))
             end = settled | broken | (share < 1e-5)
-            closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
-            reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
+            is_near = np.zeros_like(end)
             if goal is not None:
                 is_near = equations.lead_to(now, goal[..., alive]) & ~end
-                reason, end = np.where(is_near, NEAR_GOAL, reason), end | is_near
+                end |= is_near
             if end.any():
+                closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
+                reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
+                reason[is_near] = NEAR_GOAL
                 keep, status[alive[end]] = ~end, reason[end]
                 _store(done, alive[end], now.select(end) if keep.any() else now)
                 if not keep.any():
@@ -313,16 +310,12 @@ class _Equations:
 def _split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
     """Return the joint values (J + 1, k, N) of each group as views into coordinates."""
     out, first = [], 12
-    for shape in map(_joint_shape, program.groups):
-        last = first + shape[0] * shape[1]
-        out.append(coordinates[first:last].reshape(*shape, coordinates.shape[1]))
+    for group in program.groups:  # the rod counts as a joint
+        values, limbs = len(group.joints) + 1, len(group.limbs)
+        last = first + values * limbs
+        out.append(coordinates[first:last].reshape(values, limbs, coordinates.shape[1]))
         first = last
     return out
-
-
-def _joint_shape(group: Group) -> tuple[int, int]:
-    """Return the numbers of joints of a limb, its rod counted, and of limbs."""
-    return len(group.joints) + 1, len(group.limbs)
 
 
 def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:
