@@ -35,7 +35,10 @@ def descend_once(
         return descend(with_prior, z, method, control, tolerance, start)
     z, first = descend_from_closure(problem, z, method, control, tolerance)
     fit = descend(with_prior, z, method, control, tolerance, start)
-    return fit if first is None else fit.after(first)
+    if first is None:
+        return fit
+    is_exhausted = bool((first.status == DescentStatus.OUT_OF_ITERATIONS).any())
+    return replace(fit.after(first), is_start_exhausted=is_exhausted)
 
 
 def descend_weighted(

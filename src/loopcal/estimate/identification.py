@@ -69,7 +69,7 @@ from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_t
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
-from loopcal.findings import Finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, find_impossible_values
@@ -279,7 +279,7 @@ def _assemble(
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),
-        *_report_closure(problem, options),
+        *_report_closure(problem, options, fit),
         *([] if regularization is None else [regularization.finding]),
         *report_unknown_bias(free, method, sources.prior),
         *report_equations(int(problem.equations[0]), problem.parameters, method),
@@ -352,8 +352,12 @@ def _estimate_nuisance(
     )
 
 
-def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:
-    """Return why the fit did not begin with the closure, where the options ask for it."""
+def _report_closure(problem: Problem, options: FitOptions, fit: Descent) -> list[Finding]:
+    """Return why the fit did not begin with the closure, where the options ask for it, or that
+    the steps of this start ran out.
+    """
+    if fit.is_start_exhausted:
+        return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
     unused = report_unused_closure(problem) if options.begin == "closure" else None
     return [] if unused is None else [unused]
 

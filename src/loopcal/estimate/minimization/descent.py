@@ -153,6 +153,7 @@ class Descent:
     start : warm start of the last points at which rows were evaluated and accepted.
     deviation_history, cost_history : (i + 1, t, p) and (i + 1, t) after each round; trials that
         have ended repeat.
+    is_start_exhausted : whether the steps ran out in a search for a start before it.
     """
 
     deviation: FloatArray
@@ -164,11 +165,13 @@ class Descent:
     start: Start
     deviation_history: FloatArray
     cost_history: FloatArray
+    is_start_exhausted: bool = False
 
     def after(self, first: Descent) -> Descent:
         """Return this descent with the steps of the one that led to its start before its own."""
         return replace(
             self,
+            is_start_exhausted=self.is_start_exhausted or first.is_start_exhausted,
             iterations=first.iterations + self.iterations,
             deviation_history=np.concatenate([first.deviation_history, self.deviation_history[1:]]),
             cost_history=np.concatenate([first.cost_history, self.cost_history[1:]]),

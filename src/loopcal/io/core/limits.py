@@ -270,18 +270,18 @@ class CountLimit:
 
 
 DRAWN_POSES = CountLimit(
-    1_000_000, "poses to draw", "`--draw` of `loopcal simulate` and `loopcal identifiability`"
+    1_000_000, "poses to draw", "`draw` of `loopcal simulate` and `loopcal identifiability`"
 )
 PLANNED_POSES = CountLimit(
-    10_000, "poses of a plan", "`--poses` and `--hold-out` of `loopcal plan`, each"
+    2_000, "poses of a plan", "`poses` and `hold-out` of `loopcal plan`, each"
 )
-CANDIDATES = CountLimit(100_000, "candidate poses", "`--candidates` of `loopcal plan`")
-GROUPS = CountLimit(1_000, "groups of points", "`--groups` of `loopcal plan`")
-POINTS = CountLimit(1_000, "points of a group", "`--points` of `loopcal plan`")
-RESAMPLES = CountLimit(100_000, "resamples", "`--count` of `loopcal bootstrap`")
-DRAWS = CountLimit(1_000_000, "draws", "`--count` of `loopcal sample`")
-TRIALS = CountLimit(10_000, "trials", "`--trials` of `loopcal reproduce`")
-STEPS = CountLimit(1_000, "steps", "`--steps` of `loopcal compensate` and `loopcal per-leg`")
+CANDIDATES = CountLimit(100_000, "candidate poses", "`candidates` of `loopcal plan`")
+GROUPS = CountLimit(1_000, "groups of points", "`groups` of `loopcal plan`")
+POINTS = CountLimit(1_000, "points of a group", "`points` of `loopcal plan`")
+RESAMPLES = CountLimit(100_000, "resamples", "`count` of `loopcal bootstrap`")
+DRAWS = CountLimit(1_000_000, "draws", "`count` of `loopcal sample`")
+TRIALS = CountLimit(10_000, "trials", "`trials` of `loopcal reproduce`")
+STEPS = CountLimit(1_000, "steps", "`steps` of `loopcal compensate` and `loopcal per-leg`")
 
 COUNT_LIMITS: tuple[CountLimit, ...] = (
     DRAWN_POSES,
