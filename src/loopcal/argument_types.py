@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from functools import wraps
 from numbers import Integral, Real
 from typing import Any, ParamSpec, TypeVar, get_args
@@ -80,6 +81,14 @@ def check_call(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     checked.__module__ = "loopcal"  # where pickle finds it
     return checked
+
+
+def check_fields(instance: Any) -> None:
+    """Raise ArgumentTypeError for a field of a dataclass that it cannot use."""
+    for field in fields(instance):
+        kind = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", "")
+        checks = list_checks(kind, type(instance).__init__)
+        _check(field.name, getattr(instance, field.name), checks)
 
 
 _Check = tuple[str, Callable[[Any], bool]]
