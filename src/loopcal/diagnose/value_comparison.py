@@ -32,6 +32,7 @@ from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.geometry import log_so3
 from loopcal.geometry.alignment import align_point_sets
 from loopcal.mechanism import Mechanism, Status, forward_trials
@@ -144,8 +145,8 @@ class ValueComparison:
     def __repr__(self) -> str:
         return (
             f"<ValueComparison: {len(self.names)} parameters, {self.degrees} directions, "
-            f"chi-square {self.chi_square:.4g} (p = {self.p_value:.2g}), "
-            f"rms {self.rms:.3g} tolerances>"
+            f"chi-square {round_to_digits(self.chi_square, 4)} "
+            f"(p = {round_to_digits(self.p_value, 2)}), rms {round_to_digits(self.rms)} tolerances>"
         )
 
     def to_dict(self) -> dict[str, object]:

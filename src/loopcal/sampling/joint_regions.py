@@ -29,6 +29,7 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.multiple_tests import compute_single_level
@@ -65,7 +66,7 @@ class JointRegion:
     square: float
 
     def __repr__(self) -> str:
-        return f"<JointRegion of {', '.join(self.names)}: {100 * self.level:.4g} %>"
+        return f"<JointRegion of {', '.join(self.names)}: {round_to_digits(100 * self.level, 4)} %>"
 
     @property
     def standard_deviations(self) -> FloatArray:
@@ -143,7 +144,7 @@ class SimultaneousIntervals:
     single: FloatArray
 
     def __repr__(self) -> str:
-        names = f"{len(self.names)} quantities at {100 * self.level:.4g} %"
+        names = f"{len(self.names)} quantities at {round_to_digits(100 * self.level, 4)} %"
         return f"<SimultaneousIntervals of {names} by {self.rule}>"
 
     def contains(self, values: FloatArray) -> np.ndarray:

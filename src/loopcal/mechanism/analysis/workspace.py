@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.kinematics import Solution, check_arguments, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import compute_limb_frames
@@ -129,8 +130,8 @@ class WorkspaceSample:
     rejected: Mapping[str, int]
 
     def __repr__(self) -> str:
-        share = f"{100 * self.reachable_share:.3g} % of the stated workspace is reachable"
-        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share}>"
+        share = f"{round_to_digits(100 * self.reachable_share)} % of the stated workspace"
+        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share} is reachable>"
 
 
 def sample_workspace(
