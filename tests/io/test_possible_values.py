@@ -56,7 +56,9 @@ def test_a_named_length_has_no_value_that_no_machine_has(tmp_path: Path, name, v
     row = f"  - {{name: {name}, value: {value}, unit: mm}}"
     path = write_table(tmp_path, "five-bar", row)
     path.write_text(path.read_text().replace("\nidentified:", f"{NAMED}identified:"))
-    with pytest.raises(FileError, match=rf"{name} is .*must be greater|'{name}': .* is beyond") as caught:
+    with pytest.raises(
+        FileError, match=rf"{name} is .*must be greater|'{name}': .* is beyond"
+    ) as caught:
         load_robot(path)
     assert caught.value.line == len(path.read_text().splitlines())
 

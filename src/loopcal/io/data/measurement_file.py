@@ -237,8 +237,10 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
     )
 
 
-def load_pose_names(path: str | Path) -> tuple[str, ...]:
-    """Read the names of commanded poses (n,); "1", "2", ... without a column `pose`.
+def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Read the names of commanded poses (n,), and their places such as `poses.csv:12`.
+
+    The names are "1", "2", ... without a column `pose`.
 
     Raises
     ------
@@ -252,7 +254,7 @@ def load_pose_names(path: str | Path) -> tuple[str, ...]:
             row = first[name] + 1
             sentence = f"pose {name!r} is also row {row}; give each pose a name of its own"
             raise table.row_error(i, sentence)
-    return names
+    return names, tuple(map(table.place, range(len(names))))
 
 
 def _read_tables(path: Paths) -> tuple[Table, ...]:

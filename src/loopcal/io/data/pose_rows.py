@@ -22,7 +22,6 @@ from loopcal.errors import suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.references import find_reference
-from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextColumn, list_columns
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
@@ -160,9 +159,8 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     if controller is not None:
         chosen = [first[name] for name in first if name in read]
         if chosen:
-            poses = tuple(names[row] for row in chosen)
-            with name_files(table.path):
-                blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses).q
+            poses, places = [names[row] for row in chosen], [table.place(row) for row in chosen]
+            blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses, places).q
         rows = blank
     sigma = read_reading_sigma(table, robot, rows)
     return _FilePoses(
