@@ -209,8 +209,8 @@ def _report(
         case click.ClickException():
             return _refuse(error.format_message())
         case LoopcalError():
-            found = error.args[0] if error.args else None
-            is_useless = isinstance(found, Finding) and is_hint_useless(found)
+            finding = error.args[0] if error.args else None
+            is_useless = isinstance(finding, Finding) and is_hint_useless(finding)
             return _refuse(str(error), None if is_useless else find_hint(error.code, command))
         case KeyboardInterrupt() | click.exceptions.Abort():
             return _refuse(f"stopped before the end{unwritten}.")

@@ -306,11 +306,11 @@ def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntA
         names = [names]
     chosen = []
     for name in names:
-        found = [i for i, known in enumerate(available) if fnmatchcase(known, name)]
-        if not found:
+        matching = [i for i, known in enumerate(available) if fnmatchcase(known, name)]
+        if not matching:
             similar = suggest_names(name, available)
             raise EstimationError(f"no free parameter is called {name!r}{similar}")
-        chosen += [i for i in found if i not in chosen]
+        chosen += [i for i in matching if i not in chosen]
     return np.array(chosen, dtype=np.int64)
 
 

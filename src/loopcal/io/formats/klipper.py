@@ -269,19 +269,19 @@ def _list_records(cfg: KlipperConfig, name: str, parts: Sequence[str]) -> list[s
         a line of the record, or of the next one.
     """
     pattern = re.compile(rf"{name}(\d+)({'|'.join(parts)})")
-    found: dict[int, list[str]] = {}
+    records: dict[int, list[str]] = {}
     for section, option in cfg.values:
         if section == PROBED and (match := pattern.fullmatch(option)):
-            found.setdefault(int(match[1]), []).append(option)
-    for place, number in enumerate(sorted(found)):
-        present = found[number]
+            records.setdefault(int(match[1]), []).append(option)
+    for place, number in enumerate(sorted(records)):
+        present = records[number]
         lacking = [part for part in parts if f"{name}{number}{part}" not in present]
         code = "files.probe-part-missing" if lacking else "files.probe-left-out"
         if lacking or number != place:
             missing = f"{name}{number}{lacking[0]}" if lacking else f"{name}{place}"
             finding = report_finding(code, present=present[0], missing=missing, section=PROBED)
             raise cfg.error(finding, PROBED, present[0])
-    return [f"{name}{number}" for number in range(len(found))]
+    return [f"{name}{number}" for number in range(len(records))]
 
 
 def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
