@@ -283,11 +283,11 @@ def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, 
         raise DataError(
             f"is_held_out has shape {mask.shape}; give one boolean for each of {len(block)} poses"
         )
-    for i in np.flatnonzero(mask):
-        for j in np.flatnonzero((block == block[i]) & ~mask):
-            raise DataError(
-                report_finding("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
-            )
+    for i in np.flatnonzero(mask & np.isin(block, block[~mask]))[:1]:
+        j = np.flatnonzero((block == block[i]) & ~mask)[0]
+        raise DataError(
+            report_finding("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
+        )
     mask.setflags(write=False)
     return mask
 

@@ -95,11 +95,10 @@ def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) ->
     readings = tuple(actuator.name for actuator in robot.actuators)
     require_columns(planned, ("pose", *readings), f"a reading of {robot.name}")
     kept = ("pose", *readings)
-    columns = [planned.text(name) for name in kept]
     planned = replace(
         planned,
         units={name: planned.units[name] for name in kept},
-        rows=tuple(zip(*columns, strict=True)),
+        columns={name: planned.columns[name] for name in kept},
     )
     return _join_tables((table, planned), robot, allow_outside_stroke=True, allow_duplicates=True)
 
@@ -155,11 +154,9 @@ def _join_shared_errors(entries: Sequence[KindRows]) -> dict[str, float]:
 def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[int, str]:
     """Return the place of the first row of each pose, such as `data.csv:12`."""
     first: dict[int, str] = {}
-    for rows, of_rows in zip(data.observations, places, strict=True):
-        named = rows.rows.reshape(len(rows), rows.kind.poses_per_row)
-        for poses, place in zip(named.tolist(), of_rows, strict=True):
-            for pose in poses:
-                first.setdefault(pose, place)
+    for rows, of_rows in zip(reversed(data.observations), reversed(places), strict=True):
+        repeated = [place for place in of_rows for _ in range(rows.kind.poses_per_row)]
+        first |= zip(rows.rows.ravel()[::-1].tolist(), reversed(repeated), strict=True)
     return first
 
 
@@ -359,7 +356,7 @@ def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
     table = read_table(path)
     columns = [actuator.name for actuator in robot.actuators if actuator.name in table.units]
     cells = (cell for name in columns for cell in table.text(name))
-    return bool(columns and table.rows) and not any(cells)
+    return bool(columns and len(table)) and not any(cells)
 
 
 def build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:

@@ -92,9 +92,10 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
         repeated: dict[int, tuple[int, int]] = {}
         for name, row in file.first.items():
             if name in file.read or (name in file.unread and name not in read):
-                place = origin.setdefault(name, (i, row))
-                if place != (i, row):
-                    repeated[row] = place
+                if name in origin:
+                    repeated[row] = origin[name]
+                else:
+                    origin[name] = (i, row)
             elif name not in read and states_readings:
                 sentence = f"pose {name!r} has no readings in any file; add them in one"
                 raise file.table.row_error(row, sentence)
@@ -354,6 +355,8 @@ def _refuse_contradictions(
 
 def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArray:
     """Return block numbers (n,): by the column `block` of a pose's first row, else each alone."""
+    if not any("block" in file.table.units for file in files):
+        return np.arange(len(labels))
     named: dict[str, tuple[str, str]] = {}
     for file in (file for file in files if "block" in file.table.units):
         cells = file.table.text("block")

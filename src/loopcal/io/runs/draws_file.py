@@ -40,7 +40,7 @@ def save_draws(
         table = read_table(written)
         of_weight = [] if weight is None else [WEIGHT]
         require_same("columns", (*of_weight, *names), table.names)
-        numbers = np.array(table.rows, dtype=float)
+        numbers = np.array(list(table.columns.values()), dtype=float).T
         require_same_numbers("draws", draws, numbers[:, len(of_weight) :] * factors, ROUNDING)
         if weight is not None:
             require_same_numbers("weights", weight, numbers[:, 0])
