@@ -75,7 +75,7 @@ from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 
 def identify(
@@ -85,6 +85,7 @@ def identify(
     *,
     loss: Loss | None = None,
     options: FitOptions | None = None,
+    progress: Progress = report_no_progress,
 ) -> Identification:
     """Identify the free parameters of a robot; see `loopcal.estimate.methods.penalties`.
 
@@ -96,6 +97,7 @@ def identify(
     method, loss : in place of those of `options`.
     options : see `FitOptions`. By default stated tolerances are a prior, which is inflated where
         the data contradict it.
+    progress : receives the steps of the iteration, with the sum of squares.
 
     Returns
     -------
@@ -121,7 +123,7 @@ def identify(
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
-    fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free)
+    fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free, progress)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(problem, data, z, fit.cost)
     open_poses = find_open_poses(robot.with_values(values), data)

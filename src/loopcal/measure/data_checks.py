@@ -191,10 +191,8 @@ def check_duplicates(
             )
 
 
-def _find_equal_rows(
-    content: FloatArray, texts: Sequence[TextArray]
-) -> tuple[int, int] | None:
-    """Return the first row with numbers (r, c) and texts (r,) of an earlier row, and that row first.
+def _find_equal_rows(content: FloatArray, texts: Sequence[TextArray]) -> tuple[int, int] | None:
+    """Return an earlier row and the first one with its numbers (r, c) and texts (r,), if any.
 
     Only rows with an equal weighted sum of their numbers are compared, which are few.
     """

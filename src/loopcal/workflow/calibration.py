@@ -184,7 +184,8 @@ def _fit(
             )
         )
     count.begin(f"fitting {free} parameters")
-    return _FitResult(identify(chosen, data, options=fit_options), choice=choice)
+    fit = identify(chosen, data, options=fit_options, progress=count.progress)
+    return _FitResult(fit, choice=choice)
 
 
 def _report(

@@ -26,7 +26,7 @@ from loopcal.numerics.damping import Damping
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 ACCEPTED_SHARE = 1e-4
 """Share of the predicted decrease that a step must bring."""
@@ -196,6 +196,7 @@ def descend(
     control: StepControl | None = None,
     tolerance: float = RANK_TOLERANCE,
     start: Start | None = None,
+    progress: Progress = report_no_progress,
 ) -> Descent:
     """Minimize the whitened sum of squares, filtered by the method.
 
@@ -205,6 +206,8 @@ def descend(
     method : how directions are penalized. control : settings of the steps.
     tolerance : relative rank tolerance.
     start : warm start; default: the first one of the problem.
+    progress : receives each step with the sum of squares of the first trial; how many there will be
+        is not known.
 
     Returns
     -------
@@ -213,6 +216,7 @@ def descend(
     control = control or StepControl()
     model = _FilteredDescent(problem, method, tolerance, control)
     z = np.array(deviation, dtype=np.float64)
+    progress(0, 1, "fitting")
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
         begin = problem.start(z) if start is None else start
         first = problem.linearize(z, begin)
@@ -226,6 +230,7 @@ def descend(
     def observe(moved: _Point) -> None:
         deviations.append(moved.z.copy())
         costs.append(moved.cost.copy())
+        progress(0, 1, f"fitting, step {len(costs) - 1}: sum of squares {moved.cost[0]:.4g}")
 
     damping = Damping(control.damping * largest, FIRST_DAMPING * largest)
     minimum = minimize(model, point, damping, control.iterations, observe)

@@ -38,7 +38,7 @@ SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_n
 """Keys by which a settings file is recognized among YAML files of the same name."""
 
 CHUNK = 256
-"""Rows that are split into cells at once: so few that the collection of garbage does not see them."""
+"""Rows that are split at once: so few that the collection of garbage hardly sees them."""
 
 NAME_COLUMNS = ("pose", "use", "block", "kind", "session", "group")
 """Columns whose cells are names."""
