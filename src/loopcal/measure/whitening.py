@@ -77,7 +77,7 @@ def _invert_factor(correlation: FloatArray) -> FloatArray:
         np.min(np.einsum("rii->ri", L), axis=1) < _SMALLEST_PIVOT,
         "is not positive definite to rounding",
     )
-    return np.tril(np.linalg.inv(L))
+    return np.asarray(np.tril(np.linalg.inv(L)), dtype=np.float64)
 
 
 def _refuse(wrong: BoolArray, what: str) -> None:
