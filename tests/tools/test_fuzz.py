@@ -109,8 +109,10 @@ def test_three_hundred_random_inputs_have_their_answers(root) -> None:
     "name", ["docs/evidence/random_inputs.json", "evidence/random_inputs_longest.json"]
 )
 def test_no_random_input_of_the_evidence_broke_a_rule(root, name) -> None:
-    """A robot with redundant actuators and readings that fit nothing may take over ten seconds."""
+    """Readings that fit nothing, with redundant actuators and a robust refit, or a study with more
+    trials, may take over ten seconds.
+    """
     counts = json.loads((root / name).read_text("utf-8"))
     slow = {s: f["count"] for s, f in counts["finds"].items() if "TimeIsUp processor" in s}
     assert set(counts["finds"]) == set(slow)
-    assert 1000 * sum(slow.values()) <= counts.get("counts", counts)["inputs"]
+    assert 10_000 * sum(slow.values()) <= counts.get("counts", counts)["inputs"]
