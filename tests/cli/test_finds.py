@@ -156,6 +156,22 @@ def test_paths_that_the_system_does_not_open_state_what_is_wrong(
             assert "permissions" not in printed
 
 
+def test_document_of_a_result_folder_is_never_replaced_by_a_file(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    document, other = tmp_path / "run/result.json", tmp_path / "run/mine.json"
+    document.write_text('{"files": {"robot.yaml": "0123"}}', "utf-8")
+    other.write_text('{"files": 3}', "utf-8")
+    before = document.read_bytes()
+    words = ["export", "five-bar", "--format", "json", "--force", "-o"]
+    assert main([*words, str(document)]) == 1
+    assert "whose folder cannot be read without it" in capsys.readouterr().err
+    assert document.read_bytes() == before
+    assert main([*words, str(other)]) == 0
+
+
 def test_motions_that_move_nothing_fit_nothing() -> None:
     robot = load_robot("linear-delta")
     fit = fit_frames(robot, robot.home[None], np.zeros((12, 2)))

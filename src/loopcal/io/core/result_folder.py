@@ -22,13 +22,10 @@ from loopcal.findings import report_finding
 from loopcal.io.core.descriptors import watch_folder
 from loopcal.io.core.json_text import read_json, to_json
 from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.outputs import replace_folder, resolve_folder
+from loopcal.io.core.outputs import FILES, replace_folder, resolve_folder
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
-
-FILES = "files"
-"""Key of the list of files in the document."""
 
 _BLANK = "0" * 64
 """Stands for the document's own digest where this is computed."""
