@@ -3,6 +3,8 @@
 smallest that shows it, and the right answer.
 """
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -177,3 +179,27 @@ def test_motions_that_move_nothing_fit_nothing() -> None:
     fit = fit_frames(robot, robot.home[None], np.zeros((12, 2)))
     assert fit.solution.shape == (12, 6)
     assert not fit(np.ones((1, 6, 3))).any()
+
+
+INTERRUPTED = """
+import sys
+
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "click":
+            raise KeyboardInterrupt
+
+
+sys.meta_path.insert(0, Interrupt())
+from loopcal.__main__ import run
+
+sys.exit(run())
+"""
+
+
+def test_ctrl_c_while_modules_are_imported_prints_no_traceback() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "loopcal: stopped.\n")
