@@ -94,6 +94,15 @@ def test_values_whose_loops_do_not_close_are_refused_together(tmp_path: Path) ->
         load_robot(write_table(tmp_path, "linear-delta", rows))
 
 
+def test_a_gap_that_could_not_be_computed_is_not_named(tmp_path: Path) -> None:
+    """With this radius the first step of the forward solution is not finite."""
+    with pytest.raises(FileError, match="readings of home; the value farthest") as caught:
+        load_robot(
+            write_table(tmp_path, "linear-delta", "  - {name: radius, value: 500, unit: mm}")
+        )
+    assert "unknown" not in str(caught.value)
+
+
 def test_file_of_a_failed_calibration_keeps_its_values(tmp_path: Path) -> None:
     path = write_table(tmp_path, "linear-delta", "  - {name: radius, value: -1, unit: mm}")
     path.write_text("# NOT CALIBRATED: see result.json\n" + path.read_text())

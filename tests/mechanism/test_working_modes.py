@@ -158,6 +158,21 @@ def test_target_in_another_mode_is_refused_with_the_reason() -> None:
         solve_commanded_poses(robot, targets[other[:1]], ("far",))
 
 
+@pytest.mark.parametrize("mode", ["readings", "commands"])
+def test_targets_that_no_pose_was_found_for_have_no_numbers(mode) -> None:
+    robot = load_cached_robot("3-prs")
+    true = robot.with_values(robot.values + 1e-5)
+    result = compensate(true, draw_targets(robot, 6.0), mode)
+    lost = np.array([r in (Reach.OTHER_MODE, Reach.UNREACHABLE) for r in result.reach])
+    assert lost.any()
+    assert result.usable.any()
+    names = ["readings", "reached", "remaining", "not_compensable"]
+    for name in [*names, "commands"] if mode == "commands" else names:
+        values = getattr(result, name).reshape(ROWS, -1)
+        assert np.isnan(values[lost]).all(), name
+        assert np.isfinite(values[~lost]).all(), name
+
+
 def test_two_turns_of_the_cranks_reach_what_the_first_solution_does_not() -> None:
     robot = load_cached_robot("five-bar")
     targets = draw_targets(robot, 6.0)

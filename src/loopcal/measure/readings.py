@@ -34,9 +34,11 @@ def solve_commanded_poses(
     Raises
     ------
     DataError
-        If the controller's geometry does not reach a pose.
+        If the controller's geometry does not reach a pose, or there is another number of names.
     """
     solution = inverse(controller, commanded)
+    if labels and len(labels) != len(solution):
+        raise DataError(f"{len(labels)} names are given for {len(solution)} poses; name each pose")
     failed = np.flatnonzero(~solution.converged)
     if len(failed):
         first = int(failed[0])

@@ -28,7 +28,13 @@ from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.core.yaml_text import remove_key
 from loopcal.io.data.column_names import find_column_fault
-from loopcal.io.robot.identified_table import TABLE, add_table, read_possible_values
+from loopcal.io.robot.identified_table import (
+    TABLE,
+    add_table,
+    read_identified_values,
+    read_possible_values,
+    remove_mark,
+)
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,
@@ -146,8 +152,16 @@ def check_same_robot(robot: Mechanism, text: str, read: Mechanism) -> None:
 
 
 def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
-    """Return the text that `save_robot` writes."""
-    return add_table(get_source(robot).nominal_file, robot, plus_minus).text
+    """Return the text that `save_robot` writes.
+
+    That the calibration of the file failed is not said of other values.
+    """
+    source = get_source(robot)
+    text = add_table(source.nominal_file, robot, plus_minus).text
+    stored = robot.parameters.nominal
+    if TABLE in source.file.content:
+        stored = read_identified_values(source.file, robot.nominal)
+    return text if np.array_equal(robot.values, stored) else remove_mark(text)
 
 
 def get_source(robot: Mechanism) -> RobotSource:

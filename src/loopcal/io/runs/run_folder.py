@@ -34,6 +34,7 @@ from loopcal.io.core.result_folder import (
 )
 from loopcal.io.core.text_file import as_path, sha256
 from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.identified_table import remove_mark
 from loopcal.io.robot.robot_file import (
     check_same_robot,
     format_robot,
@@ -52,6 +53,7 @@ from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
     ROBOT,
     WARNING,
+    find_file_failure,
     find_run_failure,
     name_robot_file,
 )
@@ -307,9 +309,9 @@ def save_run(
     MechanismError : the robot was not loaded from a file.
     """
     document = build_document(report, inputs, command)
-    text = format_robot(report.robot, report.identification.plus_minus)
+    text = remove_mark(format_robot(report.robot, report.identification.plus_minus))
     name = name_robot_file(report, force)
-    text = WARNING + text if name == FAILED_ROBOT else text
+    text = WARNING + text if report.failures else text
     arrays = report.arrays()
     check = partial(_check_written_run, arrays=arrays, robot=report.robot, text=text)
     return write_run_folder(path, document, arrays, text, check, force, name)
@@ -382,12 +384,14 @@ def load_run_or_robot(path: str | Path) -> Run:
 
 
 def find_failure(path: str | Path) -> Finding | None:
-    """Return why the numbers of a run, or of a robot file in its folder, are not for a machine."""
+    """Return why the numbers of a run, or of a robot file, are not for a machine.
+
+    The robot file of a calibration that failed states it, wherever the file is.
+    """
     path = as_path(path, "run folder or robot file")
     folder = path.parent if path.name in (ROBOT, FAILED_ROBOT) else path
-    if not (folder / RESULT).is_file():
-        return None
-    return find_run_failure(folder, read_run_folder(folder)[0])
+    result = read_run_folder(folder)[0] if (folder / RESULT).is_file() else {}
+    return find_run_failure(folder, result) or find_file_failure(path)
 
 
 def load_posterior(path: str | Path) -> Posterior:
