@@ -133,7 +133,7 @@ def test_json_is_limited_in_nesting(tmp_path) -> None:
         path = write(tmp_path, "[" * depth + "]" * depth)
         with pytest.raises(FileError, match=r"more than 200 levels|has 300 levels"):
             read_json(path, "file of samples", "correct it")
-    with pytest.raises(FileError, match=r"not valid JSON .*digits"):
+    with pytest.raises(FileError, match=r"not valid JSON .*1111… is too large"):
         read_json(write(tmp_path, "1" * 5000), "file of samples", "correct it")
     assert read_json(write(tmp_path, json.dumps({"a": [[1]]})), "file", "") == {"a": [[1]]}
 
@@ -261,3 +261,25 @@ def test_every_option_that_takes_a_count_has_a_limit() -> None:
     assert unlimited == {"seed", "keep"}
     assert used == set(COUNTED)
     assert [getattr(limits, name) for name in COUNTED] == list(limits.COUNT_LIMITS)
+
+
+def test_lines_without_rows_are_counted_before_they_are_split(tmp_path) -> None:
+    path = write(tmp_path, "q1 [mm]\n1\n" + "\n" * 5_000_000, "data.csv")
+    with pytest.raises(FileError, match=r"has 5,000,002 lines, but the limit is 5,000,000"):
+        read_table(path)
+
+
+def test_values_of_json_text_are_counted_before_they_are_parsed(tmp_path) -> None:
+    path = write(tmp_path, "[" + "[]," * 6_000_000 + "1]", "result.json")
+    begin = time.process_time()
+    with pytest.raises(FileError, match=r"has 12,000,001 values, but the limit is 10,000,000"):
+        read_json(path, "run result", "repeat", limits.TABLE_SIZE)
+    assert time.process_time() - begin < 2.0
+
+
+@pytest.mark.parametrize("digits", ["9" * 350, "0x" + "f" * 300, "0x" + "f" * 9000, "9" * 9000])
+def test_numbers_of_many_digits_are_refused_without_their_digits(tmp_path, digits) -> None:
+    for text in (f"length: {digits}\n", f"length: [{digits}]\n"):
+        with pytest.raises(FileError, match=r"too large|thousands of digits") as refusal:
+            read_yaml(write(tmp_path, f"format: 1\n{text}"), "robot file")
+        assert len(str(refusal.value)) < 200 + len(str(tmp_path))

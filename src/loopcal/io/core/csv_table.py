@@ -22,7 +22,7 @@ import numpy as np
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.decimal_columns import parse_decimals
-from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_ROWS, TABLE_SIZE
+from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_LINES, TABLE_ROWS, TABLE_SIZE
 from loopcal.io.core.names import LONGEST_COMPOSED, LONGEST_NAME, find_fault
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
@@ -273,6 +273,7 @@ def read_settings(path: str | Path) -> YamlFile:
 
 def _read_lines(path: str | Path) -> list[str]:
     text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
+    TABLE_LINES.check(text.count("\n"), WHAT, path)
     lines = text.split("\n")
     return [line.rstrip("\r") for line in lines] if "\r" in text else lines
 

@@ -115,6 +115,13 @@ TABLE_ROWS = FileLimit(
     "rows below the header",
     "divide it into several files, or average repeated measurements",
 )
+TABLE_LINES = FileLimit(
+    "lines of a measurement file",
+    5_000_000,
+    "lines",
+    "blank lines and remarks included",
+    "remove what is no row, or divide it into several files",
+)
 TABLE_COLUMNS = FileLimit(
     "columns of a measurement file",
     1_000,
@@ -143,6 +150,13 @@ XML_JOINTS = FileLimit(
     "joints",
     "fixed ones included",
     "leave out joints that belong to no loop",
+)
+JSON_VALUES = FileLimit(
+    "values in JSON text",
+    10_000_000,
+    "values",
+    "`result.json` of a run, samples of a cable robot; keys included",
+    "check that this is the file that was meant",
 )
 JSON_DEPTH = FileLimit(
     "nesting of JSON text",
@@ -235,12 +249,14 @@ LIMITS: tuple[FileLimit, ...] = (
     TEXT_LENGTH,
     TABLE_SIZE,
     TABLE_ROWS,
+    TABLE_LINES,
     TABLE_COLUMNS,
     LINE_LENGTH,
     PATTERN_LENGTH,
     PATTERN_COUNTS,
     PATTERN_SECONDS,
     PROGRAM_SIZE,
+    JSON_VALUES,
     JSON_DEPTH,
     XML_JOINTS,
     XML_ELEMENTS,

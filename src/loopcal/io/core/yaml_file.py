@@ -151,6 +151,8 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         sentence = f"not valid YAML ({problem}); check indentation, brackets and colons"
         raise FileError(sentence, path, mark.line + first_line if mark else None) from None
     except (YAMLError, ValueError, RecursionError) as error:
+        if "integer string conversion" in str(error):  # Python reads no more than 4300 digits
+            raise FileError("a number has thousands of digits; write a shorter one", path) from None
         sentence = f"not valid YAML ({_shorten(error)}); correct the syntax"
         raise FileError(sentence, path) from None
 
@@ -258,5 +260,6 @@ def _finite(value: float, file: YamlFile, location: Location) -> float:
     except OverflowError:
         is_finite = False
     if not is_finite:
-        raise file.error(f"{name_location(location)!r} is {value}; write a finite number", location)
+        shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
+        raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
     return value

@@ -66,7 +66,7 @@ def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
 
 
 def find_file_failure(path: Path) -> Finding | None:
-    """Return `gates.run-not-calibrated` for a robot file that states it; None for any other path."""
+    """Return `gates.run-not-calibrated` for a robot file that states it; None for other paths."""
     if not path.is_file() or not read_yaml(path, "robot file").text.startswith(NOT_CALIBRATED):
         return None
     return report_finding("gates.run-not-calibrated", run=str(path), reasons=())
