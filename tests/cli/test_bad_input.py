@@ -459,4 +459,4 @@ a,0,0,0,0,0,0,0,0,0,0,0
 def test_a_pose_out_of_reach_is_named_as_in_its_file(run_refused, words) -> None:
     poses = "pose,z [mm],phi [deg],theta [deg]\nlow,700,0,10\nsteep,700,90,80\n"
     said = run_refused(f"{words} --poses p.csv", p_csv=poses)
-    assert "does not reach commanded pose 'steep' (1 of 2 fail)" in said
+    assert "does not reach commanded pose 'steep' at p.csv:3 (1 of 2 fail)" in said
