@@ -253,7 +253,9 @@ def test_every_option_that_takes_a_count_has_a_limit() -> None:
     """A seed and the number of directions of --keep take no memory."""
     unlimited, used = set(), set()
     for name in (name for members in SECTIONS.values() for name in members):
-        for option in find_command(name).params:
+        command = find_command(name)
+        assert command is not None, name
+        for option in command.params:
             if isinstance(option.type, Count):
                 used.add(option.type.limit)
             elif isinstance(option.type, click.types.IntParamType):

@@ -259,8 +259,8 @@ def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
         if is_reached.any():
             break
     else:
-        data = {"stored": stored.name, "robot": robot.name}
-        raise EstimationError(report_finding("comparison.nothing-reached", **data))
+        code = "comparison.nothing-reached"
+        raise EstimationError(report_finding(code, stored=stored.name, robot=robot.name))
     mine, theirs = (state.T[0][is_reached] for state in states)
     apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max()
     if apart <= EQUAL * robot.size:

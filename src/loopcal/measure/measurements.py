@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.argument_types import check_seed
+from loopcal.argument_types import check_seed, describe
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_array, check_number, check_type, describe, set_fields
+from loopcal.measure.array_checks import check_array, check_number, check_type, set_fields
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
