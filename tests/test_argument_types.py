@@ -3,12 +3,15 @@
 # Wrong types are passed on purpose.
 """Arguments of the wrong type or out of range: every public function says what to pass."""
 
+import inspect
+import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.argument_types import list_checks
 from tests.estimate.problems import hexapod, hexapod_data
 
 WRONG: Any = "measurements.csv"
@@ -64,6 +67,36 @@ def fit(data):
         (lambda fit, data: lc.StepControl(iterations=2.5), "iterations: .* a whole number"),
         (lambda fit, data: lc.StepControl(relative=WRONG), "relative: .* a finite number"),
         (lambda fit, data: data.split(hold_out=WRONG, seed=1), "hold_out: .* give the share"),
+        (lambda fit, data: lc.bootstrap(fit, data, seed=WRONG), "seed: .* give a whole number"),
+        (lambda fit, data: lc.bootstrap(fit, data, 2**63), "count: .* number below 2.63"),
+        (lambda fit, data: lc.bootstrap(fit, data, scheme=["wild"]), "scheme: .* one of 'wild', "),
+        (lambda fit, data: lc.bootstrap(fit, data, unit=np.ones(2)), "unit: .* text, or a whole"),
+        (lambda fit, data: lc.choose_model(fit.robot, data, ["x"]), "nested: .* a dict of lists"),
+        (lambda fit, data: lc.compensate(fit, [[0.0]], steps="3"), "steps: .* a whole number"),
+        (lambda fit, data: lc.compensate(fit, [[None, "x"]]), "targets: .* an array of numbers"),
+        (lambda fit, data: lc.compensate(fit, [[0.0]], labels="abc"), "labels: .* list of names"),
+        (lambda fit, data: lc.compute_joint_region(data), "fit: .* Identification, .* Posterior,"),
+        (lambda fit, data: lc.compute_joint_region(fit, [1]), "names: .* text, or a list of names"),
+        (lambda fit, data: lc.compare_with_values(fit, {"x": "1"}), "values: .* numbers by name"),
+        (lambda fit, data: lc.find_outliers(fit, data, "5%"), "level: .* give a number"),
+        (lambda fit, data: lc.examine_fit(fit, data, frame=3), "frame: .* give text"),
+        (lambda fit, data: lc.calibrate(fit.robot, data, progress=3), "progress: .* a function"),
+        (
+            lambda fit, data: lc.check_conventions(fit.robot, data, allow_still=np.ones(2)),
+            "True or",
+        ),
+        (lambda fit, data: lc.trace_singularity(fit.robot, medians=(1.0,)), "medians: .* two numb"),
+        (
+            lambda fit, data: lc.save_robot(fit.robot, "a.yaml", [1.0]),
+            r"shape \(1,\); give one unc",
+        ),
+        (lambda fit, data: lc.Huber("1"), "k: .* give a number"),
+        (lambda fit, data: lc.Tukey(None), "c: .* give a number"),
+        (lambda fit, data: lc.StatedValue("x", "1 mm"), "sd: .* give a number"),
+        (lambda fit, data: lc.Constraints(max_tilt="20deg"), "max_tilt: .* give a number"),
+        (lambda fit, data: lc.LineOfSight("left", [1, 0, 0]), "station: .* an array of numbers"),
+        (lambda fit, data: lc.load_run("a\0b"), "path .* contains a null character"),
+        (lambda fit, data: lc.load_robot("\ud800"), "path .* half of a character"),
     ],
 )
 def test_a_wrong_type_is_refused_with_what_to_pass(call, words, fit, data):
@@ -83,8 +116,39 @@ def test_a_wrong_type_is_refused_with_what_to_pass(call, words, fit, data):
         (lambda fit, data: lc.sample_workspace(lc.load_robot("five-bar"), -1), "-1 positions"),
         (lambda fit, data: lc.find_outliers(fit, hexapod_data(9)), "9 poses, .* made from 12"),
         (lambda fit, data: lc.examine_fit(fit, hexapod_data(9)), "9 poses, .* made from 12"),
+        (lambda fit, data: lc.cross_validate(fit.robot, data, seed=-1), "seed is -1; give"),
+        (lambda fit, data: lc.sample_workspace(fit.robot, 3, seed=-1), "seed is -1; give"),
+        (lambda fit, data: lc.compute_joint_region(fit, combinations=[[0.0] * 42]), "zeros"),
+        (lambda fit, data: lc.compute_joint_region(fit, combinations=[[np.inf] * 42]), "finite"),
     ],
 )
 def test_a_value_out_of_range_is_refused_with_what_is_allowed(call, words, fit, data):
     with pytest.raises(lc.LoopcalError, match=words):
         call(fit, data)
+
+
+UNCHECKED = {
+    *(f"{name}(method)" for name in ("choose_model", "cross_validate", "identify")),
+    *(f"{name}(method)" for name in ("identify_trials", "simulate_accuracy")),
+    *(f"{name}(path)" for name in ("load_measurements", "load_run", "load_stored_values")),
+    *("save_measurements(path)", "save_measurements(data)", "save_robot(path)", "save_run(path)"),
+    *("save_run(report)", "save_run(inputs)", "load_robot(source)", "identify(loss)"),
+    *("suggest_measurements(sigma)", "validate(uncertainty)"),
+}
+"""Parameters of public functions that check them themselves, or use objects of any class."""
+
+
+def test_annotations_of_public_functions_are_checked() -> None:
+    unchecked = {
+        f"{name}({parameter.name})"
+        for name in lc.__all__
+        if inspect.isfunction(function := getattr(lc, name))
+        for parameter in inspect.signature(function).parameters.values()
+        if not list_checks(str(parameter.annotation), inspect.unwrap(function))
+    }
+    assert unchecked == UNCHECKED
+
+
+def test_public_functions_can_be_sent_to_other_processes() -> None:
+    assert (lc.forward.__module__, lc.forward.__qualname__) == ("loopcal", "forward")
+    assert pickle.dumps(lc.forward)

@@ -21,8 +21,10 @@ from loopcal.diagnose.residuals.residual_rows import ResidualRows
 from loopcal.estimate import identify
 from loopcal.estimate.observation_rows import list_block_labels
 from loopcal.io import load_measurements, load_robot
+from loopcal.io.core.csv_table import read_table
 from loopcal.io.data.measurement_file import load_pose_names
 from loopcal.io.runs.compensation_file import format_compensation, load_targets
+from loopcal.measure import Measurements
 from loopcal.report.compensation_view import view_compensation
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
@@ -112,6 +114,26 @@ def test_files_are_read_in_time_proportional_to_their_rows(tmp_path, read) -> No
         }[read]
 
     assert measure_growth(make, 1500) < MOST
+
+
+def test_a_table_holds_a_few_objects_whatever_its_length(tmp_path) -> None:
+    file = tmp_path / "data.csv"
+    lines = (f"p{i},{i}.5,2,3" for i in range(3000))
+    file.write_text("\n".join(["pose,x [mm],y [mm],z [mm]", *lines]) + "\n", encoding="utf-8")
+    gc.collect()
+    before = len(gc.get_objects())
+    table = read_table(file)
+    assert len(table) == 3000
+    assert len(gc.get_objects()) - before < 100  # each collection of garbage visits all of them
+
+
+def test_held_out_poses_are_checked_in_time_proportional_to_their_number() -> None:
+    def make(n: int) -> Callable[[], object]:
+        is_held_out = np.arange(n) % 2 == 0
+        readings = np.zeros((n, 3))
+        return lambda: Measurements("linear-delta", readings, (), is_held_out=is_held_out)
+
+    assert measure_growth(make, 3000) < MOST
 
 
 def test_labels_of_blocks_are_listed_in_time_proportional_to_the_poses() -> None:

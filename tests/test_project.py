@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules of the repository: sizes, layers, licenses, and consistent documentation."""
 
+import ast
 import re
 import subprocess
 import tomllib
@@ -136,3 +137,16 @@ def test_every_path_in_the_architecture_page_exists(root: Path) -> None:
     places += (root / "src" / "loopcal" / "diagnose",)
     missing = {name for name in named if not any((place / name).exists() for place in places)}
     assert missing <= {"measure/kinds/GROUP/", "evidence/NAME.py", "findings/catalog/SUBJECT.toml"}
+
+
+def test_no_repr_formats_a_number_itself(root) -> None:
+    """`round_to_digits` does, and has words for what is not finite."""
+    formatted = [
+        f"{path.name}:{node.lineno}"
+        for path in (root / "src").rglob("*.py")
+        for function in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(function, ast.FunctionDef) and function.name == "__repr__"
+        for node in ast.walk(function)
+        if isinstance(node, ast.FormattedValue) and node.format_spec is not None
+    ]
+    assert formatted == []

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from loopcal.io.core import file_reference
-from loopcal.io.core.limits import LIMITS
+from loopcal.io.core.limits import COUNT_LIMITS, LIMITS
 from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
@@ -175,6 +175,12 @@ def format_limits() -> str:
     return format_table(("limit", "at most", "applies to"), rows)
 
 
+def format_counts() -> str:
+    """Return the largest numbers that options take."""
+    rows = [(str(limit), limit.meaning) for limit in COUNT_LIMITS]
+    return format_table(("at most", "option"), rows)
+
+
 def format_profile() -> str:
     """Return the keys of a profile of exports."""
     return format_record(ProfileRecord)
@@ -220,6 +226,7 @@ BLOCKS = {
     "limits": format_limits,
     "study": format_study,
     "scores": format_scores,
+    "counts": format_counts,
 }
 EXPORT_BLOCKS = {"profile": format_profile, "profile-columns": format_profile_columns} | {
     name: format_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -209,13 +210,15 @@ __all__ = ["__version__", *sorted(_PACKAGES)]  # noqa: PLE0604  # pyright: ignor
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name when it is first used; functions check their arguments' types."""
     if name not in _PACKAGES:
         raise AttributeError(
             f"module 'loopcal' has no attribute {name!r}; public names are "
             f"{', '.join(sorted(_PACKAGES))}"
         )
     value = getattr(import_module(_PACKAGES[name]), name)
+    if isinstance(value, FunctionType):
+        value = import_module("loopcal.argument_types").check_call(value)
     globals()[name] = value
     return value
 

@@ -1,9 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m loopcal`: the command line."""
+"""`loopcal` and `python -m loopcal`: the command line.
+
+Ctrl-C is answered in a sentence from the first import on; the command line itself answers it once
+it runs.
+"""
 
 import sys
 
-from loopcal.cli import main
+
+def run() -> int:
+    """Run the command line and return its exit code."""
+    try:
+        from loopcal.cli import main
+
+        return main()
+    except KeyboardInterrupt:  # before the first command ran, or after the last word was printed
+        sys.stderr.write("loopcal: stopped.\n")
+        return 1
+
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run())

@@ -31,6 +31,8 @@ _NOT_PLAIN = re.compile(
 
 def find_not_plain(text: str, allowed: str = "") -> str | None:
     """Return the first character of a text that is not plain, except for those `allowed`."""
+    if _NOT_PLAIN.search(text) is None:  # as nearly all names, of which a table has many
+        return None
     return next((m[0] for m in _NOT_PLAIN.finditer(text) if m[0] not in allowed), None)
 
 

@@ -11,6 +11,7 @@ from loopcal.apply import validate
 from loopcal.diagnose import check_held_out_rows
 from loopcal.estimate import identify
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
+from loopcal.findings import Quantity, report_finding
 from loopcal.io import load_robot, load_run, save_run
 from loopcal.measure import (
     Gaussian,
@@ -130,6 +131,12 @@ def test_wrong_held_out_row_is_named_with_its_explanation(
     assert without.count == right.after.statistics("position").count - 3
     kept = right.after.position[np.asarray(right.after["position"].rows) != WRONG]
     assert without.rms == pytest.approx(np.sqrt(np.mean(kept**2)), rel=1e-9)
+
+
+def test_where_no_other_pose_is_left_no_error_without_them_is_stated():
+    values = {"poses": ("1", "2"), "quantity": "length", "error": Quantity(0.2, "mm")}
+    finding = report_finding("validation.blunders-dominate", without=None, **values)
+    assert "without them no length error is left. Correct" in str(finding)
 
 
 def test_interchanged_poses_are_both_named(fit, split):

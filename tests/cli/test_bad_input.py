@@ -453,3 +453,10 @@ a,0,0,0,0,0,0,0,0,0,0,0
 """
     message = run_refused("calibrate hexapod-42 data.csv -o run", data_csv=data)
     assert "no column 'z', which the kind 'pose' measures; add it with its unit" in message
+
+
+@pytest.mark.parametrize("words", ["simulate 3-prs -o d.csv", "identifiability 3-prs"])
+def test_a_pose_out_of_reach_is_named_as_in_its_file(run_refused, words) -> None:
+    poses = "pose,z [mm],phi [deg],theta [deg]\nlow,700,0,10\nsteep,700,90,80\n"
+    said = run_refused(f"{words} --poses p.csv", p_csv=poses)
+    assert "does not reach commanded pose 'steep' at p.csv:3 (1 of 2 fail)" in said

@@ -10,7 +10,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.cli.exchange_commands import WRITTEN_FORMATS
-from loopcal.io import load_robot, load_run
+from loopcal.io import load_robot, load_run, save_robot
 from loopcal.io.runs.run_verdict import FAILED_ROBOT, ROBOT, find_run_failure
 from loopcal.mechanism import inverse
 
@@ -103,6 +103,40 @@ def test_failed_calibration_computes_no_commands(folder, capsys) -> None:
     assert run("compensate failed targets.csv -o new.csv --force") == 2
     assert run("compensate good targets.csv -o good.csv") == 0
     assert Path("new.csv").read_text() == Path("good.csv").read_text()
+
+
+def test_robot_file_states_elsewhere_that_its_calibration_failed(folder, capsys) -> None:
+    shutil.copy(Path("failed", FAILED_ROBOT), "taken.yaml")
+    for words in ("compensate taken.yaml targets.csv", "export taken.yaml -o taken.json"):
+        assert run(words) == 2
+        out, err = capsys.readouterr()
+        assert "taken.yaml is not calibrated. Its numbers must not be used on a machine" in err
+        assert "pose" not in out
+        assert run(f"{words} --force") == 2
+        capsys.readouterr()
+
+
+def test_forced_name_does_not_hide_that_the_calibration_failed(folder, capsys) -> None:
+    words = "calibrate linear-delta data.csv --hold-out 0.25 --limit-position 0.1um -o failed"
+    assert run(f"{words} --force") == 2
+    assert Path("failed", ROBOT).read_text().startswith("# NOT CALIBRATED")
+    shutil.copy(Path("failed", ROBOT), "taken.yaml")
+    assert run("compensate taken.yaml targets.csv") == 2
+
+
+def test_good_calibration_of_a_failed_robot_file_is_good(folder, capsys) -> None:
+    shutil.copy(Path("failed", FAILED_ROBOT), "start.yaml")
+    words = "calibrate start.yaml data.csv --hold-out 0.25 --limit-position 1mm -o again"
+    assert run(words) == 0
+    assert "NOT CALIBRATED" not in Path("again", ROBOT).read_text()
+    assert run("compensate again/robot.yaml targets.csv") == 0
+    assert run(f"{words.replace('1mm', '0.1um')} --force") == 2
+    assert Path("again", ROBOT).read_text().count("NOT CALIBRATED") == 1
+    robot = load_robot("start.yaml")
+    save_robot(robot, "same.yaml")
+    assert Path("same.yaml").read_text().startswith("# NOT CALIBRATED")
+    save_robot(robot.with_values(robot.values + 1e-6), "other.yaml")
+    assert "NOT CALIBRATED" not in Path("other.yaml").read_text()
 
 
 CONVERGED = {"status": "converged"}

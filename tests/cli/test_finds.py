@@ -3,6 +3,8 @@
 smallest that shows it, and the right answer.
 """
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,6 +30,7 @@ ROWS = "a,180,190,200,1,2,3\nb,190,180,200,1,2,3\n"
 SEPARATION = DATA.format(kind="separation", noise="{separation: 20 um}", columns="separation [mm]")
 TRIPOD = Path(find_robot_file("3-prs")).read_text("utf-8")
 SAMPLES = Path(__file__).parents[2] / "examples" / "cable-robot" / "samples.json"
+EXPORTS = Path(__file__).parents[2] / "examples" / "exports"
 LIMB = '<link name="{0}"/><joint name="{0}j" type="revolute"><parent link="base"/><child link="{0}"/><axis xyz="0 0 1"/></joint>'  # noqa: E501
 URDF = f"<robot name='r'><link name='base'/>{LIMB.format('a')}{LIMB.format('b')}</robot>"
 
@@ -76,6 +79,37 @@ FINDS = {
         {"robot.yaml": "a: &x 1\nb: &x 2\nc: *x\n"},
         says="robot.yaml: this file states no format",
     ),
+    "key that is a mapping in a list": Find(
+        "check robot.yaml",
+        {"robot.yaml": "format: 1\nlegs:\n  ? [{a: 1}]\n  : 2\n"},
+        says="robot.yaml:3: a key is a list or a mapping; write text there",
+    ),
+    "key that an alias makes a mapping": Find(
+        "check robot.yaml",
+        {"robot.yaml": "format: 1\nlegs: &x {a: 1}\n*x : 2\n"},
+        says="robot.yaml:3: a key is a list or a mapping; write text there",
+    ),
+    "format of times that states the year twice": Find(
+        "import e.txt --profile p.yaml -o new.csv",
+        {
+            "e.txt": (EXPORTS / "six-dof.txt").read_text("utf-8"),
+            "p.yaml": (EXPORTS / "six-dof.yaml").read_text("utf-8").replace("%S'", "%S %Y'"),
+        },
+        says="p.yaml:14: '%Y-%m-%d %H:%M:%S %Y' is not a format of times",
+    ),
+    "target whose name no column can have": Find(
+        "import e.txt --profile p.yaml -o new.csv",
+        {
+            "e.txt": (EXPORTS / "tracker-points.txt").read_text("utf-8"),
+            "p.yaml": (EXPORTS / "tracker-points.yaml").read_text("utf-8").replace("SMR2", "'[a'"),
+        },
+        says="the measured value '[a.x' cannot be the name of a column",
+    ),
+    "measurements with such a target": Find(
+        "identifiability linear-delta d.csv",
+        {"d.csv": "# targets: [a, 'b]']\n" + POSITION + ROWS},
+        says="the measured value 'b].x' cannot be the name of a column",
+    ),
     "closure of a list": Find(
         "import r.urdf --closures c.yaml -o new.yaml",
         {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
@@ -105,8 +139,67 @@ def test_link_to_itself_is_refused_as_an_output(tmp_path, monkeypatch, capsys) -
     assert "loop.yaml: this symbolic link has no target" in capsys.readouterr().err
 
 
+def test_paths_that_the_system_does_not_open_state_what_is_wrong(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    (tmp_path / "file").touch()
+    for path, says in (
+        ("a", "a symbolic link that leads back to itself"),
+        ("b/c.csv", "a symbolic link that leads back to itself"),
+        ("file/c.csv", "part of its path is a file"),
+    ):
+        for command in (["compensate", "linear-delta", path], ["validate", "linear-delta", path]):
+            assert main(command) == 1
+            printed = " ".join(capsys.readouterr().err.split())
+            assert says in printed
+            assert "permissions" not in printed
+
+
+def test_document_of_a_result_folder_is_never_replaced_by_a_file(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    document, other = tmp_path / "run/result.json", tmp_path / "run/mine.json"
+    document.write_text('{"files": {"robot.yaml": "0123"}}', "utf-8")
+    other.write_text('{"files": 3}', "utf-8")
+    before = document.read_bytes()
+    words = ["export", "five-bar", "--format", "json", "--force", "-o"]
+    assert main([*words, str(document)]) == 1
+    assert "whose folder cannot be read without it" in capsys.readouterr().err
+    assert document.read_bytes() == before
+    assert main([*words, str(other)]) == 0
+
+
 def test_motions_that_move_nothing_fit_nothing() -> None:
     robot = load_robot("linear-delta")
     fit = fit_frames(robot, robot.home[None], np.zeros((12, 2)))
     assert fit.solution.shape == (12, 6)
     assert not fit(np.ones((1, 6, 3))).any()
+
+
+INTERRUPTED = """
+import sys
+
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "click":
+            raise KeyboardInterrupt
+
+
+sys.meta_path.insert(0, Interrupt())
+from loopcal.__main__ import run
+
+sys.exit(run())
+"""
+
+
+def test_ctrl_c_while_modules_are_imported_prints_no_traceback() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "loopcal: stopped.\n")

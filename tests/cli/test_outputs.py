@@ -109,7 +109,7 @@ def test_pipe_is_not_replaced_even_with_force(run) -> None:
             assert (code, out, err.count("\n")) == (1, "", 1)
             assert "this is a device or a pipe" in err
         with pytest.raises(FileError, match="this is a device or a pipe"):
-            write_text(name, "text")
+            write_text(name, "text", Path.read_text)
     assert stat.S_ISFIFO(os.lstat("pipe").st_mode)
     assert Path("link").is_symlink()
     assert not Path("new.yaml").exists()
@@ -182,3 +182,23 @@ def test_template_of_a_kind_that_compares_poses_explains_their_names(run) -> Non
     assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
     assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0
     assert "compares two poses" not in Path("n.csv").read_text()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a working folder cannot be removed there")
+def test_removed_working_folder_is_named_as_the_cause(run, tmp_path, monkeypatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    robot = find_robot_file("five-bar")
+    for words in ("plan {} -o plan", "simulate {} -o data.csv", "check {}"):
+        code, _, said = run(words.format(robot))
+        assert code == 1
+        assert said == "loopcal: the working folder was removed; change to a folder that exists.\n"
+
+
+def test_folder_that_refuses_new_entries_is_not_called_missing(run) -> None:
+    if not Path("/proc/self").is_dir():
+        pytest.skip("needs a file system in which nothing can be made")
+    code, _, said = run("simulate five-bar -o /proc/data.csv")
+    assert code == 1
+    assert "does not exist" not in said

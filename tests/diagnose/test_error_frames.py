@@ -10,7 +10,13 @@ from scipy.optimize import least_squares
 
 from loopcal import geometry, load_robot, pose_uncertainty
 from loopcal.diagnose import estimate_calibration_gain, frame_motions
-from loopcal.diagnose.error_frames import fit_unfixed_frames
+from loopcal.diagnose.error_frames import (
+    choose_error_frame,
+    fit_unfixed_frames,
+    list_unfixed_motions,
+    refer_errors,
+    reference_poses,
+)
 from loopcal.diagnose.frame_motions import probe_readings
 from loopcal.errors import EstimationError
 from loopcal.estimate import FitOptions, Identification, LeastSquares, identify, prior_from
@@ -325,3 +331,14 @@ def test_plan_without_tolerances_refuses_unbounded_errors_in_the_base_frame():
         assert np.isfinite(result.errors.after.position)
     with pytest.raises(EstimationError, match="must be one of 'fitted', 'base', 'relative'"):
         plan(robot, instrument(), options=replace(options, frame="tracker"))
+
+
+@pytest.mark.parametrize("frame", ["fitted", "base"])
+def test_frames_that_are_determined_need_no_reference_poses(frame):
+    posterior = calibrated()[1].posterior
+    motions = list_unfixed_motions(posterior)
+    assert motions.shape == (12, 0)
+    chosen = choose_error_frame(posterior, frame)
+    fitted = refer_errors(posterior.robot, frame, reference_poses(posterior), motions)
+    for name, value in vars(fitted).items():
+        np.testing.assert_array_equal(getattr(chosen, name), value, err_msg=name)

@@ -15,6 +15,7 @@ from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.fit_checks.held_out_rows import Predictor
 from loopcal.diagnose.residuals.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.residuals.residual_patterns import LEVEL
+from loopcal.diagnose.tool_errors import locate_measured_poses
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
@@ -133,7 +134,8 @@ def test_a_wrong_sigma_is_no_discrepancy():
 
 def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:
     """Return a fit whose uncertainty includes the slow errors that its residuals show."""
-    slow = find_slow_errors(fit, data, linearize_fit(fit, data))
+    measured = locate_measured_poses(fit, data)
+    slow = find_slow_errors(fit, data, linearize_fit(fit, data), measured.T)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 

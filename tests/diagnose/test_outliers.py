@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from loopcal.diagnose import examine_fit, find_outliers
+from loopcal.diagnose import OutlierCheck, examine_fit, find_outliers
+from loopcal.diagnose.fit_checks import outlier_search, outliers
 from loopcal.diagnose.fit_checks.influence import Influence, compute_influence
 from loopcal.diagnose.fit_checks.outlier_search import (
     PartialFit,
+    fit_without,
     list_suspected_in_turn,
     search_suspects,
 )
@@ -36,6 +38,7 @@ from loopcal.measure import (
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import decompose
 from tests import zoo
+from tests.diagnose.correlated_data import LENGTH, ROBOTS, measure
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise, tracker
 
 SIGMA = np.array([5 * URAD] * 3 + [UM] * 3)  # of `tracker`
@@ -359,13 +362,58 @@ def move_row(data, row, amount):
     return replace(data, observations=(replace(rows, measured=measured),))
 
 
+def delta_data(n: int, wrong: dict[int, float]) -> tuple[Mechanism, Measurements]:
+    """Return a linear delta and n measured positions, rows of which are wrong by lengths [m]."""
+    errors = np.random.default_rng(2).standard_normal((n, 3))
+    for row, length in wrong.items():
+        errors[row] += length / LENGTH
+    return ROBOTS["linear-delta"], measure("linear-delta", "component", errors, 4)[1]
+
+
+def list_result(result: OutlierCheck) -> tuple[object, ...]:
+    return result.outliers, result.ambiguous, result.scale
+
+
+@pytest.mark.parametrize("wrong", [{3: 1e-3, 50: -2e-4}, {7: 3e-5, 8: 4e-5}, {}])
+@pytest.mark.parametrize("n", [6, 9, 20, 80])
+def test_far_outliers_are_compared_with_others_only_where_these_may_replace_them(
+    monkeypatch, n, wrong
+):
+    robot, data = delta_data(n, {row % n: length for row, length in wrong.items()})
+    fit = identify(robot, data)
+    result = find_outliers(fit, data)
+    monkeypatch.setattr(outlier_search, "_may_have_rivals", lambda *_: True)
+    assert list_result(find_outliers(fit, data)) == list_result(result)
+
+
+def test_the_number_of_fits_does_not_grow_with_the_gross_errors(monkeypatch):
+    counts = []
+    for wrong in (2, 12):
+        robot, data = delta_data(300, {20 * i: 1e-3 for i in range(wrong)})
+        fit, calls = identify(robot, data), []
+        counted = lambda *a, calls=calls, **k: calls.append(1) or fit_without(*a, **k)  # noqa: E731
+        monkeypatch.setattr(outliers, "fit_without", counted)
+        assert len(find_outliers(fit, data).outliers) == wrong
+        counts.append(len(calls))
+    assert max(counts) <= 6
+
+
+def test_an_even_choice_of_blocks_is_enough_to_begin_the_search(monkeypatch):
+    robot, data = delta_data(200, {5: 1e-3, 70: -3e-4, 133: 2e-3})
+    fit = identify(robot, data)
+    whole = find_outliers(fit, data)
+    monkeypatch.setattr(outliers, "MOST_ROBUST", 60)
+    assert set(find_outliers(fit, data).names) == set(whole.names) == {"6", "71", "134"}
+
+
 def test_outlier_search_reports_progress():
     robot, data = probe_delta(12, {4: 1e-3})
     reports: list[tuple[int, int, str]] = []
     find_outliers(
         identify(robot, data, LeastSquares()), data, progress=lambda *report: reports.append(report)
     )
-    assert {what for _, _, what in reports} == {
+    assert {what.partition(",")[0] for _, _, what in reports} == {
+        "fitting",
         "searching for outliers",
         "comparing suspected poses with others",
     }

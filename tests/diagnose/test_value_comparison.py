@@ -221,6 +221,19 @@ def test_answer_in_another_frame_has_the_same_chi_square_and_names_the_frame(fit
     assert part.agrees
 
 
+def test_machine_that_reaches_nothing_is_compared_by_the_poses_of_the_stored_one() -> None:
+    """A fit that failed may leave values with which no loop closes."""
+    (robot, data, _), *_ = simulate_printers(count=1)
+    fit = identify(robot, data, LeastSquares())
+    values = robot.values.copy()
+    values[robot.parameters.index("radius")] = 5.0
+    lost = robot.with_values(values)
+    failed = replace(fit, robot=lost)
+    assert compare_with_values(failed, robot).degrees
+    with pytest.raises(EstimationError, match="no tested pose is reached by both"):
+        compare_with_values(failed, lost)
+
+
 def test_values_that_cannot_be_compared_are_refused_or_undecided(tmp_path) -> None:
     (robot, data, truth), *_ = simulate_printers(count=1)
     fit = identify(robot, data, LeastSquares())

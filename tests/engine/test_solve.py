@@ -53,6 +53,21 @@ def test_every_row_converges_to_closed_loops(engine, case):
     assert state.iterations.max() <= 10
 
 
+def test_rows_that_come_near_their_goal_end_there(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    ended = engine.solve(case.program, case.e, case.q, case.home, goal=state)
+    assert_array_equal(ended.status, engine.NEAR_GOAL)
+    assert (ended.iterations < state.iterations).all()
+
+
+def test_rows_with_a_goal_elsewhere_end_as_without_it(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    away = np.array(state.T)
+    away[..., :3, 3] += case.program.size
+    ended = engine.solve(case.program, case.e, case.q, case.home, goal=replace(state, T=away))
+    assert_same(ended, state)
+
+
 def test_actuated_joints_have_the_given_values(engine, case):
     state = engine.solve(case.program, case.e, case.q, case.home)
     assert_array_equal(actuated_joint_values(case.program, state), case.q)

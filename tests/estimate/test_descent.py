@@ -275,3 +275,18 @@ def test_noise_free_rows_converge_to_rounding_error():
 def test_every_descent_status_has_a_finding():
     endings = [status for status in DescentStatus if status is not DescentStatus.RUNNING]
     assert len({report_status(status, 3).code for status in endings}) == len(endings)
+
+
+def test_each_step_of_a_fit_is_reported_with_its_sum_of_squares():
+    reports: list[str] = []
+    y = noisy_exponentials(1)
+    fit = descend(
+        make_problem(Exponentials(y)),
+        np.zeros((1, 3)),
+        LeastSquares(),
+        progress=lambda done, total, what: reports.append(f"{done} of {total}: {what}"),
+    )
+    costs = fit.cost_history[1 : len(reports), 0]
+    steps = [f"0 of 1: fitting, step {i + 1}: sum of squares {c:.4g}" for i, c in enumerate(costs)]
+    assert reports == ["0 of 1: fitting", *steps]
+    assert len(steps) > 2

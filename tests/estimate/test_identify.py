@@ -101,6 +101,14 @@ def test_closure_start_is_not_used_for_incomplete_poses():
     }
 
 
+def test_closure_start_that_runs_out_of_steps_says_so(data):
+    exhausted = "poses.closure-start-exhausted"
+    few = FitOptions(begin="closure", control=StepControl(iterations=0))
+    assert exhausted in list_codes(identify(hexapod(), data, MAP(), options=few).findings)
+    enough = FitOptions(begin="closure")
+    assert exhausted not in list_codes(identify(hexapod(), data, MAP(), options=enough).findings)
+
+
 def test_closure_start_is_not_used_for_uncertain_readings(data):
     few = replace(data.take(np.arange(10)), reading_sigma=2e-6)
     fit = identify(hexapod(), few, MAP(), options=FitOptions(begin="closure"))

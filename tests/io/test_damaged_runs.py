@@ -333,3 +333,13 @@ def test_a_run_of_format_1_is_still_read(run) -> None:
     (run / "arrays.npz").write_bytes(pack())
     with pytest.raises(FileError, match="the array 'nominal' is missing"):
         lc.load_run(run)
+
+
+@pytest.mark.parametrize("key", ["parameters", "local"])
+@pytest.mark.parametrize("change", [{"unit": "um"}, {"unit": "?"}, {"estimate": 1.0}])
+def test_an_estimate_that_the_arrays_do_not_hold_is_refused(run, key, change) -> None:
+    result = json.loads((run / "result.json").read_text())
+    result["fit"][key][1] |= change
+    write_result(run, result)
+    with pytest.raises(FileError, match=rf"'fit\.{key}' states .* but the array '.*' of the run"):
+        lc.load_run(run)

@@ -47,7 +47,7 @@ def test_disk_that_becomes_full_keeps_the_old_folder_and_file(tmp_path, size) ->
 
     def write_file() -> str:
         try:
-            write_text(file, "new" * 3000)
+            write_text(file, "new" * 3000, Path.read_text)
         except FileError as error:
             return str(error)
         return ""
@@ -103,6 +103,32 @@ def test_read_only_folder_is_refused_before_work_begins() -> None:
             said = f"{path}: cannot write here (permission denied); choose another folder"
             assert run_in_copy(refuse) == (0, said)
         assert list(place.iterdir()) == []
+    finally:
+        shutil.rmtree(place)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs permissions to drop")
+def test_folder_that_cannot_be_removed_is_not_replaced() -> None:
+    place = Path(tempfile.mkdtemp())
+    path = place / "run"
+    try:
+        os.chown(place, NOBODY, NOBODY)
+
+        def replace_protected() -> list[str]:
+            said = [write(path, 1, force=True), write(path, 1, force=True)]
+            for entry in (path, *path.iterdir()):
+                os.chown(entry, NOBODY, NOBODY)
+            os.setuid(NOBODY)
+            path.chmod(0o555)
+            said.append(write(path, 2, force=True))
+            path.chmod(0o755)
+            return [*said, write(path, 3, force=True)]
+
+        code, said = run_in_copy(replace_protected)
+        assert code == 0
+        assert (said[0], said[1], said[3]) == ("", "", "")
+        assert said[2].startswith(f"{path}: this folder is protected against changes")
+        assert (read_value(path), [p.name for p in place.iterdir()]) == (3, ["run"])
     finally:
         shutil.rmtree(place)
 

@@ -147,8 +147,9 @@ class RunFolder(RuleBasedStateMachine):
     @precondition(lambda self: self.value is not None)
     @rule()
     def write_a_study_in_its_place(self) -> None:
+        document = {"made_by": {}, "paper": ""}
         with pytest.raises(FileError, match="something other than a study"):
-            write_result_folder(self.path, STUDY, {"made_by": {}, "paper": ""}, {}, force=True)
+            write_result_folder(self.path, STUDY, document, {}, os.listdir, force=True)
 
     @invariant()
     def everything_is_there(self) -> None:

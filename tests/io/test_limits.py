@@ -8,9 +8,13 @@ import time
 import zipfile
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
+from loopcal.cli import main
+from loopcal.cli.entry_point import SECTIONS, find_command
+from loopcal.cli.options import Count
 from loopcal.errors import FileError, MechanismError
 from loopcal.io.core import limits
 from loopcal.io.core.csv_table import read_table
@@ -129,7 +133,7 @@ def test_json_is_limited_in_nesting(tmp_path) -> None:
         path = write(tmp_path, "[" * depth + "]" * depth)
         with pytest.raises(FileError, match=r"more than 200 levels|has 300 levels"):
             read_json(path, "file of samples", "correct it")
-    with pytest.raises(FileError, match=r"not valid JSON .*digits"):
+    with pytest.raises(FileError, match=r"not valid JSON .*1111… is too large"):
         read_json(write(tmp_path, "1" * 5000), "file of samples", "correct it")
     assert read_json(write(tmp_path, json.dumps({"a": [[1]]})), "file", "") == {"a": [[1]]}
 
@@ -220,3 +224,64 @@ def test_documentation_lists_every_limit() -> None:
     assert set(stated) == set(limits.LIMITS)
     for limit in limits.LIMITS:
         assert f"| {limit.of} | {limit} |" in page
+
+
+COUNTED = {
+    "DRAWN_POSES": ("simulate linear-delta -o d.csv --draw", "identifiability linear-delta --draw"),
+    "PLANNED_POSES": ("plan linear-delta -o p --poses", "plan linear-delta -o p --hold-out"),
+    "CANDIDATES": ("plan linear-delta -o p --candidates",),
+    "GROUPS": ("plan linear-delta -o p --groups",),
+    "POINTS": ("plan linear-delta -o p --points",),
+    "RESAMPLES": ("bootstrap linear-delta d.csv --count",),
+    "DRAWS": ("sample linear-delta d.csv --count",),
+    "TRIALS": ("reproduce hexapod-42 --trials",),
+    "STEPS": ("compensate run t.csv --steps", "per-leg hexapod-42 d.csv --steps"),
+}
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_counts_on_the_command_line_are_refused_above_their_limit(name, capsys) -> None:
+    """No file of these command lines exists: the number is refused before any is read."""
+    limit = getattr(limits, name)
+    for words in COUNTED[name]:
+        for number in (limit.most + 1, 10**9 + 1, 10**400):
+            assert main([*words.split(), str(number)]) == 1
+            assert f"the limit is {limit}; give a smaller number" in capsys.readouterr().err
+
+
+def test_every_option_that_takes_a_count_has_a_limit() -> None:
+    """A seed and the number of directions of --keep take no memory."""
+    unlimited, used = set(), set()
+    for name in (name for members in SECTIONS.values() for name in members):
+        command = find_command(name)
+        assert command is not None, name
+        for option in command.params:
+            if isinstance(option.type, Count):
+                used.add(option.type.limit)
+            elif isinstance(option.type, click.types.IntParamType):
+                unlimited.add(option.name)
+    assert unlimited == {"seed", "keep"}
+    assert used == set(COUNTED)
+    assert [getattr(limits, name) for name in COUNTED] == list(limits.COUNT_LIMITS)
+
+
+def test_lines_without_rows_are_counted_before_they_are_split(tmp_path) -> None:
+    path = write(tmp_path, "q1 [mm]\n1\n" + "\n" * 5_000_000, "data.csv")
+    with pytest.raises(FileError, match=r"has 5,000,002 lines, but the limit is 5,000,000"):
+        read_table(path)
+
+
+def test_values_of_json_text_are_counted_before_they_are_parsed(tmp_path) -> None:
+    path = write(tmp_path, "[" + "[]," * 6_000_000 + "1]", "result.json")
+    begin = time.process_time()
+    with pytest.raises(FileError, match=r"has 12,000,001 values, but the limit is 10,000,000"):
+        read_json(path, "run result", "repeat", limits.TABLE_SIZE)
+    assert time.process_time() - begin < 2.0
+
+
+@pytest.mark.parametrize("digits", ["9" * 350, "0x" + "f" * 300, "0x" + "f" * 9000, "9" * 9000])
+def test_numbers_of_many_digits_are_refused_without_their_digits(tmp_path, digits) -> None:
+    for text in (f"length: {digits}\n", f"length: [{digits}]\n"):
+        with pytest.raises(FileError, match=r"too large|thousands of digits") as refusal:
+            read_yaml(write(tmp_path, f"format: 1\n{text}"), "robot file")
+        assert len(str(refusal.value)) < 200 + len(str(tmp_path))

@@ -41,6 +41,43 @@ def test_impossible_identified_values_are_refused_at_their_line(name: str, tmp_p
         assert caught.value.line == len(path.read_text().splitlines())
 
 
+NAMED = """
+parameters:
+  - {name: rod, length: 300, tolerance: {sd: 0.1}, maps: [
+      {limb: west, element: rod, axis: length}, {limb: east, element: rod, axis: length}]}
+  - {name: base, length: 75, positive: true, maps: [{limb: west, element: motor, axis: x}]}
+  - {name: shift, length: 0.02, maps: [{limb: east, element: motor, axis: y}]}
+"""
+
+
+@pytest.mark.parametrize("value", ["0", "-300", "-1.0e-9", "1.0e300", "-1.0e160"])
+@pytest.mark.parametrize("name", ["rod", "base"])
+def test_a_named_length_has_no_value_that_no_machine_has(tmp_path: Path, name, value) -> None:
+    row = f"  - {{name: {name}, value: {value}, unit: mm}}"
+    path = write_table(tmp_path, "five-bar", row)
+    path.write_text(path.read_text().replace("\nidentified:", f"{NAMED}identified:"))
+    with pytest.raises(
+        FileError, match=rf"{name} is .*must be greater|'{name}': .* is beyond"
+    ) as caught:
+        load_robot(path)
+    assert caught.value.line == len(path.read_text().splitlines())
+
+
+def test_a_named_length_that_is_not_declared_positive_may_change_its_sign(tmp_path: Path) -> None:
+    path = write_table(tmp_path, "five-bar", "  - {name: shift, value: -0.05, unit: mm}")
+    path.write_text(path.read_text().replace("\nidentified:", f"{NAMED}identified:"))
+    assert load_robot(path).values[-1] == pytest.approx(-5e-5)
+
+
+@pytest.mark.parametrize("nominal", ["0", "-75"])
+def test_a_length_that_is_declared_positive_needs_such_a_value(tmp_path: Path, nominal) -> None:
+    path = write_table(tmp_path, "five-bar", "  []")
+    text = NAMED.replace("length: 75", f"length: {nominal}")
+    path.write_text(path.read_text().replace("\nidentified:", f"{text}identified:"))
+    with pytest.raises(LoopcalError, match="parameter 'base' is stated to be positive"):
+        load_robot(path)
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_values_of_tolerated_machines_are_accepted(name: str, tmp_path: Path) -> None:
     robot = load_robot(name)
@@ -55,6 +92,15 @@ def test_values_whose_loops_do_not_close_are_refused_together(tmp_path: Path) ->
     rows = "  - {name: arm1.length, value: 900, unit: mm}\n  - {name: radius, value: 5, unit: m}"
     with pytest.raises(FileError, match=r"cannot be closed at the readings of home.* radius = 5"):
         load_robot(write_table(tmp_path, "linear-delta", rows))
+
+
+def test_a_gap_that_could_not_be_computed_is_not_named(tmp_path: Path) -> None:
+    """With this radius the first step of the forward solution is not finite."""
+    with pytest.raises(FileError, match="readings of home; the value farthest") as caught:
+        load_robot(
+            write_table(tmp_path, "linear-delta", "  - {name: radius, value: 500, unit: mm}")
+        )
+    assert "unknown" not in str(caught.value)
 
 
 def test_file_of_a_failed_calibration_keeps_its_values(tmp_path: Path) -> None:

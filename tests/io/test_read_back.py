@@ -150,42 +150,6 @@ def test_any_labels_are_read_back_or_refused(labels, session, group, is_held_out
         assert set(read.observations[0].session.tolist()) == {normalize("NFC", session)}
 
 
-BROKEN = {
-    "robot": ("loopcal.io.robot.robot_file.format_robot", "simulate five-bar -o d.csv --truth F"),
-    "data": ("loopcal.io.data.measurement_writer.format_measurements", "simulate five-bar -o F"),
-    "new": ("loopcal.io.robot.derived_robots.format_new_robot", "new five-bar -o F"),
-    "template": (
-        "loopcal.io.data.measurement_writer.format_template",
-        "new five-bar -o r.yaml --measurements F",
-    ),
-    "compensation": (
-        "loopcal.io.runs.compensation_file.format_compensation",
-        "compensate five-bar targets.csv -o F",
-    ),
-}
-
-
-@pytest.mark.parametrize("what", BROKEN)
-def test_a_file_that_cannot_be_read_back_replaces_nothing(
-    tmp_path, monkeypatch, capsys, what: str
-) -> None:
-    """A defect of a writer is simulated: the first character of each line is lost."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "targets.csv").write_text("pose,x [mm],y [mm]\na,0,330\n")
-    (tmp_path / "F").write_text("old")
-    function, command = BROKEN[what]
-    module, name = function.rsplit(".", 1)
-    format_text = getattr(__import__(module, fromlist=[name]), name)
-
-    def damage(*arguments, **settings):
-        return "".join(line[1:] + "\n" for line in format_text(*arguments, **settings).splitlines())
-
-    monkeypatch.setattr(function, damage)
-    assert main([*command.split(), "--force"]) == 1
-    assert (tmp_path / "F").read_text() == "old"
-    capsys.readouterr()
-
-
 @pytest.mark.parametrize("name", ["klipper", "marlin", "reprap", "json", "csv"])
 def test_a_controller_file_is_read_back(tmp_path, monkeypatch, capsys, name: str) -> None:
     """A defect is simulated: digits of the written numbers are lost."""

@@ -53,12 +53,12 @@ def test_permissions_are_those_of_the_old_file_or_of_any_new_file(tmp_path) -> N
     plain, folder = tmp_path / "plain", tmp_path / "folder"
     plain.touch()
     folder.mkdir()
-    write_text(tmp_path / "new", "text")
+    write_text(tmp_path / "new", "text", Path.read_text)
     assert (tmp_path / "new").stat().st_mode == plain.stat().st_mode
     plain.chmod(0o640)
-    write_text(plain, "text")
+    write_text(plain, "text", Path.read_text)
     assert stat.S_IMODE(plain.stat().st_mode) == 0o640
-    with replace_folder(tmp_path / "run"):
+    with replace_folder(tmp_path / "run", os.listdir):
         pass
     assert (tmp_path / "run").stat().st_mode == folder.stat().st_mode
 
@@ -74,14 +74,14 @@ def test_temporary_names_are_unpredictable_and_created_exclusively(tmp_path, mon
     planted = tmp_path / f".loopcal-new-{'0' * 16}-a"
     planted.symlink_to(victim)
     with pytest.raises(FileError, match="file exists"):
-        write_text(tmp_path / "a", "overwritten")
+        write_text(tmp_path / "a", "overwritten", Path.read_text)
     assert (victim.read_text(), planted.is_symlink()) == ("mine", True)
 
 
 def test_names_that_file_systems_allow_are_written(tmp_path) -> None:
     for name in ("n" * 250 + ".csv", "é" * 125 + ".csv", os.fsdecode(b"\xff\xfe.csv"), "a\nb"):
-        write_text(tmp_path / name, "text")
+        write_text(tmp_path / name, "text", Path.read_text)
         assert (tmp_path / name).read_text() == "text"
-        with replace_folder(tmp_path / f"{name[1:]}"):
+        with replace_folder(tmp_path / f"{name[1:]}", os.listdir):
             pass
         assert (tmp_path / name[1:]).is_dir()

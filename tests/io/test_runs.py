@@ -56,8 +56,8 @@ def test_changed_or_missing_measurements_of_a_run_are_refused(tmp_path, calibrat
     [
         (lc.load_robot, "path of a robot file .* not Mechanism"),
         (lambda robot: lc.load_measurements(robot, robot), "path of a measurement file"),
-        (lambda _: lc.load_measurements(DATA, "hexapod-42"), r"robot is needed .*load_robot"),  # type: ignore
-        (lambda _: lc.save_robot("robot.yaml", "out.yaml"), r"robot is needed .*load_robot"),  # type: ignore
+        (lambda _: lc.load_measurements(DATA, "hexapod-42"), r"robot: got the text .*load_robot"),  # type: ignore
+        (lambda _: lc.save_robot("robot.yaml", "out.yaml"), r"robot: got the text .*load_robot"),  # type: ignore
         (lc.load_run, "path of a run folder"),
     ],
 )

@@ -8,7 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
+from loopcal.cli import main
 from loopcal.errors import DataError
+from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.measure import (
     BlockStream,
     Component,
@@ -165,7 +167,7 @@ def test_machine_that_cannot_reach_its_poses_has_nan_in_its_trial_only(robot):
     assert np.isfinite(trials.measured[0][0]).all()
     assert np.isnan(trials.measured[0][1]).all()
     assert trials.trial(1).n_rows == 0
-    with pytest.raises(DataError, match="the true machine does not reach pose 1"):
+    with pytest.raises(DataError, match="the true machine does not reach pose '1'"):
         simulate(robot.with_values(values[1]), COMMANDED, TRACKER, seed=1)
 
 
@@ -272,3 +274,25 @@ def test_uniform_errors_have_the_tolerances_as_standard_deviations(robot):
     scaled = (truth - table.nominal)[:, table.free] / table.tolerance[table.free]
     assert np.abs(scaled).max() <= np.sqrt(3.0)
     assert_allclose(scaled.std(axis=0), 1.0, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("row", "sentence"),
+    [
+        ("b,0,499.9", "does not reach commanded pose 'b' at poses.csv:4 (1 of 2 fail)"),
+        ("b,-100,330", "pose 'b' (poses.csv:4): left reads 157"),
+    ],
+)
+def test_a_refused_pose_is_called_as_in_its_file(
+    tmp_path, monkeypatch, capsys, row: str, sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    robot = find_robot_file("five-bar").read_text("utf-8").replace("[45, 225]", "[45, 150]")
+    (tmp_path / "robot.yaml").write_text(robot)
+    (tmp_path / "poses.csv").write_text(f"## remark\npose,x [mm],y [mm]\na,0,330\n{row}\n")
+    poses = "robot.yaml --poses poses.csv --kind position"
+    commands = [f"simulate {poses} -o data.csv"]
+    commands += [f"identifiability {poses}"] if "commanded" in sentence else []
+    for command in commands:
+        assert main(command.split()) == 1
+        assert sentence in " ".join(capsys.readouterr().err.split())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.apply.compensation import Reach, compensate
+from loopcal.engine import NEAR_GOAL
 from loopcal.errors import DataError
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import solve_commanded_poses
@@ -28,6 +29,14 @@ from loopcal.mechanism import (
 )
 from loopcal.mechanism.analysis.modes import find_working_modes
 from loopcal.mechanism.analysis.singularities import trace_singularity
+from loopcal.mechanism.batch_kinematics import (
+    clear_sign,
+    compute_readings,
+    forward_trials,
+    inverse_trials,
+)
+from loopcal.mechanism.solution_modes import SAME_POSE, find_other_modes
+from loopcal.mechanism.states import select_poses
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -66,6 +75,33 @@ def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide:
     assert gap[other].min(initial=np.inf) > 1e-6
     for row in np.flatnonzero(other)[:3]:
         assert "in another mode than the start" in str(result.explain(int(row)))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
+    robot = load_cached_robot(name)
+    values, n = robot.values[None], 100
+    for wide in (*WIDE, 1.5, 4.0):
+        target = draw_targets(robot, wide, n)[None]
+        state = inverse_trials(robot, values, target)
+        rows = np.flatnonzero(state.status[0] == Status.CONVERGED)
+        closed = select_poses(state, rows)
+        home = select_poses(robot.home_state, np.zeros(len(rows), dtype=np.int64))
+        back = forward(robot, compute_readings(robot, values, closed)[0])
+        gap = measure_gap(robot, back, closed.T[0])
+        has_sign = clear_sign(robot, closed).closure_sign == clear_sign(robot, home).closure_sign
+        expected = has_sign[0] & (gap <= SAME_POSE)
+        np.testing.assert_array_equal(find_other_modes(robot, closed, home), ~expected)
+
+
+def test_the_test_of_modes_ends_long_before_rounding() -> None:
+    robot = load_cached_robot("hexapod-42")
+    values = robot.values[None]
+    state = inverse_trials(robot, values, draw_targets(robot, 1.0)[None])
+    q = compute_readings(robot, values, state)
+    ended = forward_trials(robot, values, q, goal=state)
+    assert (ended.status == NEAR_GOAL).mean() > 0.95
+    assert ended.iterations.mean() < 0.6 * forward_trials(robot, values, q).iterations.mean()
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -120,6 +156,21 @@ def test_target_in_another_mode_is_refused_with_the_reason() -> None:
     assert "from home its readings lead to another pose" in str(result)
     with pytest.raises(DataError, match=r"'far' .* in another mode than the start"):
         solve_commanded_poses(robot, targets[other[:1]], ("far",))
+
+
+@pytest.mark.parametrize("mode", ["readings", "commands"])
+def test_targets_that_no_pose_was_found_for_have_no_numbers(mode) -> None:
+    robot = load_cached_robot("3-prs")
+    true = robot.with_values(robot.values + 1e-5)
+    result = compensate(true, draw_targets(robot, 6.0), mode)
+    lost = np.array([r in (Reach.OTHER_MODE, Reach.UNREACHABLE) for r in result.reach])
+    assert lost.any()
+    assert result.usable.any()
+    names = ["readings", "reached", "remaining", "not_compensable"]
+    for name in [*names, "commands"] if mode == "commands" else names:
+        values = getattr(result, name).reshape(ROWS, -1)
+        assert np.isnan(values[lost]).all(), name
+        assert np.isfinite(values[~lost]).all(), name
 
 
 def test_two_turns_of_the_cranks_reach_what_the_first_solution_does_not() -> None:

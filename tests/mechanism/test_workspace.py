@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import MechanismError
 from loopcal.io import load_robot
-from loopcal.mechanism import build, forward, sample_workspace
+from loopcal.mechanism import build, forward, inverse, sample_workspace
 from tests import zoo
 
 
@@ -55,7 +55,7 @@ def test_sampled_tilt_is_uniform_over_the_spherical_cap():
 def test_empty_workspace_is_refused_with_its_reason():
     robot = build_delta_with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
     with pytest.raises(
-        MechanismError, match=r"is empty: 0 of .* reason: the loops cannot be closed"
+        MechanismError, match=r"almost nothing .*: 0 of .* reason: the loops cannot be closed"
     ):
         sample_workspace(robot, 10)
     robot = build_delta_with_workspace(
@@ -63,6 +63,19 @@ def test_empty_workspace_is_refused_with_its_reason():
     )
     with pytest.raises(MechanismError, match="reason: stroke of q1 is exceeded"):
         sample_workspace(robot, 10)
+
+
+@pytest.mark.parametrize(("share", "is_refused"), [(0.005, True), (0.02, False)])
+def test_workspace_is_refused_where_drawing_from_it_would_take_long(share, is_refused):
+    """A stroke cuts the reachable share of z down; 1 % of the positions must be left."""
+    ranges = {"x": (-1e-9, 1e-9), "y": (-1e-9, 1e-9), "z": (0.0, 0.1)}
+    q = inverse(build_delta_with_workspace(ranges), [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1 * share]]).q
+    robot = build_delta_with_workspace(ranges, stroke=(float(q.min()), float(q.max())))
+    if not is_refused:
+        assert sample_workspace(robot, 200).reachable_share == pytest.approx(share, rel=0.3)
+        return
+    with pytest.raises(MechanismError, match=r"of 2000 .*at least 1% are needed"):
+        sample_workspace(robot, 200)
 
 
 def test_missing_range_of_a_workspace_is_named():

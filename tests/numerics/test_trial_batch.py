@@ -36,3 +36,9 @@ def test_trials_are_selected_by_indices_or_by_a_mask(trials, expected) -> None:
 def test_put_with_a_mask_replaces_the_marked_trials() -> None:
     changed = VALUES.put(np.array([False, True]), Values(np.array([5.0])))
     assert changed.array.tolist() == [1.0, 5.0]
+
+
+def test_all_trials_are_not_copied() -> None:
+    assert VALUES.take(np.array([0, 1])) is VALUES
+    assert VALUES.take(np.array([True, True])) is VALUES
+    assert VALUES.take(np.array([1, 0])) is not VALUES

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import check_limits, inverse, trace_singularity
+from loopcal.planning import path
 from loopcal.planning.candidates import draw_candidates
 from loopcal.planning.constraints import Constraints, build_checker
 from loopcal.planning.path import (
@@ -112,7 +113,8 @@ def test_order_of_few_poses_is_within_5_percent_of_the_shortest():
         points = rng.random((8, 2))
         cost = np.linalg.norm(points[1:, None] - points[None, 1:], axis=2)
         begin = np.linalg.norm(points[1:] - points[0], axis=1)
-        order, length = find_short_order(cost, begin)
+        order, length, is_converged = find_short_order(cost, begin)
+        assert is_converged
         orders = np.array(list(permutations(range(7))))
         lengths = begin[orders[:, 0]] + cost[orders[:, :-1], orders[:, 1:]].sum(axis=1)
         assert sorted(order) == list(range(7))
@@ -120,6 +122,20 @@ def test_order_of_few_poses_is_within_5_percent_of_the_shortest():
         assert length <= 1.05 * lengths.min()  # 2-opt from seven beginnings: within a few per cent
         exact += length <= lengths.min() * (1 + 1e-12)
     assert exact >= 7
+
+
+def test_order_that_runs_out_of_steps_is_marked_and_passes_home(hexapod, monkeypatch):
+    poses = hexapod.coordinates[:12]
+    whole = order_poses(hexapod.checker, poses)
+    assert whole.is_converged
+    monkeypatch.setattr(path, "REVERSALS", 0)
+    assert not order_poses(hexapod.checker, poses).is_converged
+    monkeypatch.undo()
+    monkeypatch.setattr(path, "ORDERS", 0)
+    unchecked = order_poses(hexapod.checker, poses)  # no path between two poses was checked
+    assert not unchecked.is_converged
+    assert unchecked.via_home[1:].all()
+    assert unchecked.length > whole.length
 
 
 def test_ordered_poses_have_allowed_paths_or_pass_the_home_pose(hexapod):

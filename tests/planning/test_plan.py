@@ -15,8 +15,8 @@ from loopcal.estimate.information import collect_information
 from loopcal.io import load_robot
 from loopcal.measure import KINDS, sample_truth
 from loopcal.mechanism import sample_workspace
-from loopcal.planning import PlanOptions
-from loopcal.planning.design import D, PriorInformation, choose_design, factor_design
+from loopcal.planning import PlanOptions, path
+from loopcal.planning.design import D, PriorInformation, choose_design, exchange, factor_design
 from loopcal.planning.pose_groups import (
     MOST,
     combine_prior,
@@ -162,6 +162,20 @@ def test_same_seed_gives_the_same_plan():
     one, other = (plan_poses(small) for _ in range(2))
     np.testing.assert_array_equal(one.poses.coordinates, other.poses.coordinates)
     np.testing.assert_array_equal(one.poses.held_out, other.poses.held_out)
+
+
+def test_searches_that_run_out_of_steps_say_so(monkeypatch):
+    exhausted = {"plan.exchanges-exhausted", "plan.order-exhausted"}
+
+    def plan() -> set[str]:
+        options = PlanOptions(n_poses=12, hold_out=0, n_candidates=30)
+        result = lc.plan(load_robot("five-bar"), build_instrument("position"), options=options)
+        return {finding.code for finding in result.findings}
+
+    assert not plan() & exhausted
+    monkeypatch.setattr(exchange, "EXCHANGES", 0)
+    monkeypatch.setattr(path, "REVERSALS", 0)
+    assert plan() >= exhausted
 
 
 def test_number_and_criterion_arguments_equal_the_options():

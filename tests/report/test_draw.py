@@ -11,6 +11,7 @@ import loopcal
 from loopcal.cli import main
 from loopcal.errors import FileError
 from loopcal.io import load_robot
+from loopcal.io.core.text_file import write_bytes
 from loopcal.mechanism import inverse
 from loopcal.report import draw, save_picture
 from tests import zoo
@@ -62,4 +63,4 @@ def test_unknown_picture_format_is_refused(tmp_path):
     with pytest.raises(
         FileError, match=r"written as '.docx'; use a name that ends in .png, .svg, .pdf"
     ):
-        save_picture(tmp_path / "robot.docx", zoo.hexapod())
+        save_picture(tmp_path / "robot.docx", zoo.hexapod(), write=write_bytes)

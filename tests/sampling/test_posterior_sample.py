@@ -13,6 +13,7 @@ from loopcal.estimate import FitOptions, identify, prior_from
 from loopcal.measure import fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import ParameterTable
+from loopcal.sampling import posterior_sample
 from loopcal.sampling.weighted_sample import (
     effective_size,
     fit_tail_shape,
@@ -185,6 +186,17 @@ def test_few_effective_draws_are_reported_before_any_interval() -> None:
     robot, data = delta(60.0, 20 * MM, poses=3)
     sample = lc.sample_posterior(identify(robot, data, lc.MAP()), data, 300)
     assert [finding.code for finding in sample.findings] == ["sampling.few-effective-draws"]
+
+
+def test_proposals_that_run_out_are_reported(monkeypatch) -> None:
+    """Tests above assert that nothing is said where the first proposals are good."""
+    robot, data = delta(1.0, 60 * UM, 8)
+    fit = identify(robot, data, lc.MAP())
+    monkeypatch.setattr(posterior_sample, "ROUNDS", 1)
+    monkeypatch.setattr(posterior_sample, "GOOD_SHARE", 1.01)
+    findings = lc.sample_posterior(fit, data, 1000).findings
+    assert findings[-1].code == "sampling.proposals-exhausted"
+    assert "ended after 1 rounds" in str(findings[-1])
 
 
 def test_wider_stated_intervals_are_reported() -> None:

@@ -199,6 +199,7 @@ def test_progress_is_reported_from_zero_to_the_total(robot, data):
     assert steps[0][0] == 0
     assert steps[-1][0] == steps[-1][1]
     assert all(what for *_, what in steps)
+    assert any("fitting, step 1: sum of squares " in what for *_, what in steps)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,8 @@ SHARES = ("0", "0.1", "0.25", "0.5", "0.9", "0.95", "1e-6", "1e-11")
 WRONG_SHARES = ("1", "-0.0", "-1", "nan", "inf", "1e160", "1e-320", "", "x", "50%", "0,5", "1e400")
 AMOUNTS = ("0.1", "1", "20", "200", "0.001", "1.5")
 WRONG_AMOUNTS = ("0", "-1", "nan", "inf", "1e308", "1e-320", "1e160", "", "1e400", "-0")
+TIMES = ("0.001s", "0.2s", "30s", "10min", "2h")
+WRONG_TIMES = ("", "0s", "-1s", "30", "nans", "1e9s", "1 day", "999999999h", "0.0000000001s", "٣s")
 UNITS = ("mm", "um", "m", "deg", "urad", "rad", "in", "mrad")
 WRONG_UNITS = ("", "kg", "mm2", " mm", "MM", "°", "mmm", "\x1b[31m")
 PATHS = (
@@ -49,7 +51,8 @@ PATHS = (
 def list_commands() -> dict[str, click.Command]:
     """Return every command by name, but for groups, whose commands take minutes."""
     names = [name for members in entry_point.MODULES.values() for name in members]
-    commands = {name: entry_point.find_command(name) for name in names}
+    group, context = entry_point.commands, click.Context(entry_point.commands)
+    commands = {name: group.get_command(context, name) for name in names}
     return {
         name: command
         for name, command in commands.items()
@@ -92,6 +95,8 @@ def draw_value(
         return rng.choice(WRONG_SHARES if is_wrong else SHARES)
     if isinstance(kind, click.Path):
         return rng.choice(PATHS) if is_wrong else rng.choice([*files, *PATHS[:3]])
+    if kind.name == "duration":
+        return rng.choice(WRONG_TIMES if is_wrong else TIMES)
     if hasattr(kind, "dimension") or kind.name == "quantity":
         return _draw_quantity(rng, is_wrong)
     return _draw_text(rng, words, is_wrong)

@@ -2,7 +2,7 @@
 """Small files of other programs, of machines with our own dimensions."""
 
 REPRAP = """\
-; config-override.g
+; config-override.g, ours ; keep
 M665 L269.100:269.200:269.300 R130.250 H301.500 B140.0 X-0.100 Y0.200 Z0.000
 G28 ; home
 M666 X0.500 Y-0.200 Z-0.300 A0.00 B0.00

@@ -14,11 +14,14 @@ from itertools import pairwise
 from pathlib import Path
 from xml.parsers import expat
 
+from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from tools.fuzz.cases import Case
 from tools.fuzz.execution import CPU_LIMIT, Outcome
 
 NOT_FINITE = re.compile(r"(?<![\w./+-])[-+]?(?:nan|inf|infinity)(?![\w./-])", re.IGNORECASE)
 JSON_NOT_FINITE = re.compile(r"(?<![\w\"])(?:NaN|-?Infinity)(?![\w\"])")
+NO_NUMBER = re.compile(r"\b(?:unknown|unbounded|nan|-?inf) (?:[mun]?m|deg|[mu]?rad)\b")
+"""A unit behind what is no number: a sentence that was written for numbers."""
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 FRAME = re.compile(r'File "[^"]*?/src/(loopcal/[^"]+)", line (\d+), in (\S+)')
 MESSAGE = re.compile(r"^(loopcal: |Hint: |  )")
@@ -57,7 +60,9 @@ def _list_finds(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
         return finds
     finds += _judge_message(case, outcome)
     finds += (
-        _judge_files(case, outcome) if outcome.code == 1 else _judge_success(case, outcome, folder)
+        _judge_files(case, outcome)
+        if outcome.code in (1, TIME_LIMIT_CODE)
+        else _judge_success(case, outcome, folder)
     )
     return finds
 
@@ -71,7 +76,8 @@ def find_place(text: str) -> str:
 def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
     """Check the exit code, and that messages are plain lines of the known form."""
     command = case.words[0] if case.words else ""
-    if outcome.code not in (0, 1, 2):
+    allowed = (0, 1, 2, TIME_LIMIT_CODE) if "--time-limit" in case.words else (0, 1, 2)
+    if outcome.code not in allowed:
         yield Find("exit-code", f"{command} {outcome.code}", outcome.err[-300:])
     lines = outcome.err.splitlines()
     if outcome.code and not lines:
@@ -89,6 +95,8 @@ def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
         yield Find("memory", command, outcome.err[-300:])
     if not is_usage and re.search(r"defect of loopcal|Traceback", outcome.err):
         yield Find("defect-message", normalize(outcome.err), outcome.err[-600:])
+    if match := NO_NUMBER.search(outcome.err + outcome.out):
+        yield Find("no-number", f"{command}: {match[0]}", (outcome.err + outcome.out)[-600:])
     if re.search(r"object at 0x|<class '|NoneType|dtype\(|array\(\[", outcome.err):
         yield Find("internal-words", f"{command}: {normalize(outcome.err)}", outcome.err[-600:])
 

@@ -31,6 +31,7 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import coverage_factor
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
 from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.typing import FloatArray
@@ -94,8 +95,8 @@ class PoseUncertainty:
             for values in (self.position, self.orientation)
         )
         return (
-            f"PoseUncertainty of {len(self.T)} poses: at most {1e3 * position:.3g} mm and "
-            f"{1e3 * angle:.3g} mrad (rms); {self.frame}"
+            f"PoseUncertainty of {len(self.T)} poses: at most {round_to_digits(1e3 * position)} mm "
+            f"and {round_to_digits(1e3 * angle)} mrad (rms); {self.frame}"
         )
 
     @property

@@ -10,7 +10,7 @@ part remains, and the result states it for each target. See docs/theory/accuracy
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal, get_args
 
@@ -26,7 +26,15 @@ from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import Mechanism, Solution, check_limits, forward, inverse, read_coordinates
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    Status,
+    check_limits,
+    forward,
+    inverse,
+    read_coordinates,
+)
 from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
 from loopcal.units import Dimension
 
@@ -83,7 +91,8 @@ class Compensation:
     robot, controller : the identified geometry, and that of the controller.
     readings : (n, a) of the actuators at the targets [m, rad].
     commands : (n, c) coordinates to command [m, rad]; None where readings are set.
-    wanted, reached : (n, 4, 4) platform poses; `reached` is that of the identified robot.
+    wanted, reached : (n, 4, 4) platform poses; `reached` is that of the identified robot. All these
+        but `wanted` are NaN in rows that no pose near the target was found for.
     before : (n, 6) error of the machine when its controller commands the target unchanged, in the
         frame of `uncertainty` where that is "fitted", else in the base frame.
     remaining : (n, 6) error after compensation; it and `before` are NaN where the machine does not
@@ -207,30 +216,33 @@ def compensate(
     else:
         result = _shift_commands(robot, old, uncorrected, best, steps, count)
     count.begin(TASK)
-    final, distances = result.final, result.distances
-    not_compensable = geometry.pose_difference(best.T, wanted)
+    distances, not_compensable = result.distances, geometry.pose_difference(best.T, wanted)
+    findings = _report_targets(robot, uncorrected, best, result, not_compensable)
+    is_solved = uncorrected.converged & best.converged & result.final.converged
+    final, commands = _blank_rows(result, ~is_solved)
     names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
     uncertainty = None
     if posterior is not None:
         uncertainty = pose_uncertainty(posterior, final, frame=frame, origin_name=names[0])
         before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
-    has_before, has_after = uncorrected.converged & unchanged.converged, final.converged
+    has_before = uncorrected.converged & unchanged.converged
+    after = geometry.pose_difference(result.final.T, wanted)
     return Compensation(
         mode=mode,
         labels=names,
         robot=robot,
         controller=old,
         readings=final.q,
-        commands=result.commands,
+        commands=commands,
         wanted=wanted,
         reached=final.T,
         before=np.where(has_before[:, None], before, np.nan),
-        remaining=np.where(has_after[:, None], geometry.pose_difference(final.T, wanted), np.nan),
-        not_compensable=not_compensable,
+        remaining=np.where(is_solved[:, None], after, np.nan),
+        not_compensable=np.where(is_solved[:, None], not_compensable, np.nan),
         residual_position=np.linalg.norm(distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(distances[..., :3], axis=2),
         uncertainty=uncertainty,
-        findings=_report_targets(robot, uncorrected, best, result, not_compensable),
+        findings=findings,
     )
 
 
@@ -304,6 +316,22 @@ def _shift_commands(
         final = forward(robot, solution.q)
         distances.append(geometry.pose_difference(final.T, best.T))
     return _Iteration(final, commands, np.stack(distances))
+
+
+def _blank_rows(result: _Iteration, rows: BoolArray) -> tuple[Solution, FloatArray | None]:
+    """Return the final solution and the commands (n, c) without numbers in rows (n,).
+
+    There the iteration ends at some pose, but it is not the one nearest to the target.
+    """
+    final, commands = result.final, result.commands
+    status = np.where(rows, np.maximum(final.status, Status.UNREACHABLE), final.status)
+    blank = replace(
+        final,
+        status=status.astype(np.int8),
+        q=np.where(rows[:, None], np.nan, final.q),
+        T=np.where(rows[:, None, None], np.nan, final.T),
+    )
+    return blank, None if commands is None else np.where(rows[:, None], np.nan, commands)
 
 
 def _report_targets(

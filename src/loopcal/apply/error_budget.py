@@ -38,6 +38,7 @@ from loopcal.estimate.inference.covariance_parts import TOLERANCES
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Solution, sample_workspace
 from loopcal.typing import FloatArray
@@ -139,8 +140,8 @@ class ErrorBudget:
         """Return the number of sources and the errors."""
         position, orientation = 1e3 * self.position.rms, 1e3 * self.orientation.rms
         return (
-            f"<ErrorBudget: {len(self.lines)} sources; position {position:.3g} mm, orientation "
-            f"{orientation:.3g} mrad>"
+            f"<ErrorBudget: {len(self.lines)} sources; position {round_to_digits(position)} mm, "
+            f"orientation {round_to_digits(orientation)} mrad>"
         )
 
     def to_dict(self) -> dict[str, Any]:

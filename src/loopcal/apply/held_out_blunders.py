@@ -53,8 +53,10 @@ def report_blunders(
     for quantity, unit in errors.units.items():
         all_rows, without = (e.after.statistics(quantity).rms for e in (errors, rest))
         if all_rows > DOMINATES * without or np.isnan(without):
-            quantities = (Quantity(x / unit.factor_to_si, unit.symbol) for x in (all_rows, without))
-            error, left = quantities
+            error, left = (
+                None if np.isnan(x) else Quantity(x / unit.factor_to_si, unit.symbol)
+                for x in (all_rows, without)
+            )
             dominated = report_finding(
                 "validation.blunders-dominate",
                 poses=poses,

@@ -15,6 +15,7 @@ from loopcal.cli.fit_options import fit_options, make_fit_options
 from loopcal.cli.hints import hint_for
 from loopcal.cli.options import (
     FILE,
+    Count,
     data_argument,
     data_options,
     file_option,
@@ -296,7 +297,7 @@ def validate(
     help="Robot file with the geometry of the controller; by default the nominal robot.",
 )
 @click.option(
-    "--steps", type=click.IntRange(min=1), default=3, help="Iterations of the shifted commands."
+    "--steps", type=Count("STEPS", 1), default=3, help="Iterations of the shifted commands."
 )
 @frame_option()
 @force_option("the output file", ", and compute also from a calibration that failed")

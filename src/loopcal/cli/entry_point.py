@@ -165,6 +165,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with record_outputs() as list_outputs:
         try:
             command = find_running_command(words)
+            if command is not None and not _has_working_folder():
+                return _refuse("the working folder was removed; change to a folder that exists.")
             code = commands.main(words, prog_name="loopcal", standalone_mode=False)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
@@ -173,6 +175,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         except (Exception, KeyboardInterrupt, TimeLimitError) as error:  # noqa: BLE001 the one place for all of them
             return _report(error, command, words, list_outputs())
+
+
+def _has_working_folder() -> bool:
+    """Return whether the working folder exists, from which relative paths count."""
+    try:
+        return Path.cwd().is_dir()
+    except OSError:
+        return False
 
 
 def _report(
@@ -201,8 +211,8 @@ def _report(
         case click.ClickException():
             return _refuse(error.format_message())
         case LoopcalError():
-            found = error.args[0] if error.args else None
-            is_useless = isinstance(found, Finding) and is_hint_useless(found)
+            finding = error.args[0] if error.args else None
+            is_useless = isinstance(finding, Finding) and is_hint_useless(finding)
             return _refuse(str(error), None if is_useless else find_hint(error.code, command))
         case KeyboardInterrupt() | click.exceptions.Abort():
             return _refuse(f"stopped before the end{unwritten}.")

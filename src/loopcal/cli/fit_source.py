@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from loopcal.cli import terminal
 from loopcal.cli.fit_options import make_fit_options
 from loopcal.cli.options import (
     leave_out_held_out,
@@ -52,7 +53,10 @@ def load_fit(
         robot = load_robot(source)
         flags = take_flags(options)
         measurements = leave_out_held_out(read_checked_measurements(data, robot, **flags))
-        fit = identify(robot, measurements, options=make_fit_options(options))
+        with terminal.ProgressBar() as progress:
+            fit = identify(
+                robot, measurements, options=make_fit_options(options), progress=progress
+            )
     else:
         if Path(source).is_file():
             raise LoopcalError(
@@ -76,12 +80,14 @@ def _repeat_run(run: Run) -> tuple[Identification, Measurements]:
     data, _ = run.load_measurements(**{name: bool(stated.get(name)) for name in accepted})
     options = make_fit_options(stated) if stated else FitOptions()
     options = replace(options, excluded_poses=())  # they are no longer among the measurements
-    if stated.get("prior") is not None:
-        earlier = load_run(stated["prior"]).load_posterior()
-        limb = stated.get("free_limb")
-        fit = recalibrate(run.initial_robot, data, earlier, limb, options=options)[0]
-    else:
-        fit = identify(run.initial_robot, data, options=options)
+    with terminal.ProgressBar() as progress:
+        if stated.get("prior") is not None:
+            earlier, limb = load_run(stated["prior"]).load_posterior(), stated.get("free_limb")
+            fit, _ = recalibrate(
+                run.initial_robot, data, earlier, limb, options=options, progress=progress
+            )
+        else:
+            fit = identify(run.initial_robot, data, options=options, progress=progress)
     estimate, sd = run.arrays["estimate"], fit.standard_deviations
     if len(estimate) != len(sd):
         raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))

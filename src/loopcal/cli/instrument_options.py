@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from loopcal.cli.options import POSITIVE_ANGLE, POSITIVE_LENGTH, add_options
+from loopcal.cli.options import POSITIVE_ANGLE, POSITIVE_LENGTH, Count, add_options
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.units import parse_quantity
 
@@ -81,7 +81,7 @@ unknown_options = add_options(
 
 draw_option = click.option(
     "--draw",
-    type=click.IntRange(min=1),
+    type=Count("DRAWN_POSES", 1),
     default=40,
     metavar="N",
     help="Number of poses to draw evenly from the workspace where no poses are given.",

@@ -123,7 +123,6 @@ def identifiability(
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.data.measurement_file import load_poses
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.numerics.decomposition import RANK_TOLERANCE
     from loopcal.report.identifiability_view import view_identifiability
@@ -144,10 +143,12 @@ def identifiability(
     else:
         if poses is None:
             drawn = [_name_drawn_poses(machine, draw, seed)]
-        targets = draw if poses is None else load_poses(poses, machine)
-        sigma = parse_reading_sigma(sigma_reading, machine)
         measurements = predict_noise_free(
-            machine, make_instrument(options), targets, reading_sigma=sigma, seed=seed
+            machine,
+            make_instrument(options),
+            **_read_poses(poses, draw, machine),
+            reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            seed=seed,
         )
     tolerance = rank_tolerance or RANK_TOLERANCE
     accuracy = None if useful is None else (useful, useful_angle)
@@ -192,6 +193,18 @@ def _refuse_beside_data(poses: Path | None) -> None:
             "DATA states the noise of its readings (reading_noise); leave out --sigma-reading, or "
             "DATA"
         )
+
+
+def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, Any]:
+    """Return the arguments `poses`, `labels` and `places` of a simulation: those of a file, or how
+    many to draw.
+    """
+    from loopcal.io.data.measurement_file import load_pose_names, load_poses
+
+    if poses is None:
+        return {"poses": draw}
+    labels, places = load_pose_names(poses)
+    return {"poses": load_poses(poses, robot), "labels": labels, "places": places}
 
 
 def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
@@ -261,7 +274,6 @@ def simulate(
     """  # noqa: D301
     from loopcal.io import load_robot, save_measurements, save_robot
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.data.measurement_file import load_pose_names, load_poses
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.workflow.simulated_measurements import simulate_measurements
 
@@ -273,10 +285,9 @@ def simulate(
         result = simulate_measurements(
             machine,
             make_instrument(options),
-            draw if poses is None else load_poses(poses, machine),
+            **_read_poses(poses, draw, machine),
             draw_errors=draw_errors,
             reading_sigma=parse_reading_sigma(sigma_reading, machine),
-            labels=None if poses is None else load_pose_names(poses),
             seed=seed,
         )
         drawn = _name_drawn_poses(machine, draw, seed)

@@ -81,6 +81,29 @@ class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  
         return number
 
 
+class Count(click.IntRange):
+    """A whole number on the command line, up to a limit of `loopcal.io.core.limits`.
+
+    Parameters
+    ----------
+    limit : name of the `CountLimit`, which is not imported before the option is used.
+    least : smallest number that is allowed; None where the command itself refuses small ones.
+    """
+
+    def __init__(self, limit: str, least: int | None = None) -> None:
+        super().__init__(min=least)
+        self.limit = limit
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the number, or fail with what is allowed."""
+        from loopcal.io.core import limits
+
+        number, limit = super().convert(value, param, ctx), getattr(limits, self.limit)
+        if number > limit.most:
+            self.fail(f"the limit is {limit}; give a smaller number.", param, ctx)
+        return int(number)
+
+
 LENGTH = Quantity(Dimension.LENGTH)
 ANGLE = Quantity(Dimension.ANGLE)
 POSITIVE_LENGTH = Quantity(Dimension.LENGTH, is_positive=True)

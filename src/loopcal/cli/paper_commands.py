@@ -12,6 +12,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.options import (
+    Count,
     data_argument,
     data_options,
     file_option,
@@ -47,7 +48,7 @@ HEADING = 18
 @click.option("--seed", default=0, metavar="N", help="Seed of all random choices.")
 @click.option(
     "--trials",
-    type=int,
+    type=Count("TRIALS"),
     metavar="N",
     help="Number of trials behind each statistical number.  [default: 50]",
 )
@@ -105,9 +106,7 @@ def reproduce(
 @click.command()
 @robot_argument
 @data_argument("DATA...")
-@click.option(
-    "--steps", type=click.IntRange(min=1), default=3, metavar="N", help="Gauss-Newton steps."
-)
+@click.option("--steps", type=Count("STEPS", 1), default=3, metavar="N", help="Gauss-Newton steps.")
 @file_option("-o", "--output", help="Robot file to write, with the identified values.")
 @force_option("the output file")
 @data_options

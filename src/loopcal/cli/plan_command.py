@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from loopcal.cli.instrument_options import (
     unknown_options,
 )
 from loopcal.cli.options import (
+    Count,
     data_option,
     file_option,
     flag_option,
@@ -65,7 +65,10 @@ EXCLUDED_BY_PLANE_LINE = {
 @robot_argument
 @file_option("-o", "--output", help="Folder to make.", required=True)
 @click.option(
-    "--poses", type=int, metavar="N", help="Number of poses for the calibration.  [default: 40]"
+    "--poses",
+    type=Count("PLANNED_POSES"),
+    metavar="N",
+    help="Number of poses for the calibration.  [default: 40]",
 )
 @click.option(
     "--accuracy",
@@ -81,7 +84,7 @@ EXCLUDED_BY_PLANE_LINE = {
 )
 @click.option(
     "--hold-out",
-    type=int,
+    type=Count("PLANNED_POSES"),
     metavar="N",
     help="Number of further poses for validation, drawn evenly.  "
     "[default: one for four, at least 5]",
@@ -91,13 +94,13 @@ EXCLUDED_BY_PLANE_LINE = {
 @instrument_options
 @click.option(
     "--groups",
-    type=int,
+    type=Count("GROUPS"),
     metavar="N",
     help="With --measure plane-line: number of planes with a line.  [default: 10]",
 )
 @click.option(
     "--points",
-    type=int,
+    type=Count("POINTS"),
     metavar="N",
     help="With --measure plane-line: number of points on each.  [default: 8]",
 )
@@ -110,7 +113,7 @@ EXCLUDED_BY_PLANE_LINE = {
 @constraint_options
 @click.option(
     "--candidates",
-    type=click.IntRange(min=10),
+    type=Count("CANDIDATES", 10),
     default=1000,
     metavar="N",
     help="Number of candidate poses to draw.",
@@ -282,7 +285,7 @@ def _write_plan(
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
-    from loopcal.report.pictures import render_figure
+    from loopcal.report.pictures import check_picture, render_figure
     from loopcal.report.plan_drawing import draw_curve, draw_plan
 
     figures = {}
@@ -295,8 +298,13 @@ def _write_plan(
         texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
     document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
     pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
-    read_back = functools.partial(check_written_plan, plan=result)
-    write_plan_folder(output, texts, document, pictures, force, read_back)
+
+    def read_back(folder: Path) -> None:
+        check_written_plan(folder, result)
+        for name in pictures:
+            check_picture(folder / name)
+
+    write_plan_folder(output, texts, document, pictures, read_back, force)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files
 

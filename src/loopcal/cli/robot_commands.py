@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ def new(
     with restore_on_failure((output, measurements)):
         write_robot(output, robot_text, robot)
         if measurements is not None:
-            write_text(measurements, template, lambda file: check_written_template(file, robot))
+            check = partial(check_written_template, robot=robot, instrument=instrument)
+            write_text(measurements, template, check)
     if as_json:
         terminal.print_json({"robot": output, "measurements": measurements})
         return

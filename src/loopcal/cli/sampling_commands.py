@@ -12,6 +12,7 @@ from loopcal.cli import terminal
 from loopcal.cli.fit_options import fit_options
 from loopcal.cli.fit_source import load_fit
 from loopcal.cli.options import (
+    Count,
     add_options,
     data_argument,
     data_options,
@@ -22,8 +23,14 @@ from loopcal.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from loopcal.estimate import Identification
+    from loopcal.report.text_page import Block
+    from loopcal.sampling.block_bootstrap import Bootstrap
+    from loopcal.sampling.intervals import Intervals
+    from loopcal.sampling.posterior_sample import PosteriorSample
     from loopcal.typing import FloatArray
+
+MOST_DIGITS = 10
+"""Digits of a number of poses; a longer text is no unit of resampling."""
 
 level_option = click.option(
     "--level",
@@ -46,12 +53,12 @@ draw_options = add_options(
 )
 """Decorator of a command that draws."""
 
-COUNT = click.IntRange(min=2)
-
 
 @click.command()
 @source_options
-@click.option("--count", type=COUNT, default=1000, metavar="N", help="Number of resamples.")
+@click.option(
+    "--count", type=Count("RESAMPLES", 2), default=1000, metavar="N", help="Number of resamples."
+)
 @click.option(
     "--scheme",
     type=click.Choice(("wild", "pairs", "normal")),
@@ -107,23 +114,21 @@ def bootstrap(
 
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
-    chosen = int(unit) if unit is not None and unit.isdecimal() else unit
+    is_number = unit is not None and unit.isdecimal() and len(unit) < MOST_DIGITS
+    chosen = int(unit) if unit is not None and is_number else unit
     with terminal.ProgressBar() as progress:
         result = resample(
             fit, measurements, count, scheme=scheme, unit=chosen, seed=seed, progress=progress
         )
-    _write_draws(output, fit, result.draws)
     intervals = result.intervals(level, kind)
-    if as_json:
-        terminal.print_json({**result.to_dict(), "intervals": intervals.to_dict()})
-        return
-    terminal.print_page([*view_bootstrap(result, intervals), *_written(output)])
+    page = view_bootstrap(result, intervals)
+    _finish(result, intervals, page, output, as_json)
 
 
 @click.command()
 @source_options
 @click.option(
-    "--count", type=click.IntRange(min=100), default=4000, metavar="N", help="Number of draws."
+    "--count", type=Count("DRAWS", 100), default=4000, metavar="N", help="Number of draws."
 )
 @draw_options
 @fit_options
@@ -159,12 +164,9 @@ def sample(
     fit, measurements = load_fit(source, data, options)
     with terminal.ProgressBar() as progress:
         result = sample_posterior(fit, measurements, count, seed=seed, progress=progress)
-    _write_draws(output, fit, result.draws, result.weight)
     intervals = result.intervals(level)
-    if as_json:
-        terminal.print_json({**result.to_dict(), "intervals": intervals.to_dict()})
-        return
-    terminal.print_page([*view_posterior(result, intervals), *_written(output)])
+    page = view_posterior(result, intervals)
+    _finish(result, intervals, page, output, as_json, result.weight)
 
 
 @click.command()
@@ -233,18 +235,22 @@ def _refuse_output(output: Path | None, source: str, data: tuple[Path, ...], for
     refuse_outputs((output,), (Path(source), *data), force)
 
 
-def _write_draws(
-    output: Path | None, fit: Identification, draws: FloatArray, weight: FloatArray | None = None
+def _finish(
+    result: Bootstrap | PosteriorSample,
+    intervals: Intervals,
+    page: list[Block],
+    output: Path | None,
+    as_json: bool,
+    weight: FloatArray | None = None,
 ) -> None:
-    """Write the draws, where a file is named."""
+    """Write the draws, where a file is named, and print the page or JSON."""
     from loopcal.io.runs.draws_file import save_draws
 
-    if output is None:
-        return
-    factors, units = fit.free_parameters.display()
-    save_draws(output, fit.names, units, factors, draws, weight)
-
-
-def _written(output: Path | None) -> list[str]:
-    """Return a line on the file that was written."""
-    return [] if output is None else ["", f"Written to {output}"]
+    if output is not None:
+        factors, units = result.fit.free_parameters.display()
+        save_draws(output, result.fit.names, units, factors, result.draws, weight)
+        page = [*page, "", f"Written to {output}"]
+    if as_json:
+        terminal.print_json({**result.to_dict(), "intervals": intervals.to_dict()})
+    else:
+        terminal.print_page(page)

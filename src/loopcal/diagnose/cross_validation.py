@@ -29,6 +29,7 @@ from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.findings import report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import decompose
@@ -74,7 +75,8 @@ class CrossValidation:
         return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
 
     def __repr__(self) -> str:
-        score = f"score {self.score:.4g} +/- {self.standard_error:.2g}"
+        error = round_to_digits(self.standard_error, 2)
+        score = f"score {round_to_digits(self.score, 4)} +/- {error}"
         return f"<CrossValidation: {len(self.fold)} folds, {len(self.poses)} rows, {score}>"
 
     def to_dict(self) -> dict[str, Any]:

@@ -184,7 +184,10 @@ def choose_error_frame(
     robot = posterior.robot
     instruments = {} if posterior.frames is None else posterior.frames.instruments
     check_frame(frame, (FITTED, BASE, RELATIVE, *instruments))
-    reference, motions = reference_poses(posterior), list_unfixed_motions(posterior)
+    motions = list_unfixed_motions(posterior)
+    if frame in (FITTED, BASE) and not motions.shape[1]:
+        return _keep_base(posterior, frame)
+    reference = reference_poses(posterior)
     if frame in (FITTED, BASE):
         return refer_errors(robot, frame, reference, motions)
     if frame != RELATIVE:
@@ -310,7 +313,7 @@ def reference_poses(posterior: Posterior) -> ReferencePoses:
     They are the measured poses; poses about home where a run folder does not name these.
     """
     robot, frames = posterior.robot, posterior.frames
-    if frames is not None and len(frames.readings) > 0:
+    if frames is not None and _names_readings(posterior):
         readings, where = frames.readings, "measured"
     else:
         readings, where = probe_readings(robot), "home"
@@ -331,6 +334,20 @@ def list_error_twists(posterior: Posterior, T: FloatArray, D: FloatArray) -> Flo
     if own is None:
         return by_parameters
     return np.concatenate([by_parameters, own.twists(T, D)], axis=2)
+
+
+def _keep_base(posterior: Posterior, frame: str) -> ErrorFrame:
+    """Return the base frame of a calibration that determines all frames: nothing is fitted."""
+    own = posterior.discrepancy
+    p = len(posterior.unit) + (0 if own is None else own.errors.count)
+    by_parameters, by_itself = np.zeros((MOTIONS, p)), np.zeros((MOTIONS, 0))
+    over: Over = "measured" if _names_readings(posterior) else "home"
+    return ErrorFrame(frame, posterior.robot.size, by_parameters, by_itself, over=over)
+
+
+def _names_readings(posterior: Posterior) -> bool:
+    """Return whether a posterior names the readings of the measured poses."""
+    return posterior.frames is not None and len(posterior.frames.readings) > 0
 
 
 def _moved_frames(fit: FrameFit, motion: FloatArray, twists: FloatArray) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from loopcal.estimate.information import collect_information, count_equations
 from loopcal.estimate.methods.tolerance_components import compute_symmetric_root
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import (
@@ -157,7 +158,7 @@ class Identifiability:
 
     def __repr__(self) -> str:
         name, rank = self.free_parameters.robot.name, f"rank {self.rank} of {self.n_parameters}"
-        numbers = f"{self.n_equations} equations, condition {self.condition:.3g}"
+        numbers = f"{self.n_equations} equations, condition {round_to_digits(self.condition)}"
         return f"<Identifiability of {name}: {rank}, {numbers}>"
 
     def __str__(self) -> str:

@@ -152,9 +152,9 @@ class PredictionComparison:
         kinds = compute_kind_errors(rows, self.before.residuals(rows), self.after.residuals(rows))
         if self.readings is None:
             return kinds
-        some = (*kinds[:-1], self.readings)
+        errors = (*kinds[:-1], self.readings)
         return summarize_kinds(
-            {k.kind: np.array([1.0, k.before**2, k.after**2]) * k.count for k in some if k.count}
+            {k.kind: np.array([1.0, k.before**2, k.after**2]) * k.count for k in errors if k.count}
         )
 
 

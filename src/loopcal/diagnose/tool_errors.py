@@ -14,7 +14,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Solution, differentiate_pose, forward
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 MOST_POSES = 1000
 """Measured poses, evenly chosen, by which two uncertainties are compared: ratios over more poses
@@ -73,7 +73,11 @@ def locate_measured_poses(
     readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
     readings = readings[np.isfinite(readings).all(axis=1)]
     if most is not None:
-        chosen = np.linspace(0, len(readings) - 1, min(most, len(readings))).astype(int)
-        readings = readings[np.unique(chosen)]
+        readings = readings[choose_evenly(len(readings), most)]
     solution = forward(fit.robot, readings)
     return solution.take(np.flatnonzero(solution.converged))
+
+
+def choose_evenly(count: int, most: int) -> IntArray:
+    """Return at most so many of the numbers below `count`, evenly chosen."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))

@@ -32,6 +32,7 @@ from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.geometry import log_so3
 from loopcal.geometry.alignment import align_point_sets
 from loopcal.mechanism import Mechanism, Status, forward_trials
@@ -144,8 +145,8 @@ class ValueComparison:
     def __repr__(self) -> str:
         return (
             f"<ValueComparison: {len(self.names)} parameters, {self.degrees} directions, "
-            f"chi-square {self.chi_square:.4g} (p = {self.p_value:.2g}), "
-            f"rms {self.rms:.3g} tolerances>"
+            f"chi-square {round_to_digits(self.chi_square, 4)} "
+            f"(p = {round_to_digits(self.p_value, 2)}), rms {round_to_digits(self.rms)} tolerances>"
         )
 
     def to_dict(self) -> dict[str, object]:
@@ -243,18 +244,26 @@ def _refuse_other_fixed_values(fit: Identification, values: Mapping[str, float])
 
 
 def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
-    """Refuse a machine that has other poses with the same values of all parameters."""
+    """Refuse a machine that has other poses with the same values of all parameters: those of the
+    robot or, where it reaches no pose with them, the stored ones.
+    """
     if stored.parameters.names != robot.parameters.names:
         raise EstimationError(
             f"{stored.name!r} does not have the parameters of {robot.name!r}; give a robot file of "
             "the same family and structure, or only the values to compare"
         )
-    known, q = robot.values[None], draw_readings(robot)
-    states = [forward_trials(one, known, q) for one in (robot, stored)]
-    is_reached = np.all([s.status[0] == Status.CONVERGED for s in states], axis=0)
+    for machine in (robot, stored):
+        known, q = machine.values[None], draw_readings(machine)
+        states = [forward_trials(one, known, q) for one in (robot, stored)]
+        is_reached = np.all([s.status[0] == Status.CONVERGED for s in states], axis=0)
+        if is_reached.any():
+            break
+    else:
+        code = "comparison.nothing-reached"
+        raise EstimationError(report_finding(code, stored=stored.name, robot=robot.name))
     mine, theirs = (state.T[0][is_reached] for state in states)
-    apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max(initial=0.0)
-    if is_reached.any() and apart <= EQUAL * robot.size:
+    apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max()
+    if apart <= EQUAL * robot.size:
         return
     own = forward_trials(stored, stored.values[None], q).T[0][is_reached]
     rotation = align_point_sets(own[:, :3, 3], mine[:, :3, 3])[:3, :3]

@@ -10,6 +10,7 @@ from loopcal.engine.householder import fold as fold
 from loopcal.engine.newton import solve as solve
 from loopcal.engine.program import CONVERGED as CONVERGED
 from loopcal.engine.program import LENGTH as LENGTH
+from loopcal.engine.program import NEAR_GOAL as NEAR_GOAL
 from loopcal.engine.program import PITCH as PITCH
 from loopcal.engine.program import Block as Block
 from loopcal.engine.program import ClosureBlocks as ClosureBlocks

@@ -8,6 +8,7 @@ N). Formulas: docs/theory/engine.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,25 +106,9 @@ def place_links(group: Group, e: FloatArray) -> PlacedLinks:
 class Chain:
     """The limbs of a group at platform T (3, 4, N) and joint values theta (J + 1, k, N).
 
-    `residual` gives the rows of its ending, the `rows_of_` methods their derivatives.
+    `residual` gives the rows of its ending, the `rows_of_` methods their derivatives. Only limbs
+    that end in a distance have `distance`, `direction` and `moment`.
     """
-
-    group: Group
-    links: PlacedLinks
-    theta: FloatArray
-    size: float
-    last: int
-    before: list[FloatArray]
-    axes: list[FloatArray]
-    origins: list[FloatArray]
-    platform: FloatArray
-    tip: FloatArray
-    tip_rotation: FloatArray
-    arm: FloatArray
-    gap: FloatArray
-    distance: FloatArray
-    direction: FloatArray
-    moment: FloatArray
 
     def __init__(
         self, group: Group, links: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
@@ -131,7 +116,8 @@ class Chain:
         self.group, self.links, self.theta, self.size = group, links, theta, size
         self.last = len(group.joints) + 1
         # rotation before each link, axis of each joint, origin behind each link
-        self.before, self.axes, self.origins = [links.nominal[0]], [], [links.origin[0]]
+        self.before, self.origins = [links.nominal[0]], [links.origin[0]]
+        self.axes: list[FloatArray] = []
         rotation, point = links.rotation[0], links.origin[0]
         for j, letter in enumerate(group.joints):
             axis, value = rotation[:, 2], theta[j]
@@ -141,7 +127,7 @@ class Chain:
             if letter == "R":
                 c, s = np.cos(value), np.sin(value)
                 x, y = rotation[:, 0], rotation[:, 1]
-                rotation = np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, axis), axis=1)
+                rotation = stack((c * x + s * y, c * y - s * x, axis)).swapaxes(0, 1)
             self.before.append(rotation)
             point = point + matvec(rotation, links.origin[j + 1])
             self.origins.append(point)
@@ -176,14 +162,14 @@ class Chain:
             return dot(self.direction, direction)[None]
         if self.group.ending == "ball":
             return direction[list(self.group.rows)]
-        rows = np.stack(np.broadcast_arrays(*np.zeros((3, 1, 1)), *direction))
+        rows = stack((*np.zeros((3, 1, 1)), *direction))
         return rows[list(self.group.rows)]
 
     def rows_of_turn(self, axis: FloatArray, arm: FloatArray) -> FloatArray:
         """Return the rows of turning about `axis`, attachment or tip at `arm` from the center."""
         if self.group.ending != "rigid":
             return self.rows_of_shift(cross(axis, arm))
-        rows = np.stack(np.broadcast_arrays(*(self.size * axis), *cross(axis, arm)))
+        rows = stack((*(self.size * axis), *cross(axis, arm)))
         return rows[list(self.group.rows)]
 
     def rows_of_freedom(self, f: int) -> FloatArray:
@@ -243,7 +229,15 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the cross product of (3, ..) and (3, ..)."""
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return np.stack((x, y, z))
+    return stack((x, y, z))
+
+
+def stack(parts: Sequence[FloatArray]) -> FloatArray:
+    """Return arrays as one, (parts, ..), each as large as the largest; faster than `np.stack`."""
+    out = np.empty((len(parts), *max(parts, key=np.size).shape))
+    for i, part in enumerate(parts):
+        out[i] = part
+    return out
 
 
 def exponential(w: FloatArray) -> FloatArray:
@@ -269,4 +263,4 @@ def _polynomial(w: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     ax, ay, az, bxy, bxz, byz = a * x, a * y, a * z, bx * y, bx * z, by * z
     first = (rest + bx * x, bxy - az, bxz + ay, bxy + az, rest + by * y)
     last = (byz - ax, bxz - ay, byz + ax, rest + bz * z)
-    return np.stack(first + last).reshape(3, 3, *rest.shape)
+    return stack(first + last).reshape(3, 3, *rest.shape)

@@ -61,11 +61,15 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
     """
     t, p = factor.shape[:2]
-    stack = [factor, np.broadcast_to(rows, (t, *rows.shape[1:]))]
+    # a factor of no rows would be most of the stack where rows are few
+    begin = factor if rows.shape[1] >= p or factor.any() else factor[:, :0]
+    stack = [begin, np.broadcast_to(rows, (t, *rows.shape[1:]))]
     height = PART * p
     count = rows.shape[1] // height
     if count > 1:
         parts = stack[1][:, : count * height].reshape(t, count, height, p)
         factors = np.asarray(np.linalg.qr(parts, mode="r"))
         stack[1:] = factors.reshape(t, count * p, p), stack[1][:, count * height :]
-    return np.asarray(np.linalg.qr(np.concatenate(stack, axis=1), mode="r"))
+    R = np.asarray(np.linalg.qr(np.concatenate(stack, axis=1), mode="r"))
+    missing = p - R.shape[1]
+    return np.concatenate([R, np.zeros((t, missing, p))], axis=1) if missing else R

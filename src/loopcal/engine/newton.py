@@ -16,15 +16,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine.closure import Chain, PlacedLinks, exponential, matmul, place_links
+from loopcal.engine.closure import Chain, PlacedLinks, dot, exponential, matmul, place_links
 from loopcal.engine.householder import back_substitute, triangularize
-from loopcal.engine.program import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, Group, Program, State
-from loopcal.typing import FloatArray
+from loopcal.engine.program import (
+    CONVERGED,
+    EXHAUSTED,
+    NEAR_GOAL,
+    NOT_FINITE,
+    STALLED,
+    Program,
+    State,
+)
+from loopcal.typing import BoolArray, FloatArray
 
 CHUNK = 2048
 """Rows solved together: few enough for the cache, many enough that Python's share is small."""
 RESIDUAL, STEP = 1e-13, 1e-7
 """Residual and last step of a converged row, relative to the robot's size."""
+NEAR, NEARER = 1e-2, 0.1
+"""Distance from a goal, relative to the robot's size and to the step towards it, below which
+Newton's method ends there. A step that ends so much closer than it was long converges
+quadratically. Other solutions of the same readings are at least ten times as far from each other,
+except close to a singularity.
+"""
 SINGULAR = 1e-11
 """Smallest pivot of a limb's joints, relative to its largest, below which a limb is singular."""
 
@@ -79,6 +93,7 @@ def solve(
     task: Task | None = None,
     free: bool = False,
     max_iterations: int = 60,
+    goal: State | None = None,
 ) -> State:
     """Find the pose and the joints that close every loop.
 
@@ -87,6 +102,8 @@ def solve(
     start : first guess, (t | 1, n | 1) rows.
     task : conditions on the pose, as many as the freed actuators leave open.
     free : solve for the actuated joints too.
+    goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
+        goal, to which further steps would converge. Its coordinates are those before that step.
 
     Rows that fail are marked in `status`; nothing is raised.
     """
@@ -100,17 +117,21 @@ def solve(
     ]
     T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
     begin = np.concatenate([a.reshape(t * n, -1) for a in (T, *joints)], axis=1).T
+    goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
     for rows in np.split(np.arange(t * n), range(CHUNK, t * n, CHUNK)):
         placed = [p.select(rows // n) for p in links]
         equations = _Equations(program, unknown, redundant, placed, task, rows)
-        chunks.append(_iterate(equations, begin[:, rows], max_iterations))
+        goal_rows = None if goals is None else goals[..., rows]
+        chunks.append(_iterate(equations, begin[:, rows], max_iterations, goal_rows))
     whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
     return _pack(program, whole, (t, n))
 
 
-def _iterate(equations: _Equations, coordinates: FloatArray, max_iterations: int) -> Solved:
-    """Iterate one chunk until every row has converged or failed."""
+def _iterate(
+    equations: _Equations, coordinates: FloatArray, max_iterations: int, goal: FloatArray | None
+) -> Solved:
+    """Iterate one chunk until every row has converged, is near its goal (3, 4, N), or failed."""
     size, N = equations.program.size, coordinates.shape[1]
     may_stay_open = equations.program.sigma is not None
     status, steps, alive = np.full(N, EXHAUSTED, np.int8), np.zeros(N, np.int64), np.arange(N)
@@ -126,9 +147,14 @@ def _iterate(equations: _Equations, coordinates: FloatArray, max_iterations: int
             finite = np.isfinite(now.reducible) & np.isfinite(now.length)
             broken = ~(finite & (now.pivot > SINGULAR))
             end = settled | broken | (share < 1e-5)
+            is_near = np.zeros_like(end)
+            if goal is not None:
+                is_near = equations.lead_to(now, goal[..., alive]) & ~end
+                end |= is_near
             if end.any():
                 closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
                 reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
+                reason[is_near] = NEAR_GOAL
                 keep, status[alive[end]] = ~end, reason[end]
                 _store(done, alive[end], now.select(end) if keep.any() else now)
                 if not keep.any():
@@ -257,6 +283,15 @@ class _Equations:
                 length = np.maximum(length, np.abs(part).max(axis=0) * unit)
         return length
 
+    def lead_to(self, now: Iterate, goal: FloatArray) -> BoolArray:
+        """Return which full steps (N,) lead close to the platform of a goal (3, 4, N)."""
+        size, T = self.program.size, now.coordinates[:12].reshape(3, 4, -1)
+        rotation = matmul(exponential(now.step[:3]), T[:, :3]) - goal[:, :3]
+        position = T[:, 3] + now.step[3:6] - goal[:, 3]
+        square = 0.5 * size**2 * np.add.reduce(rotation**2, axis=(0, 1)) + dot(position, position)
+        length = np.minimum(NEAR * size, NEARER * now.length)
+        return (now.length <= 0.5 * size) & (square <= length**2)
+
     def move(self, now: Iterate, fraction: FloatArray) -> FloatArray:
         """Return the coordinates a fraction (N,) of its step beyond an iterate."""
         out, N = now.coordinates.copy(), len(fraction)
@@ -275,16 +310,12 @@ class _Equations:
 def _split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
     """Return the joint values (J + 1, k, N) of each group as views into coordinates."""
     out, first = [], 12
-    for shape in map(_joint_shape, program.groups):
-        last = first + shape[0] * shape[1]
-        out.append(coordinates[first:last].reshape(*shape, coordinates.shape[1]))
+    for group in program.groups:  # the rod counts as a joint
+        values, limbs = len(group.joints) + 1, len(group.limbs)
+        last = first + values * limbs
+        out.append(coordinates[first:last].reshape(values, limbs, coordinates.shape[1]))
         first = last
     return out
-
-
-def _joint_shape(group: Group) -> tuple[int, int]:
-    """Return the numbers of joints of a limb, its rod counted, and of limbs."""
-    return len(group.joints) + 1, len(group.limbs)
 
 
 def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:

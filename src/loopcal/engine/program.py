@@ -23,6 +23,8 @@ PITCH, LENGTH = 6, 7
 """Values of `Slot.axis` beside the axes 0..5 of a twist."""
 CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 """Values of `State.status`."""
+NEAR_GOAL = 8
+"""The value of `State.status` of a row that comes close to a given goal."""
 
 
 @dataclass(frozen=True)

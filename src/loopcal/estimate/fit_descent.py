@@ -22,29 +22,43 @@ from loopcal.estimate.prior_inflation import ROUNDS, choose_methods
 from loopcal.estimate.problem import Problem
 from loopcal.measure import Measurements
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, Progress, report_no_progress
 
 
 def descend_once(
-    problem: Problem, z: FloatArray, start: Start | None, options: FitOptions
+    problem: Problem,
+    z: FloatArray,
+    start: Start | None,
+    options: FitOptions,
+    progress: Progress = report_no_progress,
 ) -> Descent:
-    """Descend from deviations z (t, p); the history includes steps of the linearized closure."""
+    """Descend from deviations z (t, p); the history includes steps of the linearized closure.
+
+    `progress` receives the steps.
+    """
     method, control, tolerance = get_method(options), options.control, options.rank_tolerance
     with_prior = problem if options.prior is None else options.prior.added(problem)
     if options.begin == "kinematics":
-        return descend(with_prior, z, method, control, tolerance, start)
+        return descend(with_prior, z, method, control, tolerance, start, progress)
     z, first = descend_from_closure(problem, z, method, control, tolerance)
-    fit = descend(with_prior, z, method, control, tolerance, start)
-    return fit if first is None else fit.after(first)
+    fit = descend(with_prior, z, method, control, tolerance, start, progress)
+    if first is None:
+        return fit
+    is_exhausted = bool((first.status == DescentStatus.OUT_OF_ITERATIONS).any())
+    return replace(fit.after(first), is_start_exhausted=is_exhausted)
 
 
 def descend_weighted(
-    problem: Problem, data: Measurements, z: FloatArray, options: FitOptions
+    problem: Problem,
+    data: Measurements,
+    z: FloatArray,
+    options: FitOptions,
+    progress: Progress = report_no_progress,
 ) -> tuple[Descent, FloatArray, Problem]:
     """Descend with or without a loss; return also the weight (n,) of each pose and the problem with
     these weights.
     """
-    run: Run = partial(descend_once, options=options)
+    run: Run = partial(descend_once, options=options, progress=progress)
     if options.loss is None:
         return run(problem, z, None), np.ones(data.n_poses), problem
     estimated, blocks = options.noise == "estimated", linked_blocks(data)
@@ -53,18 +67,25 @@ def descend_weighted(
 
 
 def descend_to_prior(
-    problem: Problem, data: Measurements, z: FloatArray, options: FitOptions, free: FreeParameters
+    problem: Problem,
+    data: Measurements,
+    z: FloatArray,
+    options: FitOptions,
+    free: FreeParameters,
+    progress: Progress = report_no_progress,
 ) -> tuple[Descent, FloatArray, Problem, FitOptions]:
     """Descend, and again as long as the data ask for other components of the tolerances; return
     also the options with these.
     """
-    fit, weights, weighted = descend_weighted(problem, data, z, options)
+    fit, weights, weighted = descend_weighted(problem, data, z, options, progress)
     for _ in range(ROUNDS):
         method = choose_methods(free, fit, get_method(options)).get(0)
         if method is None:
             break
         other = replace(options, method=method)
-        again, new_weights, new_problem = descend_weighted(problem, data, fit.deviation, other)
+        again, new_weights, new_problem = descend_weighted(
+            problem, data, fit.deviation, other, progress
+        )
         if again.status[0] != DescentStatus.CONVERGED:
             break
         fit, weights, weighted, options = again.after(fit), new_weights, new_problem, other

@@ -3,19 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from loopcal.argument_types import ORIGINS, describe
 from loopcal.errors import ArgumentTypeError, DataError, EstimationError, suggest_names
-from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements, check_actuators
-from loopcal.measure.array_checks import describe
 from loopcal.measure.reading_sigma import weight_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -24,19 +23,10 @@ HUGE = 1e150
 """Residuals, in units of sigma, whose squares cannot be summed."""
 
 
-ORIGINS: Mapping[type, str] = {
-    Mechanism: "as from load_robot('hexapod-42')",
-    Measurements: "as from load_measurements('data.csv', robot)",
-    Identification: "as from identify(robot, data)",
-    Posterior: "as identify(robot, data).posterior",
-}
-"""How to obtain an argument of each type."""
-
-
 def check_argument(value: object, name: str, *allowed: type) -> None:
     """Raise ArgumentTypeError unless an argument has one of these types, which `ORIGINS` lists."""
     if not isinstance(value, allowed):
-        wanted = ", or ".join(f"{each.__name__}, {ORIGINS[each]}" for each in allowed)
+        wanted = ", or ".join(f"{each.__name__}, {ORIGINS[each.__name__]}" for each in allowed)
         raise ArgumentTypeError(f"{name}: got {describe(value)}; give {wanted}")
 
 

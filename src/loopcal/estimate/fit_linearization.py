@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.posterior import VarianceSources, find_variance_sources
-from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.poses.smooth_errors import SmoothErrors
-from loopcal.estimate.poses.states import PoseStates
+from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
@@ -27,10 +28,12 @@ class FitLinearization:
     Attributes
     ----------
     problem : without the rows of an earlier calibration. linearization : with them.
+    solution : poses and nuisance parameters at which both are linearized.
     decomposition, penalty : of the fit. sources : of its variances.
     """
 
     problem: Problem
+    solution: PoseSolution
     linearization: Linearization
     decomposition: Decomposition
     penalty: FloatArray
@@ -75,7 +78,7 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
     fit : a fit that converged. data : its measurements, with the sigma of their readings, without
         excluded poses.
     """
-    problem, linearization = _linearize(fit, data, is_setup_known=False)
+    problem, solution, linearization = _linearize(fit, data, is_setup_known=False)
     method = fit.method
     d = decompose_for(
         method,
@@ -86,21 +89,22 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     sources = find_variance_sources(d, penalty, fit.residual_test, method, fit.free_parameters)
-    return FitLinearization(problem, linearization, d, penalty, sources)
+    return FitLinearization(problem, solution, linearization, d, penalty, sources)
 
 
 def linearize_rows_of(fit: Identification, data: Measurements) -> tuple[Problem, Linearization]:
     """Linearize the rows of other measurements of the poses of a fit at its estimate, such as those
     of another sigma, with an earlier calibration; arguments as of `linearize_fit`.
     """
-    return _linearize(fit, data, is_setup_known=False)
+    problem, _, linearization = _linearize(fit, data, is_setup_known=False)
+    return problem, linearization
 
 
 def factor_known_setup(fit: Identification, data: Measurements) -> FloatArray:
     """Return the triangular factor (p, p) of the whitened rows of a fit by the parameters in
     tolerances, as if its frames, targets, surfaces and offsets were known.
     """
-    return _linearize(fit, data, is_setup_known=True)[1].factor[0, :-1, :-1]
+    return _linearize(fit, data, is_setup_known=True)[2].factor[0, :-1, :-1]
 
 
 def linearize_smooth_errors(
@@ -111,33 +115,52 @@ def linearize_smooth_errors(
 
     Parameters
     ----------
-    fit, data : as of `linearize_fit`. linear : of both; the poses begin where it has them.
+    fit, data : as of `linearize_fit`. linear : of both; its poses and nuisance parameters stay.
     """
-    states = linear.linearization.next_start.poses
-    return _linearize(fit, data, is_setup_known=False, errors=errors, states=states)[1]
+    solution, free = linear.solution, replace(fit.free_parameters, errors=errors)
+    if solution.linearized is not None:
+        solution = replace(solution, linearized=solution.linearized.with_errors(errors))
+    problem = _state_problem(fit, data, free, is_setup_known=False)
+    # the columns of the errors have no part in the rank of the machine
+    problem = replace(problem, consistent=None)
+    z, start = _start_at_estimate(fit, problem)
+    return _add_prior(fit, problem, problem.linearize_at(z, start, solution))
 
 
 def _linearize(
-    fit: Identification,
-    data: Measurements,
-    *,
-    is_setup_known: bool,
-    errors: SmoothErrors | None = None,
-    states: PoseStates | None = None,
-) -> tuple[Problem, Linearization]:
-    """Return the weighted problem of a fit, and its linearization with an earlier calibration."""
+    fit: Identification, data: Measurements, *, is_setup_known: bool
+) -> tuple[Problem, PoseSolution, Linearization]:
+    """Return the weighted problem of a fit, its solution at the estimate, and its linearization
+    there with an earlier calibration.
+    """
+    problem = _state_problem(fit, data, fit.free_parameters, is_setup_known=is_setup_known)
+    z, start = _start_at_estimate(fit, problem)
+    solution = problem.solve(z, start, derivatives=True)
+    linearization = problem.linearize_at(z, start, solution)
+    return problem, solution, _add_prior(fit, problem, linearization)
+
+
+def _state_problem(
+    fit: Identification, data: Measurements, free: FreeParameters, *, is_setup_known: bool
+) -> Problem:
+    """Return the weighted problem of a fit; a known setup is fixed at its estimate."""
     setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
-    values = fit.nuisance.estimate
     if is_setup_known and len(setup):
-        setup = setup.with_nominal(values).with_fixed("*")
-    free = replace(fit.free_parameters, errors=errors)
-    problem = problem_of(free, data, setup).weighted(fit.pose_weights)
-    if errors is not None:  # their columns have no part in the rank of the machine
-        problem = replace(problem, consistent=None)
-    z = free.deviation(fit.robot.values[None])
+        setup = setup.with_nominal(fit.nuisance.estimate).with_fixed("*")
+    return problem_of(free, data, setup).weighted(fit.pose_weights)
+
+
+def _start_at_estimate(fit: Identification, problem: Problem) -> tuple[FloatArray, Start]:
+    """Return the deviation (1, p) of a fit, and a start with its nuisance parameters."""
+    z = problem.free.deviation(fit.robot.values[None])
     start = problem.start(z, seek=False)
-    start = start.with_nuisance(values[None]) if len(setup) else start
-    start = start if states is None else replace(start, poses=states)
+    values = fit.nuisance.estimate
+    return z, start.with_nuisance(values[None]) if problem.nuisance is not None else start
+
+
+def _add_prior(
+    fit: Identification, problem: Problem, linearization: Linearization
+) -> Linearization:
+    """Return a linearization with the rows of the earlier calibration of a fit, if any."""
     prior = fit.options.prior
-    with_prior = problem if prior is None else prior.added(problem)
-    return problem, with_prior.linearize(z, start)
+    return linearization if prior is None else prior.added(problem).append(linearization)

@@ -69,13 +69,13 @@ from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_t
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
-from loopcal.findings import Finding
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 
 def identify(
@@ -85,6 +85,7 @@ def identify(
     *,
     loss: Loss | None = None,
     options: FitOptions | None = None,
+    progress: Progress = report_no_progress,
 ) -> Identification:
     """Identify the free parameters of a robot; see `loopcal.estimate.methods.penalties`.
 
@@ -96,6 +97,7 @@ def identify(
     method, loss : in place of those of `options`.
     options : see `FitOptions`. By default stated tolerances are a prior, which is inflated where
         the data contradict it.
+    progress : receives the steps of the iteration, with the sum of squares.
 
     Returns
     -------
@@ -121,7 +123,7 @@ def identify(
     check_count(problem, data, method, options.allow_fewer_equations or options.prior is not None)
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
-    fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free)
+    fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free, progress)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(problem, data, z, fit.cost)
     open_poses = find_open_poses(robot.with_values(values), data)
@@ -279,7 +281,7 @@ def _assemble(
         *(combination.finding for combination in unidentifiable),
         *nuisance.report_unobservable(),
         *free.findings(),
-        *_report_closure(problem, options),
+        *_report_closure(problem, options, fit),
         *([] if regularization is None else [regularization.finding]),
         *report_unknown_bias(free, method, sources.prior),
         *report_equations(int(problem.equations[0]), problem.parameters, method),
@@ -352,8 +354,12 @@ def _estimate_nuisance(
     )
 
 
-def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:
-    """Return why the fit did not begin with the closure, where the options ask for it."""
+def _report_closure(problem: Problem, options: FitOptions, fit: Descent) -> list[Finding]:
+    """Return why the fit did not begin with the closure, where the options ask for it, or that
+    the steps of this start ran out.
+    """
+    if fit.is_start_exhausted:
+        return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
     unused = report_unused_closure(problem) if options.begin == "closure" else None
     return [] if unused is None else [unused]
 

@@ -45,7 +45,7 @@ def add_loss_uncertainty(
     if loss is None or not (result.converged and test.intervals):
         return result
     member = np.unique(blocks, return_inverse=True)[1]
-    distance, counts = measure_block_distances(problem, fit, member, weighted)
+    distance, counts = measure_block_distances(problem, fit.deviation, fit.start, member, weighted)
     unit = estimate_scale_of(distance, counts) if test.noise == "estimated" else 1.0
     variance, left = compute_loss_variance(loss, distance, counts, result.rank, unit)
     times = variance / test.sigma_scale**2

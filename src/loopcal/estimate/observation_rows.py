@@ -18,7 +18,7 @@ from loopcal.measure import Kind, Measurements
 from loopcal.numerics.elimination_tree import connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-BLOCK = 512
+BLOCK = 2048
 """Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
 enough for the cache."""
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from loopcal.argument_types import describe
 from loopcal.errors import ArgumentTypeError, EstimationError
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.inference.residual_test import SIGMA_UNCERTAINTY
@@ -17,7 +18,7 @@ from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.descent import StepControl
 from loopcal.measure import NuisanceParameters
-from loopcal.measure.array_checks import check_number, check_type, describe
+from loopcal.measure.array_checks import check_number, check_type
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray
 

@@ -173,8 +173,7 @@ class Problem:
         Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
         begins at `start`.
         """
-        t = len(self)
-        shared = None
+        t, shared = len(self), None
         exact = self.poses if isinstance(self.poses, ExactPoses) else None
         is_equal = t > 1 and bool((deviation == deviation[0]).all())
         if exact is not None and exact.is_single_block and is_equal:
@@ -188,21 +187,32 @@ class Problem:
                 solution = exact.solve(z, trials, begin, self.control, shared=shared)
             else:
                 solution = self.poses.solve(z, trials, begin, self.control)
-            linearization = self._eliminate(solution, z, trials, begin)
-            if self.consistent is not None and self.located is None:
-                linearization = self._drop_second_order(linearization, solution, trials, begin)
-            linearizations.append(linearization)
+            linearizations.append(self.take(chosen).linearize_at(z, begin, solution))
         return Linearization.join(linearizations)
 
+    def linearize_at(
+        self, deviation: FloatArray, start: Start, solution: PoseSolution
+    ) -> Linearization:
+        """Linearize at deviations (t, p) and a solution there, see `solve`."""
+        linearization = self._eliminate(solution, deviation, self.trials, start)
+        if self.consistent is not None and self.located is None:
+            return self._drop_second_order(linearization, solution, self.trials, start)
+        return linearization
+
     def solve(
-        self, deviation: FloatArray, start: Start, nuisance: FloatArray | None = None
+        self,
+        deviation: FloatArray,
+        start: Start,
+        nuisance: FloatArray | None = None,
+        *,
+        derivatives: bool = False,
     ) -> PoseSolution:
         """Solve for poses and nuisance parameters at deviations (t, p).
 
-        `nuisance` (t, U) are nuisance parameters that are not solved for.
+        `nuisance` (t, U) is not solved for. `derivatives` : whether poses are linearized, too.
         """
         return self.poses.solve(
-            deviation, self.trials, start, self.control, nuisance, derivatives=False
+            deviation, self.trials, start, self.control, nuisance, derivatives=derivatives
         )
 
     def residuals(self, deviation: FloatArray, solution: PoseSolution) -> tuple[Residuals, ...]:
@@ -221,17 +231,19 @@ class Problem:
                 kind.whitened[:, numbers] = rows.whiten(white, raw, self.trials)
         return tuple(kinds)
 
-    def leverage_rows(self, linearization: Linearization) -> Iterator[list[LeverageRows]]:
+    def leverage_rows(
+        self, linearization: Linearization, solution: PoseSolution | None = None
+    ) -> Iterator[list[LeverageRows]]:
         """Give, block by block, the rows by everything that they determine (one trial).
 
         `linearization` is one of this problem, or of the same one with other weights: nuisance
         parameters and their elimination are taken from it. Uncertain poses are where the rows of
-        this problem put them at these nuisance parameters.
+        this problem put them at these nuisance parameters, unless a solution is given.
         """
-        z = linearization.deviation
-        fixed = None if linearization.nuisance is None else linearization.nuisance.values
-        solution = self.poses.solve(z, self.trials, linearization.next_start, self.control, fixed)
-        estimate = linearization.nuisance
+        z, estimate = linearization.deviation, linearization.nuisance
+        if solution is None:
+            fixed = None if estimate is None else estimate.values
+            solution = self.solve(z, linearization.next_start, fixed, derivatives=True)
         at_nodes = None if estimate is None else estimate.elimination.at_nodes
         rows = self.poses.iterate_rows(solution, z, self.trials)
         yield from spread_rows(self.poses, rows, self.parameters, self.nuisance, at_nodes)

@@ -132,7 +132,8 @@ def recalibrate(
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
     change = assess_change(robot, data, earlier, names, free_limb or MACHINE, options, progress)
     used = _used_prior(robot, prior, free_limb, names)
-    fit = identify(robot, data, LeastSquares(), options=replace(options, prior=used))
+    chosen = replace(options, prior=used)
+    fit = identify(robot, data, LeastSquares(), options=chosen, progress=progress)
     return replace(fit, findings=(*fit.findings, change.finding)), change
 
 
@@ -157,7 +158,8 @@ def assess_change(
     prior = prior_from(with_shown_noise(earlier))
 
     def fit_with(used: Prior) -> Identification:
-        return identify(robot, data, options=replace(options, prior=used))
+        chosen = replace(options, prior=used)
+        return identify(robot, data, options=chosen, progress=progress)
 
     alone = fit_with(prior.without(prior.names))
     sigma, noise_degrees = _find_new_noise(alone, earlier)

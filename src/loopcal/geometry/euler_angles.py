@@ -22,6 +22,9 @@ EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
 # first angle is set to zero.
 _GIMBAL = 1e-15
 
+Vector = tuple[FloatArray, ...]
+"""Three components (...) of vectors."""
+
 
 def wrap_angle(angle: FloatArray | float) -> FloatArray:
     """Return angles (...) plus full turns, in (-pi, pi] [rad]."""
@@ -105,13 +108,9 @@ def euler_rates(angles: FloatArray, order: str) -> FloatArray:
     About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular if two axes
     are parallel.
     """
-    (i, j, last), fixed = _moving_axes(order)
-    moving = angles[..., ::-1] if fixed else angles
-    turned = rotation_about_axis(moving[..., 0], i)
-    both = turned @ rotation_about_axis(moving[..., 1], j)
-    first = np.broadcast_to(np.eye(3)[i], turned.shape[:-1])
-    columns = [first, turned[..., :, j], both[..., :, last]]
-    return np.stack(columns[::-1] if fixed else columns, axis=-1)
+    columns, fixed = _rate_columns(angles, order)
+    columns = columns[::-1] if fixed else columns
+    return stack_matrix(tuple(zip(*columns, strict=True)))
 
 
 def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
@@ -119,12 +118,32 @@ def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
 
     The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
     """
-    rates = euler_rates(angles, order)
-    first, second, third = (rates[..., :, i] for i in range(3))
-    rows = np.stack(
-        [np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2
-    )
-    return rows / _nonzero(np.sum(rows[..., 0, :] * first, axis=-1))[..., None, None]
+    (first, second, third), fixed = _rate_columns(angles, order)
+    across = _cross(second, third)
+    determinant = _nonzero(across[0] * first[0] + across[1] * first[1] + across[2] * first[2])
+    rows = (across, _cross(third, first), _cross(first, second))
+    rows = rows[::-1] if fixed else rows
+    return stack_matrix(tuple(tuple(entry / determinant for entry in row) for row in rows))
+
+
+def _rate_columns(angles: FloatArray, order: str) -> tuple[tuple[Vector, ...], bool]:
+    """Return the columns of `euler_rates` about moving axes, and whether they are in reverse."""
+    (i, j, last), fixed = _moving_axes(order)
+    moving = angles[..., ::-1] if fixed else angles
+    k, sign = 3 - i - j, 1.0 if (j - i) % 3 == 1 else -1.0
+    (c, s), (cc, ss) = ((np.cos(moving[..., a]), np.sin(moving[..., a])) for a in (0, 1))
+    s, ss = sign * s, sign * ss
+    # Rj(a2) turns ek by ss towards ei, and ei by -ss towards ek; Ri(a1) turns ek by -s towards ej
+    along, across = (cc, -ss) if last == i else (ss, cc)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    by_axes = ((one, zero, zero), (zero, c, s), (along, -s * across, c * across))
+    place = np.argsort((i, j, k))
+    return tuple(tuple(column[a] for a in place) for column in by_axes), fixed
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross product of vectors given by their components."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def _nonzero(divisor: FloatArray) -> FloatArray:

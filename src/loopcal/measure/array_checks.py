@@ -2,11 +2,12 @@
 """Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
 
 from collections.abc import Iterable, Sequence
-from numbers import Integral, Real
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.argument_types import describe
 from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.typing import FloatArray
 
@@ -116,23 +117,7 @@ def check_number(value: object, what: str, allowed: str) -> None:
         raise ArgumentTypeError(f"{what}: got {describe(value)}; give {allowed}")
 
 
-def check_seed(seed: object) -> None:
-    """Raise an error unless the seed of a random stream is a whole number, 0 or more."""
-    if not isinstance(seed, Integral):
-        raise ArgumentTypeError(f"seed: got {describe(seed)}; give a whole number, 0 or more")
-    if seed < 0:
-        raise DataError(f"seed is {seed}; give a whole number, 0 or more")
-
-
 def set_fields(instance: object, **values: object) -> None:
     """Set fields of a frozen dataclass to their checked values; for its `__post_init__` alone."""
     for name, value in values.items():
         object.__setattr__(instance, name, value)
-
-
-def describe(value: object) -> str:
-    """Return a value as error messages show it: its text and its type."""
-    if isinstance(value, str):
-        return f"the text {value[:60]!r}"
-    name = type(value).__name__
-    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"

@@ -16,7 +16,7 @@ from loopcal.errors import DataError
 from loopcal.findings import Quantity, report_finding
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.observations import Observations
+from loopcal.measure.observations import Observations, TextArray
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
@@ -169,23 +169,17 @@ def check_duplicates(
         )
         if not len(poses):
             continue
-        texts = [
-            np.concatenate([getattr(rows, name) for rows in alike]) for name in ("session", "group")
-        ]
-        owners = [np.unique(text, return_inverse=True)[1].reshape(-1, 1) for text in texts]
         measured = np.concatenate([rows.measured for rows in alike])
         is_empty = ~np.concatenate([rows.present.any(axis=1) for rows in alike])
         own = np.where(is_empty, np.arange(1, len(poses) + 1), 0)[:, None]  # equal to no other row
         content = np.concatenate(
-            [measurements.readings[poses].reshape(len(poses), -1), measured, *owners, own], axis=1
+            [measurements.readings[poses].reshape(len(poses), -1), measured, own], axis=1
         )
-        _, first, member = np.unique(
-            np.nan_to_num(content, nan=1e300), axis=0, return_index=True, return_inverse=True
-        )
-        repeated = np.flatnonzero(first[member.ravel()] != np.arange(len(poses)))
-        if len(repeated):
-            second = int(repeated[0])
-            pair = (int(first[member.ravel()[second]]), second)
+        texts = [
+            np.concatenate([getattr(rows, name) for rows in alike]) for name in ("session", "group")
+        ]
+        pair = _find_equal_rows(np.nan_to_num(content, nan=1e300), texts)
+        if pair is not None:
             lines = [place for rows in alike for place in places_of.get(id(rows), ())]
             raise DataError(
                 report_finding(
@@ -195,6 +189,25 @@ def check_duplicates(
                     places=tuple(lines[i] for i in pair) if lines else (),
                 )
             )
+
+
+def _find_equal_rows(content: FloatArray, texts: Sequence[TextArray]) -> tuple[int, int] | None:
+    """Return an earlier row and the first one with its numbers (r, c) and texts (r,), if any.
+
+    Only rows with an equal weighted sum of their numbers are compared, which are few.
+    """
+    key = (content * np.random.default_rng(0).uniform(0.5, 1.0, content.shape[1])).sum(axis=1)
+    order = np.argsort(key, kind="stable")
+    equal = np.flatnonzero(np.diff(key[order]) == 0.0)
+    rows = np.unique(order[np.concatenate([equal, equal + 1])])
+    owners = [np.unique(text[rows], return_inverse=True)[1].reshape(-1, 1) for text in texts]
+    _, first, member = np.unique(
+        np.hstack([content[rows], *owners]), axis=0, return_index=True, return_inverse=True
+    )
+    repeated = np.flatnonzero(first[member.ravel()] != np.arange(len(rows)))
+    if not len(repeated):
+        return None
+    return int(rows[first[member.ravel()[repeated[0]]]]), int(rows[repeated[0]])
 
 
 def check_targets_move(

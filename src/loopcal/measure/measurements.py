@@ -8,16 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.argument_types import check_seed, describe
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import (
-    check_array,
-    check_number,
-    check_seed,
-    check_type,
-    describe,
-    set_fields,
-)
+from loopcal.measure.array_checks import check_array, check_number, check_type, set_fields
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
@@ -289,11 +283,11 @@ def _check_held_out(is_held_out: ArrayLike, block: IntArray, labels: tuple[str, 
         raise DataError(
             f"is_held_out has shape {mask.shape}; give one boolean for each of {len(block)} poses"
         )
-    for i in np.flatnonzero(mask):
-        for j in np.flatnonzero((block == block[i]) & ~mask):
-            raise DataError(
-                report_finding("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
-            )
+    for i in np.flatnonzero(mask & np.isin(block, block[~mask]))[:1]:
+        j = np.flatnonzero((block == block[i]) & ~mask)[0]
+        raise DataError(
+            report_finding("data.block-partly-held-out", held_out=labels[i], fitted=labels[j])
+        )
     mask.setflags(write=False)
     return mask
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Actuator readings of commanded poses, and values of joints that kinds sense."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,10 @@ from loopcal.typing import FloatArray
 
 
 def solve_commanded_poses(
-    controller: Mechanism, commanded: ArrayLike, labels: tuple[str, ...] = ()
+    controller: Mechanism,
+    commanded: ArrayLike,
+    labels: Sequence[str] = (),
+    places: Sequence[str] = (),
 ) -> Solution:
     """Return readings, poses and passive joints that a controller computes for commanded poses.
 
@@ -25,25 +28,33 @@ def solve_commanded_poses(
     controller : Mechanism
         The geometry that the controller uses, usually the nominal robot.
     commanded : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
-    labels : tuple of str, optional
-        Names of the poses for messages; default "1", "2", ...
+    labels, places : sequence of str, optional
+        Names of the poses, and their places such as `poses.csv:12`, for messages; see `name_pose`.
 
     Raises
     ------
     DataError
-        If the controller's geometry does not reach a pose.
+        If the controller's geometry does not reach a pose, or there is another number of names.
     """
     solution = inverse(controller, commanded)
+    if labels and len(labels) != len(solution):
+        raise DataError(f"{len(labels)} names are given for {len(solution)} poses; name each pose")
     failed = np.flatnonzero(~solution.converged)
     if len(failed):
         first = int(failed[0])
-        name = labels[first] if labels else str(first + 1)
+        name = name_pose(first, labels, places)
         raise DataError(
-            f"{controller.name!r} does not reach commanded pose {name!r} ({len(failed)} of "
+            f"{controller.name!r} does not reach commanded pose {name} ({len(failed)} of "
             f"{len(solution.q)} fail): {solution.explain(first)}; correct the pose, or the "
             "geometry of the controller"
         )
     return solution
+
+
+def name_pose(index: int, labels: Sequence[str] = (), places: Sequence[str] = ()) -> str:
+    """Return how a message names a pose: `'p3' at poses.csv:12`; "1", "2", ... without labels."""
+    label = repr(labels[index] if labels else str(index + 1))
+    return f"{label} at {places[index]}" if places else label
 
 
 # --- values of joints

@@ -128,8 +128,8 @@ def _find_repeats(rows: ComparedRows, fitted: FloatArray) -> list[list[int]]:
     near = KDTree(readings / limit).query_ball_point(
         rows.content[asked, :n] / limit, r=1.0, p=np.inf
     )
-    for i, found in zip(asked, near, strict=True):
-        result[i] = places[found].tolist()
+    for i, neighbors in zip(asked, near, strict=True):
+        result[i] = places[neighbors].tolist()
     return result
 
 

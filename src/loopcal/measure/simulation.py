@@ -5,7 +5,9 @@ The controller's inverse kinematics turns commanded poses into readings. The for
 the true machine turns readings into true poses. The instrument measures these poses with noise.
 """
 
-from collections.abc import Mapping
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,7 +22,12 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import broadcast_reading_sigma, resolve_reading_sigma
-from loopcal.measure.readings import list_sensed_joints, select_joint_values, solve_commanded_poses
+from loopcal.measure.readings import (
+    list_sensed_joints,
+    name_pose,
+    select_joint_values,
+    solve_commanded_poses,
+)
 from loopcal.mechanism import Mechanism, Status, forward
 from loopcal.typing import BoolArray, FloatArray
 
@@ -140,6 +147,7 @@ def simulate_trials(
     nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
     disturbance: Disturbance = NO_DISTURBANCE,
+    pose_names: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> Trials:
     """Measure the same commanded poses on t machines.
 
@@ -163,10 +171,8 @@ def simulate_trials(
         exact, infinity is missing. Default: as the robot states for its actuators.
     disturbance : Disturbance, optional
         What happens at each pose although the model does not contain it.
-
-    Returns
-    -------
-    trials : Trials
+    pose_names : (labels, places), optional
+        Names of the poses, and their places such as `poses.csv:12`, for messages.
 
     Raises
     ------
@@ -177,7 +183,8 @@ def simulate_trials(
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
     values = _check_truth(robot, truth)
-    commanded = solve_commanded_poses(robot.nominal if controller is None else controller, poses)
+    geometry = robot.nominal if controller is None else controller
+    commanded = solve_commanded_poses(geometry, poses, *pose_names)
     readings, n = commanded.q, len(commanded.q)
     assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))
     labels = tuple(str(i + 1) for i in range(n))
@@ -210,6 +217,7 @@ def simulate(
     controller: Mechanism | None = None,
     nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
+    pose_names: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> Measurements:
     """Measure commanded poses on one machine: trial 0 of `simulate_trials`.
 
@@ -217,7 +225,7 @@ def simulate(
     ----------
     robot : Mechanism
         The true machine, at its true values.
-    poses, instrument, seed, controller, nuisance_values, reading_sigma
+    poses, instrument, seed, controller, nuisance_values, reading_sigma, pose_names
         As for `simulate_trials`.
 
     Returns
@@ -233,14 +241,23 @@ def simulate(
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     truth = robot.values[None]
     trials = simulate_trials(
-        robot, truth, poses, instrument, seed, controller, nuisance_values, reading_sigma
+        robot,
+        truth,
+        poses,
+        instrument,
+        seed,
+        controller,
+        nuisance_values,
+        reading_sigma,
+        pose_names=pose_names,
     )
     failed = np.flatnonzero(~trials.reached[0])
     if len(failed):
+        name = name_pose(int(failed[0]), *pose_names)
         raise DataError(
-            f"the true machine does not reach pose {int(failed[0]) + 1} with the readings of the "
-            f"controller ({len(failed)} of {len(trials.readings)} poses fail); choose poses "
-            "further inside the workspace, or smaller errors"
+            f"the true machine does not reach pose {name} with the readings of the controller "
+            f"({len(failed)} of {len(trials.readings)} poses fail); choose poses further inside "
+            "the workspace, or smaller errors"
         )
     return trials.trial(0)
 

@@ -57,6 +57,16 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
     _refuse(~np.all(np.isfinite(correlation), axis=(1, 2)), "is not positive definite")
     asymmetric = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > 1e-9
     _refuse(np.any(asymmetric, axis=(1, 2)), "is not symmetric")
+    W = _invert_factor(correlation) / sd[:, None, :]
+    return np.where(both, W, 0.0) * np.sqrt(weight)[:, None, None]
+
+
+def _invert_factor(correlation: FloatArray) -> FloatArray:
+    """Return the inverse lower Cholesky factors (r, m, m) of correlation matrices."""
+    diagonal = np.eye(correlation.shape[1], dtype=bool)
+    if not np.any(correlation[:, ~diagonal]):  # most files: nothing to factor
+        root = np.sqrt(np.where(diagonal, correlation, 1.0))
+        return np.where(diagonal, 1.0 / root, 0.0)
     try:
         L = np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
@@ -67,8 +77,7 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
         np.min(np.einsum("rii->ri", L), axis=1) < _SMALLEST_PIVOT,
         "is not positive definite to rounding",
     )
-    W = np.tril(np.linalg.inv(L)) / sd[:, None, :]
-    return np.where(both, W, 0.0) * np.sqrt(weight)[:, None, None]
+    return np.asarray(np.tril(np.linalg.inv(L)), dtype=np.float64)
 
 
 def _refuse(wrong: BoolArray, what: str) -> None:

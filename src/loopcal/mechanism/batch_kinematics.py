@@ -61,6 +61,7 @@ def forward_trials(
     q: FloatArray,
     start: State | None = None,
     follow: bool = True,
+    goal: State | None = None,
 ) -> State:
     """Solve forward kinematics for readings q (t | 1, n, a) and values (t | 1, p).
 
@@ -68,7 +69,8 @@ def forward_trials(
     singularity, is solved again along the straight path from the start's readings. Rows that still
     fail are marked, see `Status`. Redundant readings contradict each other by their errors; a row
     that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
-    these rows are marked at once, in a fraction of the time.
+    these rows are marked at once, in a fraction of the time. With a `goal` (t, n), a row that comes
+    close to it ends there as `engine.NEAR_GOAL`.
     """
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
@@ -77,7 +79,7 @@ def forward_trials(
         # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
     begin = clear_sign(robot, start or robot.home_state)
-    state = clear_sign(robot, engine.solve(robot.program, e, joints, begin))
+    state = clear_sign(robot, engine.solve(robot.program, e, joints, begin, goal=goal))
     wrong = _find_wrong_rows(robot, state, begin)
     if not wrong.any():
         return state
@@ -110,7 +112,7 @@ def inverse_trials(
     names, size = robot.controlled, robot.size
     t, n = max(len(values), len(target)), target.shape[1]
     wanted = np.broadcast_to(target, (t, n, target.shape[2]))
-    flat = wanted.reshape(t * n, -1)
+    flat = wanted.reshape(t * n, target.shape[2])
 
     def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         return compare_coordinates(T, flat[rows], names, size)
@@ -166,11 +168,17 @@ def clear_sign(robot: Mechanism, state: State) -> State:
     return replace(state, closure_sign=np.zeros_like(state.closure_sign))
 
 
+def _find_open_rows(robot: Mechanism, state: State) -> BoolArray:
+    """Return the rows that failed or left a wide gap."""
+    return (state.status != Status.CONVERGED) | (state.residual > WIDE * robot.size)
+
+
 def _find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
     """Return the rows that failed, ended beyond a singularity or left a wide gap."""
     closed = state.status == Status.CONVERGED
     beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
-    return ~closed & (state.status != Status.NOT_FINITE) | closed & beyond
+    failed = ~closed & (state.status != Status.NOT_FINITE) & (state.status != engine.NEAR_GOAL)
+    return failed | closed & beyond
 
 
 def _follow_path(
@@ -221,8 +229,8 @@ def _take_steps(
 ) -> State:
     """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
 
-    With `leave`, a row that fails on the way goes to the end at once: there the path leaves the
-    reach of the robot, and each further step would use all its iterations.
+    With `leave`, a row that fails or opens wide on the way goes to the end at once: there the path
+    leaves the reach of the robot, and each further step would use many iterations for nothing.
     """
     origin, target = path
     current, moving = begin, np.arange(len(target))
@@ -234,7 +242,7 @@ def _take_steps(
         )
         current = replace_rows(current, moving, zero, clear_sign(robot, solved))
         if leave and step < count:
-            failed = moving[current.status[moving, 0] != Status.CONVERGED]
+            failed = moving[_find_open_rows(robot, current)[moving, 0]]
             if len(failed):
                 zero = np.zeros(len(failed), int)
                 state = select_rows(current, (len(target), 1), failed, zero)

@@ -40,9 +40,10 @@ def find_impossible_values(
     deviation = np.abs(values - robot.parameters.nominal)
     largest = int(np.argmax(deviation))
     unit = robot.get_unit(robot.parameters.dimensions[largest])
+    gap = float(state.residual[0, 0])
     finding = report_finding(
         "mechanism.values-open-loops",
-        gap=Quantity(float(state.residual[0, 0]) * 1e3, "mm"),
+        gap=Quantity(gap * 1e3, "mm") if np.isfinite(gap) else None,
         name=robot.parameters.names[largest],
         value=Quantity(float(values[largest]) / unit.factor_to_si, unit.symbol),
         nominal=robot.to_quantity(

@@ -26,7 +26,7 @@ from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
 
-BLOCK_ROWS = 512
+BLOCK_ROWS = 1024
 """Rows linearized together."""
 
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal import geometry
-from loopcal.engine import State
+from loopcal.engine import NEAR_GOAL, State
 from loopcal.mechanism.batch_kinematics import (
     clear_sign,
     compute_readings,
@@ -70,16 +70,18 @@ def find_other_modes(robot: Mechanism, state: State, begin: State) -> BoolArray:
     """Return the closed rows (n,) of a state (1, n) whose readings lead elsewhere from `begin`.
 
     Forward kinematics accepts no solution of another sign, so rows of another sign are not solved.
+    It ends where it comes close to the pose of the state, to which it would converge.
     """
     begin, closed = clear_sign(robot, begin), state.status[0] == Status.CONVERGED
     is_other = closed & (clear_sign(robot, state).closure_sign[0] != begin.closure_sign[0])
     rows = np.flatnonzero(closed & ~is_other)
     values, chosen = robot.values[None], select_poses(state, rows)
     q = compute_readings(robot, values, chosen)
-    back = forward_trials(robot, values, q, select_poses(begin, rows))
-    gap = np.abs(geometry.pose_difference(back.T[0], chosen.T[0]) * robot.twist_scale).max(axis=1)
-    returned = (back.status[0] == Status.CONVERGED) & (gap <= SAME_POSE * robot.size)
-    is_other[rows] = ~returned
+    back = forward_trials(robot, values, q, select_poses(begin, rows), goal=chosen)
+    is_other[rows] = back.status[0] != NEAR_GOAL
+    ended = back.status[0] == Status.CONVERGED
+    gap = geometry.pose_difference(back.T[0, ended], chosen.T[0, ended]) * robot.twist_scale
+    is_other[rows[ended]] = np.abs(gap).max(axis=1, initial=0.0) > SAME_POSE * robot.size
     return is_other
 
 

@@ -261,6 +261,8 @@ class Halving:
 
     def is_negligible(self, change: FloatArray, cost: FloatArray) -> BoolArray:
         """Return which squared changes (a,) of the residuals are negligible."""
+        if not self.relative:  # infinity times zero is no number
+            return (change <= self.absolute**2) & np.isfinite(cost)
         return change <= self.relative**2 * cost + self.absolute**2
 
     def is_worse(self, cost: FloatArray, before: FloatArray) -> BoolArray:

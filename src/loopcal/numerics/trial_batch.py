@@ -66,9 +66,11 @@ class TrialBatch:
         return map_arrays(replaced, self, other)
 
     def _are_all(self, trials: IntArray) -> bool:
-        """Return whether these indices are those of all trials; a mask [False, True] is not."""
-        is_mask = trials.dtype == np.bool_
-        return not is_mask and np.array_equal(trials, np.arange(_count_trials(self)))
+        """Return whether these indices, or this mask, are all trials in their order."""
+        count = _count_trials(self)
+        if trials.dtype == np.bool_:
+            return len(trials) == count and bool(trials.all())
+        return len(trials) == count and np.array_equal(trials, np.arange(count))
 
     @staticmethod
     def join(parts: Sequence[Value]) -> Value:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.argument_types import check_fields
 from loopcal.errors import DataError
 from loopcal.mechanism import (
     NEAR_SHARE,
@@ -55,6 +56,7 @@ class LineOfSight:
     farthest: float = np.inf
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("station", "facing"):
             given = np.array(getattr(self, name), dtype=float)
             if given.shape != (3,) or not np.isfinite(given).all():
@@ -115,6 +117,7 @@ class Constraints:
     sight: LineOfSight | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not 0.0 <= self.min_margin < 1.0:
             raise DataError(
                 f"the margin from singularities is {self.min_margin:g}; give a share of the "

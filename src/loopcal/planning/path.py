@@ -39,6 +39,12 @@ LEAST_GAIN = 1e-12
 """Share of the length by which a path must become shorter to count: rounding is no gain."""
 
 
+REVERSALS = 50
+"""Reversals of sections for each pose of an order, at most: about one is enough."""
+ORDERS = 100
+"""Orders that are computed anew because a path is not allowed, at most."""
+
+
 def locate_home(robot: Mechanism) -> FloatArray:
     """Return the controlled coordinates (c,) of home [m, rad], where every path starts."""
     return read_coordinates(robot.home, robot.controlled)
@@ -142,11 +148,14 @@ class VisitingOrder:
     via_home : (n,) True where the path goes via home before the pose, because the straight path is
         not allowed.
     length : of the whole path from home to the last pose [m], see `measure_distance`.
+    is_converged : whether no reversal of a section makes it shorter; False where the search ran out
+        of steps. Paths that were not checked then go via home.
     """
 
     order: IntArray
     via_home: BoolArray
     length: float
+    is_converged: bool
 
 
 def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
@@ -162,8 +171,8 @@ def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
     known, free = np.eye(n, dtype=bool), np.ones((n, n), dtype=bool)
     # A path is checked when an order uses it; one that is not allowed costs the way via home, and
     # the order is computed anew.
-    while True:
-        order, length = find_short_order(np.where(free, direct, around), from_home)
+    order, length, is_converged = find_short_order(direct, from_home)
+    for _ in range(ORDERS):
         first, second = order[:-1], order[1:]
         new = ~known[first, second]
         if not new.any():
@@ -172,23 +181,28 @@ def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
         allowed = check_paths(checker, poses[first], poses[second]).allowed
         known[first, second] = known[second, first] = True
         free[first, second] = free[second, first] = allowed
-    via = np.concatenate([[False], ~free[order[:-1], order[1:]]])
-    return VisitingOrder(order, via, length)
+        order, length, is_converged = find_short_order(np.where(free, direct, around), from_home)
+    first, second = order[:-1], order[1:]
+    usable, is_checked = free & known, bool(known[first, second].all())
+    if not is_checked:
+        length = float(from_home[order[0]] + np.where(usable, direct, around)[first, second].sum())
+    via = np.concatenate([[False], ~usable[first, second]])
+    return VisitingOrder(order, via, length, is_checked and is_converged)
 
 
-def find_short_order(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray, float]:
-    """Return a short order (n,) and its length, from symmetric costs (n, n) and costs from home
-    (n,).
+def find_short_order(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray, float, bool]:
+    """Return a short order (n,), its length, and whether no reversal makes it shorter, from
+    symmetric costs (n, n) and costs from home (n,).
     """
     n = len(cost)
     whole = np.zeros((n + 1, n + 1))
     whole[1:, 1:], whole[0, 1:], whole[1:, 0] = cost, from_home, from_home
-    best: tuple[IntArray, float] | None = None
+    best: tuple[IntArray, float, bool] | None = None
     for first in np.argsort(from_home, kind="stable")[:FIRST_POSES]:
-        tour = _reverse_sections(whole, _visit_nearest(whole, int(first) + 1))
+        tour, is_converged = _reverse_sections(whole, _visit_nearest(whole, int(first) + 1))
         length = float(whole[tour[:-1], tour[1:]].sum())
         if best is None or length < best[1] * (1.0 - LEAST_GAIN):
-            best = (tour[1:] - 1, length)
+            best = (tour[1:] - 1, length, is_converged)
     assert best is not None
     return best
 
@@ -202,14 +216,17 @@ def _visit_nearest(cost: FloatArray, first: int) -> IntArray:
     return np.array(tour)
 
 
-def _reverse_sections(cost: FloatArray, tour: IntArray) -> IntArray:
-    """Return the tour after reversing the section that shortens it most, until none does.
+def _reverse_sections(cost: FloatArray, tour: IntArray) -> tuple[IntArray, bool]:
+    """Return the tour after reversing the section that shortens it most, until none does, and
+    whether none does.
 
     The end is free, the beginning is not.
     """
     tour = np.array(tour)
     m = len(tour)
-    while m > 2:
+    if m <= 2:
+        return tour, True
+    for _ in range(REVERSALS * m):
         steps = cost[tour[:-1], tour[1:]]
         # reversing i..j replaces the steps before i and after j; after the last pose there is none
         after = np.concatenate([steps[1:], [0.0]])
@@ -221,6 +238,6 @@ def _reverse_sections(cost: FloatArray, tour: IntArray) -> IntArray:
         gain[np.tril_indices(m - 1)] = -np.inf
         i, j = np.unravel_index(int(np.argmax(gain)), gain.shape)
         if not gain[i, j] > LEAST_GAIN * steps.sum():
-            break
+            return tour, True
         tour[i + 1 : j + 2] = tour[i + 1 : j + 2][::-1]
-    return tour
+    return tour, False

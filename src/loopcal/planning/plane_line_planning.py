@@ -75,6 +75,8 @@ class SurfacePlan:
         tolerances as prior information.
     sd_first, sd_last : root mean square standard deviation of these, in tolerances, as drawn and as
         planned.
+    is_converged : whether moving points further gains hardly anything; False where the passes over
+        the coordinates ran out.
     """
 
     robot: Mechanism
@@ -86,6 +88,7 @@ class SurfacePlan:
     possible: int
     sd_first: float
     sd_last: float
+    is_converged: bool = True
 
     def list_roles(self) -> tuple[str, ...]:
         """Return the role of each point of a group: on both, on the line, in the plane."""
@@ -125,6 +128,7 @@ class SurfacePlan:
         """Everything that the plan reports."""
         u, k = self.poses.groups.shape
         few = () if self.rank == self.possible else (self._report_few_groups(),)
+        exhausted = report_finding("plan.sweeps-exhausted", sweeps=SWEEPS)
         return (
             report_finding(
                 "plan.surfaces",
@@ -141,6 +145,7 @@ class SurfacePlan:
                 sd_last=self.sd_last,
             ),
             *few,
+            *(() if self.is_converged else (exhausted,)),
             report_finding("plan.readings-are-measured"),
         )
 
@@ -240,6 +245,7 @@ def plan_surfaces(
         possible,
         _rms_sd(rows[: options.groups], rank),
         _rms_sd(best.rows, rank),
+        best.is_converged,
     )
 
 

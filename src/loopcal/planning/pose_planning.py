@@ -27,6 +27,7 @@ from loopcal.planning.design import (
     factor_design,
     is_allowed,
 )
+from loopcal.planning.design.exchange import EXCHANGES
 from loopcal.planning.options import N_POSES, PlanOptions
 from loopcal.planning.path import order_poses
 from loopcal.planning.prediction import ExpectedErrors
@@ -161,15 +162,14 @@ def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> 
         min(best.efficiency, 1.0),
         int(is_allowed(rows).sum()),
     )
-    return Plan(
-        robot,
-        problem.instrument,
-        options,
-        _arrange_poses(problem, chosen, held_out),
-        quality,
-        forecast,
-        _collect_notes(problem),
-    )
+    poses, is_order_short = _arrange_poses(problem, chosen, held_out)
+    notes = list(_collect_notes(problem))
+    if not best.design.is_converged:
+        counts = {"counted": problem.group_name, "exchanges": EXCHANGES * n}
+        notes.append(report_finding("plan.exchanges-exhausted", **counts))
+    if not is_order_short:
+        notes.append(report_finding("plan.order-exhausted"))
+    return Plan(robot, problem.instrument, options, poses, quality, forecast, tuple(notes))
 
 
 def _require_numbers(problem: PlanningProblem, n_poses: int) -> int:
@@ -228,8 +228,12 @@ def _require_candidates(problem: PlanningProblem, rows: FloatArray, n: int) -> N
         )
 
 
-def _arrange_poses(problem: PlanningProblem, chosen: IntArray, held_out: IntArray) -> PlannedPoses:
-    """Return the poses of groups for the fit and for validation in the order of visiting."""
+def _arrange_poses(
+    problem: PlanningProblem, chosen: IntArray, held_out: IntArray
+) -> tuple[PlannedPoses, bool]:
+    """Return the poses of groups for the fit and for validation in the order of visiting, and
+    whether the search for a short order came to its end.
+    """
     members = problem.groups.members
     selected = members[np.concatenate([chosen, held_out])]
     poses = np.unique(selected)
@@ -238,7 +242,7 @@ def _arrange_poses(problem: PlanningProblem, chosen: IntArray, held_out: IntArra
     ordered = poses[visit.order]
     place = np.empty(len(candidates), dtype=np.int64)
     place[ordered] = np.arange(len(ordered))
-    return PlannedPoses(
+    planned = PlannedPoses(
         _name_poses(problem, len(ordered)),
         candidates.coordinates[ordered],
         _round_readings(problem.robot, candidates.solution.q[ordered]),
@@ -247,6 +251,7 @@ def _arrange_poses(problem: PlanningProblem, chosen: IntArray, held_out: IntArra
         place[selected],
         visit.length,
     )
+    return planned, visit.is_converged
 
 
 def _round_readings(robot: Mechanism, readings: FloatArray) -> FloatArray:

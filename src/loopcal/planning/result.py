@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Instrument
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.planning.options import PlanOptions
@@ -174,7 +175,7 @@ class Plan:
         return (
             f"Plan({self.robot.name}: {self.n_poses} poses for the fit, "
             f"{int(self.poses.held_out.sum())} held out, criterion {self.options.criterion}, "
-            f"efficiency at least {self.quality.efficiency:.3f})"
+            f"efficiency at least {round_to_digits(self.quality.efficiency)})"
         )
 
     def __str__(self) -> str:

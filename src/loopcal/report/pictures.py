@@ -3,8 +3,13 @@
 
 from __future__ import annotations
 
+import re
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.parsers import expat
+
+from loopcal.errors import FileError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -15,6 +20,9 @@ DPI = 150
 
 SALT = "loopcal"
 """Identifiers in an SVG are random without a salt."""
+
+_PDF_END = re.compile(rb"startxref\s+(\d+)\s+%%EOF\s*\Z")
+"""End of a PDF file, with the place of its table of objects."""
 
 METADATA: dict[str, dict[str, None]] = {
     ".png": {},
@@ -55,6 +63,26 @@ def show_names(figure: Figure) -> Figure:
         assert isinstance(text, Text)
         text.set_parse_math(False)
     return figure
+
+
+def check_picture(path: Path) -> None:
+    """Read a picture that was written; raise an exception where it is not complete.
+
+    PNG is decoded, SVG is parsed, and of PDF the first line and the place of its table of objects
+    are read.
+    """
+    if path.suffix.lower() == ".png":
+        from matplotlib.image import imread
+
+        imread(path)
+        return
+    content = path.read_bytes()
+    if path.suffix.lower() == ".svg":
+        expat.ParserCreate().Parse(content, True)
+        return
+    end = _PDF_END.search(content)
+    if not content.startswith(b"%PDF-") or end is None or content[int(end[1]) :][:4] != b"xref":
+        raise FileError("this picture is not a complete PDF file", path)
 
 
 def render_figure(figure: Figure, ending: str) -> bytes:

@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
-from loopcal.report.pictures import FORMATS, render_figure, show_names
+from loopcal.report.pictures import FORMATS, check_picture, render_figure, show_names
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -83,9 +83,15 @@ def save_picture(
     robot: Mechanism,
     solution: Solution | None = None,
     row: int = 0,
-    write: Callable[[Path, bytes], object] = Path.write_bytes,
+    *,
+    write: Callable[[Path, bytes, Callable[[Path], object]], object],
 ) -> None:
-    """Write the picture of a robot to a file, by the function `write`.
+    """Write the picture of a robot to a file.
+
+    Parameters
+    ----------
+    write : writes bytes to a file that the given function reads, such as
+        `loopcal.io.core.text_file.write_bytes`.
 
     Raises
     ------
@@ -98,7 +104,7 @@ def save_picture(
             f"{', '.join(FORMATS)}",
             path,
         )
-    write(path, render_figure(draw(robot, solution, row), path.suffix.lower()))
+    write(path, render_figure(draw(robot, solution, row), path.suffix.lower()), check_picture)
 
 
 def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:

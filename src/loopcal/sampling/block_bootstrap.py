@@ -140,19 +140,19 @@ class Bootstrap:
     def findings(self) -> tuple[Finding, ...]:
         """How many resamples failed, and whether the stated intervals agree with the scatter."""
         total = len(self.draws) + self.failed
-        found = []
+        findings = []
         if self.failed > MOST_FAILED * total:
-            found.append(report_finding("sampling.failures", failed=self.failed, count=total))
+            findings.append(report_finding("sampling.failures", failed=self.failed, count=total))
         codes = ("sampling.bootstrap-agrees", "sampling.bootstrap-differs")
-        found += report_intervals(self.intervals(kind="percentile"), *codes)
+        findings += report_intervals(self.intervals(kind="percentile"), *codes)
         if not isinstance(self.fit.method, MAP | LeastSquares):
             name = type(self.fit.method).__name__
-            found.append(report_finding("sampling.bias-not-drawn", method=name))
+            findings.append(report_finding("sampling.bias-not-drawn", method=name))
         if self.scheme == "normal" or not isinstance(self.fit.method, MAP | LeastSquares):
-            return tuple(found)
+            return tuple(findings)
         stated = np.where(self.is_known, self.fit.standard_deviations, np.nan)
         ratio = self.standard_deviations / stated
-        return (*found, self.scatter.report(self.fit.names, ratio, self.blocks))
+        return (*findings, self.scatter.report(self.fit.names, ratio, self.blocks))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what was drawn and what was found, for JSON."""

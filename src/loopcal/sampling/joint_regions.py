@@ -29,6 +29,7 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.multiple_tests import compute_single_level
@@ -65,7 +66,7 @@ class JointRegion:
     square: float
 
     def __repr__(self) -> str:
-        return f"<JointRegion of {', '.join(self.names)}: {100 * self.level:.4g} %>"
+        return f"<JointRegion of {', '.join(self.names)}: {round_to_digits(100 * self.level, 4)} %>"
 
     @property
     def standard_deviations(self) -> FloatArray:
@@ -143,7 +144,7 @@ class SimultaneousIntervals:
     single: FloatArray
 
     def __repr__(self) -> str:
-        names = f"{len(self.names)} quantities at {100 * self.level:.4g} %"
+        names = f"{len(self.names)} quantities at {round_to_digits(100 * self.level, 4)} %"
         return f"<SimultaneousIntervals of {names} by {self.rule}>"
 
     def contains(self, values: FloatArray) -> np.ndarray:
@@ -158,7 +159,7 @@ class SimultaneousIntervals:
 
 def compute_joint_region(
     fit: Identification | Posterior,
-    names: Sequence[str] | None = None,
+    names: str | Sequence[str] | None = None,
     level: float = LEVEL,
     combinations: FloatArray | None = None,
 ) -> JointRegion:
@@ -189,7 +190,7 @@ def compute_joint_region(
 
 def compute_simultaneous_intervals(
     fit: Identification | Posterior,
-    names: Sequence[str] | None = None,
+    names: str | Sequence[str] | None = None,
     level: float = LEVEL,
     rule: Rule = "maximum",
     combinations: FloatArray | None = None,
@@ -258,7 +259,7 @@ class _Selection:
 
 def _select(
     fit: Identification | Posterior,
-    names: Sequence[str] | None,
+    names: str | Sequence[str] | None,
     level: float,
     combinations: FloatArray | None,
 ) -> _Selection:
@@ -280,10 +281,15 @@ def _select(
     labels = tuple(posterior.names[i] for i in places)
     if combinations is not None:
         rows = np.atleast_2d(np.asarray(combinations, dtype=np.float64))
-        if rows.shape[1] != len(places):
+        if rows.ndim != 2 or rows.shape[1] != len(places):
             raise EstimationError(
-                f"combinations have {rows.shape[1]} columns for {len(places)} parameters; give one "
-                "factor for each"
+                f"combinations have shape {rows.shape} for {len(places)} parameters; give rows "
+                "with one factor for each"
+            )
+        if not np.isfinite(rows).all() or not rows.any(axis=1).all():
+            raise EstimationError(
+                "combinations have a row of zeros, or a number that is not finite; give finite "
+                "factors, not all of them 0"
             )
         effect, labels = rows @ effect, tuple(f"combination {i + 1}" for i in range(len(rows)))
         open_part = effect * posterior.unit @ posterior.directions[:, np.isinf(posterior.variance)]
@@ -294,17 +300,17 @@ def _select(
     return _Selection(posterior, labels, center, effect, effect @ posterior.root)
 
 
-def _find_places(available: tuple[str, ...], names: Sequence[str]) -> IntArray:
+def _find_places(available: tuple[str, ...], names: str | Sequence[str]) -> IntArray:
     """Return the places of names or patterns among the available names, in the order of these."""
     if isinstance(names, str):
         names = [names]
     chosen = []
     for name in names:
-        found = [i for i, known in enumerate(available) if fnmatchcase(known, name)]
-        if not found:
+        matching = [i for i, known in enumerate(available) if fnmatchcase(known, name)]
+        if not matching:
             similar = suggest_names(name, available)
             raise EstimationError(f"no free parameter is called {name!r}{similar}")
-        chosen += [i for i in found if i not in chosen]
+        chosen += [i for i in matching if i not in chosen]
     return np.array(chosen, dtype=np.int64)
 
 

@@ -117,7 +117,11 @@ class PosteriorSample:
             size_or_tail = {"size": size, "count": len(self.draws), "shape": self.tail_shape}
             return (report_finding("sampling.few-effective-draws", **size_or_tail),)
         codes = ("sampling.posterior-agrees", "sampling.posterior-differs")
-        return (*report_intervals(intervals, *codes), *self._report_wider())
+        rest = [*report_intervals(intervals, *codes), *self._report_wider()]
+        if self.rounds == ROUNDS and size < GOOD_SHARE * len(self.draws):
+            tried = {"rounds": ROUNDS, "size": size, "count": len(self.draws)}
+            rest.append(report_finding("sampling.proposals-exhausted", **tried))
+        return tuple(rest)
 
     def _report_wider(self) -> list[Finding]:
         """Return whether stated intervals allow for more than the posterior contains."""

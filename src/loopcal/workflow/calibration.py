@@ -129,9 +129,9 @@ def _refuse_far_rows(conventions: ConventionCheck, options: CalibrationOptions) 
     Every fold without them would be fitted well and predict them badly, and every fit with them
     takes all of its iterations.
     """
-    found = conventions.finding
-    if options.choose_model and found is not None and found.code == "conventions.rows-far-off":
-        raise DataError(report_finding("model.rows-far-off", poses=found.data["poses"]))
+    finding = conventions.finding
+    if options.choose_model and finding is not None and finding.code == "conventions.rows-far-off":
+        raise DataError(report_finding("model.rows-far-off", poses=finding.data["poses"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,8 @@ def _fit(
             )
         )
     count.begin(f"fitting {free} parameters")
-    return _FitResult(identify(chosen, data, options=fit_options), choice=choice)
+    fit = identify(chosen, data, options=fit_options, progress=count.progress)
+    return _FitResult(fit, choice=choice)
 
 
 def _report(

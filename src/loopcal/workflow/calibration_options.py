@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from loopcal.apply.validation_findings import check_limit
+from loopcal.argument_types import check_seed
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, Posterior
 from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_number, check_seed, check_type
+from loopcal.measure.array_checks import check_number, check_type
 from loopcal.mechanism import Mechanism
 
 

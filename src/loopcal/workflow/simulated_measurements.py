@@ -35,7 +35,8 @@ def simulate_measurements(
     *,
     draw_errors: bool = False,
     reading_sigma: ArrayLike | None = None,
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str] = (),
+    places: Sequence[str] = (),
     seed: int = 1,
 ) -> SimulatedMeasurements:
     """Command a robot to poses by its nominal geometry, and measure where the true machine goes.
@@ -46,7 +47,9 @@ def simulate_measurements(
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
     draw_errors : draw the true machine from the tolerances instead.
     reading_sigma : (a,) [SI] noise of the recorded readings; None as the robot states.
-    labels : (n,) names of the poses; None numbers them. seed : of poses, errors and noise.
+    labels : (n,) names of the poses, which are numbered without them.
+    places : (n,) places of the poses such as `poses.csv:12`, for messages.
+    seed : of poses, errors and noise.
 
     Raises
     ------
@@ -55,10 +58,11 @@ def simulate_measurements(
     """
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     targets = resolve_poses(truth.nominal, poses, seed)
-    data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma)
-    if labels is not None:
+    names = (labels, places)
+    data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma, pose_names=names)
+    if labels:
         data = replace(data, labels=tuple(labels))
-    check_strokes(data, truth)
+    check_strokes(data, truth, places=dict(enumerate(places)))
     return SimulatedMeasurements(data, truth)
 
 
@@ -103,6 +107,8 @@ def predict_noise_free(
     poses: ArrayLike | int = 40,
     *,
     reading_sigma: ArrayLike | None = None,
+    labels: Sequence[str] = (),
+    places: Sequence[str] = (),
     seed: int = 1,
 ) -> Measurements:
     """Return what an instrument would measure of the robot as it is, to analyze its data.
@@ -110,7 +116,9 @@ def predict_noise_free(
     Parameters
     ----------
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
-    seed : of the poses.
+    labels, places : (n,) names of the poses, and their places, for messages. seed : of the poses.
     """
-    targets = resolve_poses(robot, poses, seed)
-    return simulate(robot, targets, instrument, 0, robot, reading_sigma=reading_sigma)
+    targets, names = resolve_poses(robot, poses, seed), (labels, places)
+    return simulate(
+        robot, targets, instrument, 0, robot, reading_sigma=reading_sigma, pose_names=names
+    )

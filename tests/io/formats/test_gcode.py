@@ -13,20 +13,7 @@ from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from loopcal.mechanism import Mechanism
-
-REPRAP = """\
-; config-override.g, ours ; keep
-M665 L269.100:269.200:269.300 R130.250 H301.500 B140.0 X-0.100 Y0.200 Z0.000
-G28 ; home
-M666 X0.500 Y-0.200 Z-0.300 A0.00 B0.00
-M307 H0 A139.0 X9
-"""
-MARLIN = """\
-echo:; Delta settings:
-echo:  M665 L269.10 R130.25 H300.00 S100.00 X-0.10 Y0.20 Z0.00 A0.00 B0.10 C-0.10
-echo:  M666 X-0.50 Y0.00 Z-0.25
-echo:  M851 X0.00 Y0.00 Z-1.50 ; (mm)
-"""
+from tools.fuzz.sources import MARLIN, REPRAP
 
 
 def import_robot(folder: Path, name: str, text: str) -> Mechanism:
@@ -218,3 +205,22 @@ def test_corrected_and_added_words_update_the_checksum(tmp_path) -> None:
     for byte in code.encode():
         checksum ^= byte
     assert written == f"{code}*{checksum} ; ours\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("reprap", MARLIN, ":2: 'echo:' in front of M665 belongs to Marlin, whose end stops count"),
+        ("reprap", MARLIN.replace("echo:", ""), ":4: M851 belongs to Marlin.*format marlin"),
+        ("marlin", REPRAP, ":2: a list of lengths in M665 L belongs to RepRap.*format reprap"),
+        ("marlin", "M665 L250 R130 H300\nM584 X0\n", ":2: M584 belongs to RepRapFirmware"),
+    ],
+)
+def test_a_file_of_the_other_firmware_is_refused(tmp_path, name, text, sentence) -> None:
+    """Their adjustments of end stops have opposite signs."""
+    with pytest.raises(FileError, match=sentence):
+        import_robot(tmp_path, name, text)
+    robot = import_robot(tmp_path, "marlin", MARLIN)
+    (tmp_path / "into.g").write_text(text)
+    with pytest.raises(FileError, match=sentence):
+        export_robot(robot, name, tmp_path / "into.g")

@@ -50,6 +50,7 @@ from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, forward
 
@@ -102,7 +103,7 @@ class ConventionCheck:
 
     def __repr__(self) -> str:
         code = "agrees" if self.finding is None else self.finding.code
-        return f"<ConventionCheck: {code}, misfit {self.misfit:.3g}>"
+        return f"<ConventionCheck: {code}, misfit {round_to_digits(self.misfit)}>"
 
     def __str__(self) -> str:
         return repr(self) if self.finding is None else str(self.finding)

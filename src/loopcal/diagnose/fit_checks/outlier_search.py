@@ -266,11 +266,13 @@ def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) ->
     suspects = suspects[np.argsort(-end.ratio[suspects], kind="stable")][:MOST_COMPARED]
     for done, i in enumerate(suspects):
         progress(done, len(suspects), "comparing suspected poses with others")
+        far = float(compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit))
+        if not _may_have_rivals(end, i, far):
+            continue
         excluded = end.excluded.copy()
         excluded[i] = False
         back = refit(excluded)
         square = back.influence.distance / end.scale**2
-        far = float(compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit))
         group = np.zeros_like(excluded)
         near = ~end.excluded & (back.p_value() < limit) & (square > square[i] - far)
         for j in np.flatnonzero(near):
@@ -282,6 +284,21 @@ def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) ->
             group[i] = True
             groups.append(group)
     return _join_groups(groups)
+
+
+def _may_have_rivals(end: PartialFit, i: int, far: float) -> bool:
+    """Return whether any d_j^2 may come within `far` of d_i^2 with block i back in the fit.
+
+    Block i then moves the fit by at most d_i in the norm of the information, and d_j by at most
+    sqrt(g / (1 - g)) d_i, where the largest eigenvalue g of G_j is at most the leverage of j. Both
+    d_i^2 and the information of the others are as before. Where one of very many blocks is far off,
+    this takes the place of a fit.
+    """
+    leverage, distance = end.influence.leverage, np.sqrt(end.influence.distance) / end.scale
+    inside = np.where(leverage < 1.0, leverage, 0.0)
+    moved = np.where(leverage < 1.0, np.sqrt(inside / (1.0 - inside)), np.inf)
+    largest = np.where(end.excluded, 0.0, distance + moved * distance[i])
+    return bool((largest**2 > distance[i] ** 2 - far).any())
 
 
 def list_suspected_in_turn(fits: tuple[PartialFit, ...]) -> list[BoolArray]:

@@ -34,13 +34,19 @@ from loopcal.diagnose.fit_checks.outlier_search import (
 from loopcal.errors import LoopcalError
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.identification import identify
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.losses import Tukey
+from loopcal.estimate.minimization.robust_descent import estimate_scale_of, measure_block_distances
 from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
+from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.typing import Progress, report_no_progress
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
+
+MOST_ROBUST = 20_000
+"""Blocks that a robust fit is made from: it is where the others are compared, not a result."""
 
 
 @dataclass(frozen=True)
@@ -179,11 +185,14 @@ def find_outliers(
     problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
     member = np.unique(linked_blocks(data), return_inverse=True)[1]
     labels = list_block_labels(data.labels, member)
-    reference = _refit_robustly(fit, data) if fit.residual_test.failed else fit
+    reference = _refit_robustly(fit, data, member, progress) if fit.residual_test.failed else fit
     z = fit.free_parameters.deviation(reference.robot.values[None])
     start = problem.linearize(z, problem.start(z)).next_start
     low_weight = np.zeros(len(labels), dtype=bool)
-    low_weight[member] = reference.pose_weights < 0.5
+    if len(reference.pose_weights) == len(member):
+        low_weight[member] = reference.pose_weights < 0.5
+    else:
+        low_weight = _weigh_blocks(problem, z, start, member) < 0.5
 
     noise = fit.residual_test.noise
     refit = partial(fit_without, fit, problem, member, deviation=z, start=start, noise=noise)
@@ -230,14 +239,29 @@ def find_outliers(
     )
 
 
-def _refit_robustly(fit: Identification, data: Measurements) -> Identification:
-    """Return a robust fit of the same data; the fit itself where it does not converge."""
+def _refit_robustly(
+    fit: Identification, data: Measurements, member: IntArray, progress: Progress
+) -> Identification:
+    """Return a robust fit; the fit itself where it does not converge.
+
+    `member` (n,) is the block of each pose. Of many blocks, an even choice is fitted.
+    """
+    count = int(member.max()) + 1
+    if count > MOST_ROBUST:
+        chosen = np.linspace(0, count - 1, MOST_ROBUST).astype(np.int64)
+        data = data.take(np.isin(member, chosen))
     options = replace(fit.options, loss=Tukey(), noise="estimated")
     try:
-        robust = identify(fit.initial, data, options=options)
+        robust = identify(fit.initial, data, options=options, progress=progress)
     except LoopcalError:
         return fit
     return robust if robust.converged else fit
+
+
+def _weigh_blocks(problem: Problem, z: FloatArray, start: Start, member: IntArray) -> FloatArray:
+    """Return the weights (u,) of blocks in a robust fit at z (1, p), which others determined."""
+    distance, degrees = measure_block_distances(problem, z, start, member, problem)
+    return Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)
 
 
 def _summarize(

@@ -20,6 +20,7 @@ import numpy as np
 
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
+from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -105,12 +106,13 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
 def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
     """Sum of squares between repeats, and its degrees of freedom; each kind has its own means."""
     problem = problem_of(fit.free_parameters, data)
-    z = fit.free_parameters.deviation(fit.robot.values[None])
+    groups = [_group_repeats(rows, member) for rows in problem.rows]
     total, degrees = 0.0, 0
+    if all(len(np.unique(of_rows)) == len(of_rows) for of_rows in groups):
+        return total, degrees
+    z = fit.free_parameters.deviation(fit.robot.values[None])
     residuals = problem.residuals(z, problem.solve(z, problem.start(z)))
-    for rows, residual in zip(problem.rows, residuals, strict=True):
-        same = np.column_stack([member[rows.poses_by_link], rows.nuisance])
-        group_of_row = np.unique(same, axis=0, return_inverse=True)[1].ravel()
+    for rows, group_of_row, residual in zip(problem.rows, groups, residuals, strict=True):
         for group in np.flatnonzero(np.bincount(group_of_row) > 1):
             chosen = group_of_row == group
             W = rows.whitener[0, chosen]
@@ -121,6 +123,12 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
             total += float(((b - A @ mean) ** 2).sum())
             degrees += int(present.sum()) - int(rank)
     return total, degrees
+
+
+def _group_repeats(rows: ObservationRows, member: IntArray) -> IntArray:
+    """Return the group (r,) of rows of one kind that repeat each other."""
+    same = np.column_stack([member[rows.poses_by_link], rows.nuisance])
+    return np.asarray(np.unique(same, axis=0, return_inverse=True)[1].ravel())
 
 
 def _untested(

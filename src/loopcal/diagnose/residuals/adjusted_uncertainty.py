@@ -24,7 +24,12 @@ from loopcal.diagnose.residuals.residual_patterns import (
     find_patterns,
 )
 from loopcal.diagnose.residuals.residual_rows import ResidualRows, collect_residual_rows
-from loopcal.diagnose.tool_errors import MOST_POSES, linearize_tool_errors, locate_measured_poses
+from loopcal.diagnose.tool_errors import (
+    MOST_POSES,
+    choose_evenly,
+    linearize_tool_errors,
+    locate_measured_poses,
+)
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.added_covariance import add_covariance
@@ -33,6 +38,7 @@ from loopcal.estimate.inference.residual_test import choose_severity
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.mechanism import Solution
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS
 
@@ -65,14 +71,20 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     linear = linearize_fit(fit, data)
     rows = collect_residual_rows(fit, data, linear)
-    slow = find_slow_errors(fit, data, linear)
+    measured = locate_measured_poses(fit, data)
+    slow = find_slow_errors(fit, data, linear, measured.T)
     if rows is not None:
-        fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
+        fit = _add_patterns(fit, data, rows, measured, is_slow=slow is not None)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 
 def _add_patterns(
-    fit: Identification, data: Measurements, rows: ResidualRows, *, is_slow: bool
+    fit: Identification,
+    data: Measurements,
+    rows: ResidualRows,
+    measured: Solution,
+    *,
+    is_slow: bool,
 ) -> Identification:
     """Return a fit whose covariance allows for the patterns of its residuals. A dependence on a
     reading is a slow error of the poses, and counts once where such errors were found.
@@ -82,7 +94,7 @@ def _add_patterns(
     is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
     if not (effects or patterns.is_correlated or is_small):
         return fit
-    tool = state_tool_uncertainty(fit, data)
+    tool = state_tool_uncertainty(fit, measured)
     for effect in effects:
         root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
         finding = _report_effect(effect, tool.measure_growth(root))
@@ -143,9 +155,9 @@ class ToolUncertainty:
         return float(np.sqrt(1.0 + max(shares, default=0.0)))
 
 
-def state_tool_uncertainty(fit: Identification, data: Measurements) -> ToolUncertainty:
-    """Return the uncertainty of the measured poses of a fit, frames fitted."""
-    posterior, solution = fit.posterior, locate_measured_poses(fit, data, MOST_POSES)
+def state_tool_uncertainty(fit: Identification, measured: Solution) -> ToolUncertainty:
+    """Return the uncertainty of some evenly chosen measured poses of a fit, frames fitted."""
+    posterior, solution = fit.posterior, measured.take(choose_evenly(len(measured.q), MOST_POSES))
     D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
     p = D.shape[-1]
     angle, position = D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)

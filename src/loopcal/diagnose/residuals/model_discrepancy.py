@@ -23,7 +23,6 @@ import numpy as np
 from loopcal.diagnose.fit_checks.repeated_poses import LEVEL as REPEATS_LEVEL
 from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
 from loopcal.diagnose.residuals.residual_patterns import LEVEL
-from loopcal.diagnose.tool_errors import locate_measured_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_smooth_errors
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY, ModelDiscrepancy
@@ -101,7 +100,7 @@ class SlowErrors:
 
 
 def find_slow_errors(
-    fit: Identification, data: Measurements, linear: FitLinearization
+    fit: Identification, data: Measurements, linear: FitLinearization, T: FloatArray
 ) -> SlowErrors | None:
     """Return the slow errors that the residuals of a fit show; None without any, or where nothing
     can be tested.
@@ -109,9 +108,9 @@ def find_slow_errors(
     Parameters
     ----------
     fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses. linear : of both, see `linearize_fit`.
+        excluded poses. linear : of both, see `linearize_fit`. T : (n, 4, 4) [m] measured poses.
     """
-    T, tool = locate_measured_poses(fit, data).T, fit.robot.tool[:3, 3]
+    tool = fit.robot.tool[:3, 3]
     if len(T) < FEWEST_POSES:
         return None
     kernels = (
@@ -126,11 +125,11 @@ def find_slow_errors(
     slow = [each for each in slow if each.found]
     if slow:
         return min(slow, key=lambda each: min(p for _, p in each.found.values()))
-    return find_rough_errors(fit, data, linear, describe_smooth_errors(T, tool, ROUGH, MOST_ROUGH))
+    return find_rough_errors(fit, data, linear, T)
 
 
 def find_rough_errors(
-    fit: Identification, data: Measurements, linear: FitLinearization, errors: SmoothErrors
+    fit: Identification, data: Measurements, linear: FitLinearization, T: FloatArray
 ) -> SlowErrors | None:
     """Return errors that every pose has of its own, where repeats of a pose agree much better with
     each other than with the fit; None elsewhere.
@@ -141,6 +140,7 @@ def find_rough_errors(
     lack = check_lack_of_fit(fit, data)
     if lack.is_explained is not False:
         return None
+    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], ROUGH, MOST_ROUGH)
     rows = project_slow_errors(fit, data, linear, errors)
     if rows is None:
         return None
@@ -224,6 +224,7 @@ def project_slow_errors(
     prior[:, :k] = np.diag(np.sqrt(penalty))
     prior[:, -1] = np.sqrt(penalty) * d.coordinates(linear.linearization.deviation)[0][used]
     factor = extended.factor[0]
+    factor = factor[factor.any(axis=1)]  # there may be fewer rows than coefficients
     p = len(used)
     columns = np.concatenate([factor[:, :p] @ to_z, factor[:, p:]], axis=1)
     R = np.asarray(np.linalg.qr(np.concatenate([columns, prior[penalty > 0.0]]), mode="r"))
@@ -231,9 +232,7 @@ def project_slow_errors(
     if degrees < FEWEST_DEGREES:
         return None
     slope = fit.tolerance[:, None] * (to_z @ np.linalg.solve(R[:k, :k], R[:k, k : k + m]))
-    left = R[k:, k:]
-    turned, triangle = np.linalg.qr(left[:, :m])
-    residuals = turned.T @ left[:, m]
+    triangle, residuals = R[k : k + m, k : k + m], R[k : k + m, k + m]
     size = np.linalg.norm(factor[:, p : p + m])
     if not np.linalg.norm(triangle) > UNSEEN * size:
         return None

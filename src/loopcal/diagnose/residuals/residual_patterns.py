@@ -92,7 +92,7 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     effects = [e for e in listed if _is_testable(rows, e)]
     correlation, p_value = test_correlation(rows)
     tests = len(effects) + int(np.isfinite(p_value))
-    found: list[EffectSizes] = []
+    significant: list[EffectSizes] = []
     while effects:
         p_values = [test_effect(rows, effect) for effect in effects]
         best = int(np.argmin(p_values))
@@ -100,14 +100,16 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
         if not p_any < LEVEL:
             break
         effect = effects.pop(best)
-        found.append(estimate_sizes(rows, effect, p_any))
+        significant.append(estimate_sizes(rows, effect, p_any))
         rows = rows.with_effects(effect.columns)
         effects = [e for e in effects if _is_testable(rows, e)]
-    if found:
+    if significant:
         correlation, p_value = test_correlation(rows)
     p_any = compute_any_probability(p_value, tests)
     is_correlated = p_any < LEVEL
-    return ResidualPatterns(tests, tuple(found), correlation, p_any, is_correlated, order, rows)
+    return ResidualPatterns(
+        tests, tuple(significant), correlation, p_any, is_correlated, order, rows
+    )
 
 
 def test_effect(rows: ResidualRows, effect: Effect) -> float:

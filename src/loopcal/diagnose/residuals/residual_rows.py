@@ -166,7 +166,7 @@ def _iterate_rows(
     linear: FitLinearization, observations: list[Observations]
 ) -> Iterator[tuple[FloatArray, IntArray, IntArray, IntArray]]:
     """Give rows (k, U + p + 1) that are present, with their kind, row and column (k,)."""
-    for parts in linear.problem.leverage_rows(linear.linearization):
+    for parts in linear.problem.leverage_rows(linear.linearization, linear.solution):
         for part in parts:
             present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
             i, column = np.nonzero(present[part.numbers])

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.estimate.poses.smooth_errors import PREFIX, SmoothErrors
+from loopcal.findings.wording import round_to_digits
 from loopcal.typing import FloatArray
 
 DISCREPANCY = "residuals.model-discrepancy"
@@ -45,7 +46,9 @@ class ModelDiscrepancy:
     def __repr__(self) -> str:
         """Return the amplitudes."""
         rotation, place = 1e3 * self.errors.amplitude[[0, 3]]
-        return f"<ModelDiscrepancy: {place:.3g} mm and {rotation:.3g} mrad>"
+        return (
+            f"<ModelDiscrepancy: {round_to_digits(place)} mm and {round_to_digits(rotation)} mrad>"
+        )
 
     def twists(self, T: FloatArray, by_parameters: FloatArray) -> FloatArray:
         """Return twists (n, 6, m) of the platform at poses T (n, 4, 4) by independent errors of

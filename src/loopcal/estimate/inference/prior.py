@@ -155,11 +155,15 @@ class WithPrior:
 
     def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
         """Linearize the measurements and append the rows of the prior."""
-        measured = self.measured.linearize(deviation, start)
+        return self.append(self.measured.linearize(deviation, start))
+
+    def append(self, measured: Linearization) -> Linearization:
+        """Return the linearized measurements with the rows of the prior."""
         if not len(self.slope):
             return measured
         slope = self.list_slopes(measured)
-        residual = np.matmul(slope, (deviation - self.center)[..., None])[..., 0] + self.constant
+        change = measured.deviation - self.center
+        residual = np.matmul(slope, change[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
         return replace(
             measured,

@@ -182,7 +182,7 @@ class ComponentSearch:
         and from inflated ones.
         """
         searches = [self._search(is_inflated) for is_inflated in (False, True)]
-        return min(searches, key=lambda found: found[0])[1]
+        return min(searches, key=lambda search: search[0])[1]
 
     def _search(self, is_inflated: bool) -> tuple[float, tuple[ToleranceComponent, ...]]:
         """Return minus the log evidence, up to a constant, and the components."""

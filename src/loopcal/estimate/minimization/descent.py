@@ -26,7 +26,7 @@ from loopcal.numerics.damping import Damping
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 ACCEPTED_SHARE = 1e-4
 """Share of the predicted decrease that a step must bring."""
@@ -153,6 +153,7 @@ class Descent:
     start : warm start of the last points at which rows were evaluated and accepted.
     deviation_history, cost_history : (i + 1, t, p) and (i + 1, t) after each round; trials that
         have ended repeat.
+    is_start_exhausted : whether the steps ran out in a search for a start before it.
     """
 
     deviation: FloatArray
@@ -164,11 +165,13 @@ class Descent:
     start: Start
     deviation_history: FloatArray
     cost_history: FloatArray
+    is_start_exhausted: bool = False
 
     def after(self, first: Descent) -> Descent:
         """Return this descent with the steps of the one that led to its start before its own."""
         return replace(
             self,
+            is_start_exhausted=self.is_start_exhausted or first.is_start_exhausted,
             iterations=first.iterations + self.iterations,
             deviation_history=np.concatenate([first.deviation_history, self.deviation_history[1:]]),
             cost_history=np.concatenate([first.cost_history, self.cost_history[1:]]),
@@ -193,6 +196,7 @@ def descend(
     control: StepControl | None = None,
     tolerance: float = RANK_TOLERANCE,
     start: Start | None = None,
+    progress: Progress = report_no_progress,
 ) -> Descent:
     """Minimize the whitened sum of squares, filtered by the method.
 
@@ -202,6 +206,8 @@ def descend(
     method : how directions are penalized. control : settings of the steps.
     tolerance : relative rank tolerance.
     start : warm start; default: the first one of the problem.
+    progress : receives each step with the sum of squares of the first trial; how many there will be
+        is not known.
 
     Returns
     -------
@@ -210,6 +216,7 @@ def descend(
     control = control or StepControl()
     model = _FilteredDescent(problem, method, tolerance, control)
     z = np.array(deviation, dtype=np.float64)
+    progress(0, 1, "fitting")
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
         begin = problem.start(z) if start is None else start
         first = problem.linearize(z, begin)
@@ -223,6 +230,7 @@ def descend(
     def observe(moved: _Point) -> None:
         deviations.append(moved.z.copy())
         costs.append(moved.cost.copy())
+        progress(0, 1, f"fitting, step {len(costs) - 1}: sum of squares {moved.cost[0]:.4g}")
 
     damping = Damping(control.damping * largest, FIRST_DAMPING * largest)
     minimum = minimize(model, point, damping, control.iterations, observe)

@@ -81,18 +81,20 @@ def descend_robustly(
 
 
 def measure_block_distances(
-    problem: Problem, fit: Descent, member: IntArray, weighted: Problem
+    problem: Problem, z: FloatArray, start: Start, member: IntArray, weighted: Problem
 ) -> tuple[FloatArray, FloatArray]:
     """Return d = |W r| (u,) and the number of residuals (u,) of every block.
 
-    `member` (n,) is the block of each pose. Nuisance parameters are those that fit the `weighted`
-    problem best.
+    Parameters
+    ----------
+    z, start : deviation (1, p), and a start there. member : (n,) block of each pose.
+    weighted : the problem that the nuisance parameters fit best.
     """
-    z, count = fit.deviation, int(member.max()) + 1
+    count = int(member.max()) + 1
     nuisance = None
     if problem.nuisance is not None:
-        nuisance = weighted.solve(z, fit.start).nuisance
-    solution = problem.solve(z, fit.start, nuisance)
+        nuisance = weighted.solve(z, start).nuisance
+    solution = problem.solve(z, start, nuisance)
     square, degrees = np.zeros(count), np.zeros(count)
     for rows, kind in zip(problem.rows, problem.residuals(z, solution), strict=True):
         blocks, present = member[rows.first_poses], rows.is_present[0]
@@ -132,8 +134,8 @@ def _begin_without_far_blocks(
     did not converge: one row that is far off can prevent every step. The scale is that of the
     median block, whose distance is the error of the start.
     """
-    start = replace(failed.fit, deviation=deviation, start=problem.start(deviation))
-    distance, degrees = measure_block_distances(problem, start, member, problem)
+    start = problem.start(deviation)
+    distance, degrees = measure_block_distances(problem, deviation, start, member, problem)
     weight = Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)[member]
     weighted = problem.weighted(weight)
     return RobustFit(run(weighted, deviation, None), weighted, weight)
@@ -153,7 +155,9 @@ def _reweight(
         fit = robust.fit
         if fit.status[0] != DescentStatus.CONVERGED:
             break
-        distance, degrees = measure_block_distances(problem, fit, member, robust.problem)
+        distance, degrees = measure_block_distances(
+            problem, fit.deviation, fit.start, member, robust.problem
+        )
         if estimate_scale:
             distance = distance / estimate_scale_of(distance, degrees)
         weight = loss.weight(distance, degrees)[member]

@@ -24,8 +24,8 @@ from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
 
-CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9)
-"""Control of the iteration to consistent poses: until residuals are rounding."""
+CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)
+"""Control of the iteration to consistent poses: until residuals are rounding, or out of reach."""
 
 LOOSE = 1e3
 """Standard deviation of a reading that moves freely, in sizes of the robot or in radians."""

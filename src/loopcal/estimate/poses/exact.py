@@ -95,7 +95,8 @@ class ExactPoses:
             return np.where(ok.reshape(*ok.shape, *[1] * (new.ndim - 2)), new, before)
 
         motion = linearized.by_parameters.astype(np.float32)
-        state = map_arrays(kept, states.state, old.state)
+        is_new = ok.all() and len(ok) == a
+        state = states.state if is_new else map_arrays(kept, states.state, old.state)
         return PoseStates(state, old.q), np.broadcast_to(motion, (a, *motion.shape[1:]))
 
     def solve(

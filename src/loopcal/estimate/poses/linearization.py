@@ -23,6 +23,7 @@ import numpy as np
 from loopcal import engine, geometry
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.estimate.poses.smooth_errors import SmoothErrors
 from loopcal.measure import Evaluation, select_joint_values
 from loopcal.mechanism import (
     Status,
@@ -61,6 +62,16 @@ class LinearizedPoses:
     joints_by_coordinates: Mapping[str, FloatArray] = field(default_factory=dict)
     closure_step: FloatArray | None = None
 
+    def with_errors(self, errors: SmoothErrors) -> LinearizedPoses:
+        """Return the poses with the coefficients of errors of the poses as further parameters."""
+        twists = np.where(self.is_reached[..., None, None], errors.twists(self.T), 0.0)
+        slopes = {
+            name: np.concatenate([slope, np.zeros((*slope.shape[:-1], errors.count))], axis=-1)
+            for name, slope in self.joints_by_parameters.items()
+        }
+        by_parameters = np.concatenate([self.by_parameters, twists], axis=-1)
+        return replace(self, by_parameters=by_parameters, joints_by_parameters=slopes)
+
     def is_lost(self, is_needed: BoolArray) -> BoolArray:
         """Return the trials (a,) in which a needed pose (n,) is not reached."""
         return np.asarray(np.any(~self.is_reached & is_needed, axis=1))
@@ -70,10 +81,7 @@ def scale_parameters(free: FreeParameters, by_parameter: FloatArray) -> FloatArr
     """Return derivatives (.., p) by the free parameters in units of their tolerance."""
     p = by_parameter.shape[-1]
     columns = by_parameter[..., free.places] if len(free.places) < p else by_parameter
-    columns = columns * free.tolerance
-    if free.errors is None:
-        return columns
-    return np.concatenate([columns, np.zeros((*columns.shape[:-1], free.errors.count))], axis=-1)
+    return columns * free.tolerance
 
 
 def locate_poses(
@@ -166,10 +174,6 @@ def mask_unreached(
     """Complete linearized poses: joint values, which are reached, and zeros where one is not."""
     shape = state.T.shape[:2]
     Y, slopes, turns = poses.by_coordinates, poses.joints_by_parameters, poses.joints_by_coordinates
-    if free.errors is not None and poses.by_parameters.shape[-1]:
-        by_parameters = poses.by_parameters.copy()
-        by_parameters[..., -free.errors.count :] = free.errors.twists(state.T)
-        poses = replace(poses, by_parameters=by_parameters)
     derivatives = [poses.by_parameters, *slopes.values(), *turns.values()]
     derivatives += [] if Y is None else [Y, q]
     ok = np.asarray(state.status == Status.CONVERGED)
@@ -185,7 +189,7 @@ def mask_unreached(
     def spread(array: np.ndarray) -> FloatArray:
         return np.broadcast_to(masked(array), (*shape, array.shape[-1]))
 
-    return LinearizedPoses(
+    complete = LinearizedPoses(
         T=state.T if ok.all() else np.where(ok[..., None, None], state.T, np.eye(4)),
         is_reached=ok,
         by_parameters=masked(poses.by_parameters),
@@ -194,6 +198,9 @@ def mask_unreached(
         by_coordinates=None if Y is None else masked(Y),
         joints_by_coordinates={name: spread(turn) for name, turn in turns.items()},
     )
+    if free.errors is None or not complete.by_parameters.shape[-1]:
+        return complete
+    return complete.with_errors(free.errors)
 
 
 def join_located(

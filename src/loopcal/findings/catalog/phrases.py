@@ -191,13 +191,13 @@ def inflated_tolerances(data: Data) -> str:
     """Return by which factors tolerances, or parts of them, are inflated."""
     wide = "the tolerances of {names:list} {factor} times as wide as stated"
     shift = "a common deviation of {names:list} ({factor} tolerances)"
-    found = [fill_template(shift if p["kind"] == "shift" else wide, **p) for p in data["parts"]]
-    if data["factor"] > 1.0 or not found:
-        others = "the others" if found else "tolerances"
+    changes = [fill_template(shift if p["kind"] == "shift" else wide, **p) for p in data["parts"]]
+    if data["factor"] > 1.0 or not changes:
+        others = "the others" if changes else "tolerances"
         is_near_one = 1.0 < data["factor"] < 1.005  # it would read "1 times"
         wider = "less than 0.5 % wider than" if is_near_one else "{factor} times as wide as"
-        found.append(fill_template(f"{others} {wider} stated", **data))
-    return list_names(found, len(found))
+        changes.append(fill_template(f"{others} {wider} stated", **data))
+    return list_names(changes, len(changes))
 
 
 def strongest_pair(data: Data) -> str:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A composer of YAML that refuses deep documents, and those whose aliases stand for too much.
+"""A composer of YAML that refuses deep documents, those whose aliases stand for too much, and keys
+that are lists or mappings.
 
 A document of a kilobyte can stand for a terabyte: each line lists ten aliases of the line before.
 The composer keeps an alias as a reference, but whoever reads the values meets all of them. So the
@@ -22,8 +23,16 @@ class LimitError(Exception):
         self.line = line
 
 
+class KeyTypeError(Exception):
+    """A key that is a list or a mapping, at a line that is counted from 0."""
+
+    def __init__(self, line: int) -> None:
+        super().__init__("a key is a list or a mapping")
+        self.line = line
+
+
 def make_bounded_composer(loader: Any) -> Any:
-    """Return a composer of ruamel.yaml that counts values and levels.
+    """Return a composer of ruamel.yaml that counts values and levels, and checks keys.
 
     Parameters
     ----------
@@ -31,12 +40,14 @@ def make_bounded_composer(loader: Any) -> Any:
 
     Raises
     ------
-    LimitError, MarkedYAMLError : while it composes, as soon as a limit is exceeded; or an alias
-        that stands for a value that contains it.
+    LimitError, KeyTypeError, MarkedYAMLError : while it composes, as soon as a limit is exceeded;
+        a key that is no scalar, which ruamel.yaml cannot always store; or an alias that stands for
+        a value that contains it.
     """
     from ruamel.yaml.composer import Composer
     from ruamel.yaml.error import MarkedYAMLError
     from ruamel.yaml.events import AliasEvent
+    from ruamel.yaml.nodes import ScalarNode
 
     class BoundedComposer(Composer):
         """A composer that counts."""
@@ -47,6 +58,15 @@ def make_bounded_composer(loader: Any) -> Any:
             self._sizes: dict[str, int] = {}
 
         def compose_node(self, parent: Any, index: Any) -> Any:
+            """Return the next node; check that a key is a scalar."""
+            line = self.parser.peek_event().start_mark.line
+            node = self._compose_counted(parent, index)
+            is_key = parent is not None and index is None
+            if is_key and not isinstance(node, ScalarNode):
+                raise KeyTypeError(line)
+            return node
+
+        def _compose_counted(self, parent: Any, index: Any) -> Any:
             """Return the next node; count its values."""
             event = self.parser.peek_event()
             if isinstance(event, AliasEvent):

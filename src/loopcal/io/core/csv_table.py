@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ import numpy as np
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.decimal_columns import parse_decimals
-from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_ROWS, TABLE_SIZE
+from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_LINES, TABLE_ROWS, TABLE_SIZE
 from loopcal.io.core.names import LONGEST_COMPOSED, LONGEST_NAME, find_fault
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
@@ -36,6 +36,9 @@ CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/
 
 SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_noise", "poses")
 """Keys by which a settings file is recognized among YAML files of the same name."""
+
+CHUNK = 256
+"""Rows that are split at once: so few that the collection of garbage hardly sees them."""
 
 NAME_COLUMNS = ("pose", "use", "block", "kind", "session", "group")
 """Columns whose cells are names."""
@@ -54,15 +57,19 @@ class Table:
     path : the file. settings : front matter or sidecar; without content where there is neither.
     header_line : line of the header.
     units : column -> unit symbol as written, None where there is none.
-    rows : cells without surrounding blanks, one for each column. lines : line of each row.
+    columns : column -> cells without surrounding blanks, one for each row. Columns, since a million
+        rows would take time and memory as objects of their own. lines : line of each row.
     """
 
     path: Path
     settings: YamlFile
     header_line: int
     units: dict[str, str | None]
-    rows: tuple[tuple[str, ...], ...]
+    columns: Mapping[str, tuple[str, ...]]
     lines: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.lines)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,15 +79,19 @@ class Table:
     def text(self, name: str, default: str = "") -> tuple[str, ...]:
         """Return the cells of a column; `default` in every row where the column does not exist."""
         if name not in self.units:
-            return (default,) * len(self.rows)
-        place = self.names.index(name)
-        return tuple(row[place] for row in self.rows)
+            return (default,) * len(self)
+        return self.columns[name]
+
+    @property
+    def rows(self) -> Iterator[tuple[str, ...]]:
+        """The cells of each row."""
+        return zip(*self.columns.values(), strict=True)
 
     def pose_names(self) -> tuple[str, ...]:
         """Return the cells of the column `pose`; "1", "2", ... where it does not exist."""
         if "pose" in self.units:
             return self.text("pose")
-        return tuple(str(i + 1) for i in range(len(self.rows)))
+        return tuple(str(i + 1) for i in range(len(self)))
 
     def numbers(
         self, name: str, dimension: Dimension, empty: bool = True, infinite: bool = False
@@ -154,6 +165,11 @@ class Table:
         """Return an error at the line of a row."""
         return FileError(sentence, self.path, self.lines[row])
 
+    def places(self, rows: Iterable[int]) -> tuple[str, ...]:
+        """Return file and line of rows; see `place`."""
+        file, lines = str(self.path), self.lines
+        return tuple([f"{file}:{lines[row]}" for row in rows])
+
     def place(self, row: int) -> str:
         """Return file and line of a row, such as `data.csv:12`."""
         return f"{self.path}:{self.lines[row]}"
@@ -168,7 +184,7 @@ def read_table(path: str | Path) -> Table:
         Unreadable file, bad settings, no header, a bad header, no rows, rows of the wrong length.
     """
     table = read_template(path)
-    if not table.rows:
+    if not len(table):
         sentence = "this file has a header but no rows; add one row for each pose"
         raise FileError(sentence, table.path, table.header_line)
     return table
@@ -179,34 +195,41 @@ def read_template(path: str | Path) -> Table:
     path = as_path(path, WHAT)
     lines = _read_lines(path)
     settings, first = _read_settings(path, lines)
-    numbered = [
-        (i + 1, line)
-        for i, line in enumerate(lines)
-        if i >= first and line.strip() and not line.startswith("#")
+    numbers = [
+        number
+        for number, line in enumerate(lines[first:], first + 1)
+        if line.strip() and not line.startswith("#")
     ]
-    _check_size(path, numbered)
-    if not numbered:
+    texts = [lines[number - 1] for number in numbers]
+    _check_size(path, numbers, texts)
+    if not numbers:
         raise FileError("this file has no header; its first line names columns and units", path)
-    header_line, header = numbered[0]
+    header_line, header = numbers[0], texts[0]
     if "," not in header and (";" in header or "\t" in header):
         separator = "semicolons" if ";" in header else "tabs"
         sentence = f"columns are separated by {separator}; use commas, and decimal points"
         raise FileError(sentence + CONVERT_HINT, path, header_line)
     units = _parse_header(path, header_line, header)
-    rows = tuple(_parse_row(path, line, text, len(units)) for line, text in numbered[1:])
-    table = Table(path, settings, header_line, units, rows, tuple(n for n, _ in numbered[1:]))
+    cells = _parse_columns(path, numbers[1:], texts[1:], len(units))
+    columns = dict(zip(units, cells, strict=True))
+    table = Table(path, settings, header_line, units, columns, tuple(numbers[1:]))
     _refuse_names(table)
     return table
 
 
-def _check_size(path: Path, numbered: Sequence[tuple[int, str]]) -> None:
-    """Raise FileError for too many rows or columns, or a line that is too long."""
-    TABLE_ROWS.check(len(numbered) - 1, WHAT, path)
-    for number, line in numbered:
-        LINE_LENGTH.check(len(line), WHAT, path, number)
-    if numbered:
-        number, header = numbered[0]
-        TABLE_COLUMNS.check(header.count(",") + 1, WHAT, path, number)
+def _check_size(path: Path, numbers: Sequence[int], texts: Sequence[str]) -> None:
+    """Raise FileError for too many rows or columns, or a line that is too long.
+
+    Parameters
+    ----------
+    numbers : of the lines of header and rows. texts : these lines.
+    """
+    TABLE_ROWS.check(len(texts) - 1, WHAT, path)
+    lengths = list(map(len, texts))
+    longest = max(lengths, default=0)
+    if longest:
+        LINE_LENGTH.check(longest, WHAT, path, numbers[lengths.index(longest)])
+        TABLE_COLUMNS.check(texts[0].count(",") + 1, WHAT, path, numbers[0])
 
 
 def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
@@ -229,6 +252,11 @@ def suggest_header(header: str, symbol: str | None, known: Iterable[str]) -> str
     return f" (did you mean {name if written is None else f'{name} [{written}]'!r}?)"
 
 
+def format_header(units: Mapping[str, str | None]) -> tuple[str, ...]:
+    """Return the cells of a header from column -> symbol of its unit, None for text."""
+    return tuple(name if unit is None else f"{name} [{unit}]" for name, unit in units.items())
+
+
 def format_row(cells: Iterable[str]) -> str:
     """Return a line of cells, in quotes where one contains a comma, a quote or a number sign."""
     return ",".join(map(_quote_cell, cells))
@@ -245,7 +273,9 @@ def read_settings(path: str | Path) -> YamlFile:
 
 def _read_lines(path: str | Path) -> list[str]:
     text = read_text(path, WHAT, CONVERT_HINT, TABLE_SIZE)
-    return [line.rstrip("\r") for line in text.split("\n")]
+    TABLE_LINES.check(text.count("\n"), WHAT, path)
+    lines = text.split("\n")
+    return [line.rstrip("\r") for line in lines] if "\r" in text else lines
 
 
 def _read_settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
@@ -329,6 +359,25 @@ def _refuse_names(table: Table) -> None:
         for cell in dict.fromkeys(cells):
             if (fault := find_fault(cell, longest)) is not None:
                 raise table.row_error(cells.index(cell), fault)
+
+
+def _parse_columns(
+    path: Path, numbers: Sequence[int], texts: Sequence[str], count: int
+) -> list[tuple[str, ...]]:
+    """Return the cells of each of the header's `count` columns.
+
+    Parameters
+    ----------
+    numbers : of the lines of the rows. texts : these lines.
+    """
+    columns: list[list[str]] = [[] for _ in range(count)]
+    for begin in range(0, len(texts), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        pairs = zip(numbers[part], texts[part], strict=True)
+        rows = [_parse_row(path, number, text, count) for number, text in pairs]
+        for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
+            column.extend(cells)
+    return list(map(tuple, columns))
 
 
 def _parse_row(path: Path, line: int, text: str, count: int) -> tuple[str, ...]:

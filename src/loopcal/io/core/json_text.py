@@ -15,9 +15,15 @@ from typing import Any
 
 from loopcal import serialization
 from loopcal.errors import FileError
-from loopcal.io.core.limits import JSON_DEPTH, PROGRAM_SIZE, FileLimit
+from loopcal.io.core.limits import JSON_DEPTH, JSON_VALUES, PROGRAM_SIZE, FileLimit
 from loopcal.io.core.text_file import read_text
 from loopcal.plain_text import escape_json
+
+SHOWN = 20
+"""Characters of a number that a message shows."""
+
+LONGEST_WHOLE = 400
+"""Digits of a whole number that are read; a double has 309."""
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -53,18 +59,19 @@ def read_json(path: str | Path, what: str, action: str, limit: FileLimit = PROGR
         twice, or nested too deeply.
     """
     text = read_text(path, what, limit=limit)
+    JSON_VALUES.check(sum(text.count(sign) for sign in ",:[{"), what, path)
     try:
         content = json.loads(
             text,
             parse_float=lambda number: _refuse_infinite(float(number), number),
-            parse_int=lambda number: _refuse_infinite(int(number), number),
+            parse_int=lambda number: _refuse_infinite(_read_whole(number), number),
             parse_constant=lambda name: _refuse_infinite(math.nan, name),
             object_pairs_hook=_refuse_duplicates,
         )
     except json.JSONDecodeError as error:
         sentence = f"not valid JSON ({error.msg}); {action}"
         raise FileError(sentence, path, error.lineno) from None
-    except ValueError as error:  # also a whole number of thousands of digits
+    except ValueError as error:
         raise FileError(f"not valid JSON ({error}); {action}", path) from None
     except RecursionError:
         raise JSON_DEPTH.make_error(what, path) from None
@@ -81,6 +88,11 @@ def _measure_depth(content: Any) -> int:
     return depth
 
 
+def _read_whole(text: str) -> float:
+    """Return a whole number, as infinite where no double is as large."""
+    return int(text) if len(text) <= LONGEST_WHOLE else math.inf
+
+
 def _refuse_infinite(value: float, text: str) -> float:
     """Return a number that fits a double."""
     try:
@@ -88,7 +100,9 @@ def _refuse_infinite(value: float, text: str) -> float:
     except OverflowError:
         is_finite = False
     if not is_finite:
-        raise ValueError(f"the number {text[:20]} is not finite")
+        if len(text) > SHOWN:
+            raise ValueError(f"the number {text[:SHOWN]}… is too large")
+        raise ValueError(f"the number {text} is not finite")
     return value
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every limit of what a file may contain, in one table.
+"""Every limit of what a file may contain, and of counts on the command line, in two tables.
 
-A limit lies far above what a machine needs, and low enough that a damaged or hostile file neither
-fills the memory nor takes minutes. It is checked before memory is taken for what it limits.
+A limit lies far above what a machine needs, and low enough that a damaged or hostile file, or a
+number with too many zeros, neither fills the memory nor takes minutes. It is checked before memory
+is taken for what it limits.
 """
 
 from __future__ import annotations
@@ -114,6 +115,13 @@ TABLE_ROWS = FileLimit(
     "rows below the header",
     "divide it into several files, or average repeated measurements",
 )
+TABLE_LINES = FileLimit(
+    "lines of a measurement file",
+    5_000_000,
+    "lines",
+    "blank lines and remarks included",
+    "remove what is no row, or divide it into several files",
+)
 TABLE_COLUMNS = FileLimit(
     "columns of a measurement file",
     1_000,
@@ -142,6 +150,13 @@ XML_JOINTS = FileLimit(
     "joints",
     "fixed ones included",
     "leave out joints that belong to no loop",
+)
+JSON_VALUES = FileLimit(
+    "values in JSON text",
+    10_000_000,
+    "values",
+    "`result.json` of a run, samples of a cable robot; keys included",
+    "check that this is the file that was meant",
 )
 JSON_DEPTH = FileLimit(
     "nesting of JSON text",
@@ -234,12 +249,14 @@ LIMITS: tuple[FileLimit, ...] = (
     TEXT_LENGTH,
     TABLE_SIZE,
     TABLE_ROWS,
+    TABLE_LINES,
     TABLE_COLUMNS,
     LINE_LENGTH,
     PATTERN_LENGTH,
     PATTERN_COUNTS,
     PATTERN_SECONDS,
     PROGRAM_SIZE,
+    JSON_VALUES,
     JSON_DEPTH,
     XML_JOINTS,
     XML_ELEMENTS,
@@ -248,3 +265,49 @@ LIMITS: tuple[FileLimit, ...] = (
     ARRAYS_COUNT,
 )
 """All limits, in the order of docs/files.md."""
+
+
+@dataclass(frozen=True)
+class CountLimit:
+    """The largest number that an option takes.
+
+    Parameters
+    ----------
+    most : this number. unit : noun for messages, such as `poses`.
+    meaning : commands and options to which it applies, for documentation.
+    """
+
+    most: int
+    unit: str
+    meaning: str
+
+    def __str__(self) -> str:
+        return f"{self.most:,} {self.unit}"
+
+
+DRAWN_POSES = CountLimit(
+    1_000_000, "poses to draw", "`draw` of `loopcal simulate` and `loopcal identifiability`"
+)
+PLANNED_POSES = CountLimit(
+    2_000, "poses of a plan", "`poses` and `hold-out` of `loopcal plan`, each"
+)
+CANDIDATES = CountLimit(100_000, "candidate poses", "`candidates` of `loopcal plan`")
+GROUPS = CountLimit(1_000, "groups of points", "`groups` of `loopcal plan`")
+POINTS = CountLimit(1_000, "points of a group", "`points` of `loopcal plan`")
+RESAMPLES = CountLimit(100_000, "resamples", "`count` of `loopcal bootstrap`")
+DRAWS = CountLimit(1_000_000, "draws", "`count` of `loopcal sample`")
+TRIALS = CountLimit(10_000, "trials", "`trials` of `loopcal reproduce`")
+STEPS = CountLimit(1_000, "steps", "`steps` of `loopcal compensate` and `loopcal per-leg`")
+
+COUNT_LIMITS: tuple[CountLimit, ...] = (
+    DRAWN_POSES,
+    PLANNED_POSES,
+    CANDIDATES,
+    GROUPS,
+    POINTS,
+    RESAMPLES,
+    DRAWS,
+    TRIALS,
+    STEPS,
+)
+"""The limits of counts, in the order of docs/files.md."""

@@ -77,13 +77,13 @@ def format_comment(text: str) -> str:
 
 def _find_fault(text: str, what: str, allowed: str, longest: int) -> Finding | None:
     """Return what is wrong with the characters or the length of a text."""
-    shown, character = quote(text), find_not_plain(text, allowed)
+    character = find_not_plain(text, allowed)
     if character is not None:
         named = name_character(character)
-        return report_finding("files.name-not-plain", what=what, name=shown, character=named)
+        return report_finding("files.name-not-plain", what=what, name=quote(text), character=named)
     if len(text) > longest:
         n = len(text)
         return report_finding(
-            "files.name-too-long", what=what, name=shown, length=n, longest=longest
+            "files.name-too-long", what=what, name=quote(text), length=n, longest=longest
         )
     return None

@@ -13,8 +13,13 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
+from loopcal.io.core.json_text import read_json
+from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.replacement import create_temporary, place_folder, restore_files
 from loopcal.io.core.text_file import check_readable, report_write_errors, resolve_target
+
+FILES = "files"
+"""Key of the list of files in the document of a result folder."""
 
 
 def refuse_outputs(
@@ -26,7 +31,8 @@ def refuse_outputs(
     ----------
     outputs : files to write; None is skipped.
     inputs : files that are read, or folders whose files are read; None is skipped.
-    force : existing files may be replaced, except those that are read.
+    force : existing files may be replaced, except those that are read and the documents of result
+        folders, without which nothing else in the folder can be read.
 
     Raises
     ------
@@ -57,6 +63,8 @@ def refuse_outputs(
             raise FileError("cannot write here (permission denied); choose another folder", path)
         if path.is_file() and not force:
             raise FileError(report_finding("files.output-exists"), path)
+        if is_folder_document(path):
+            raise FileError(report_finding("files.output-in-result"), path)
 
 
 @contextmanager
@@ -64,6 +72,19 @@ def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Restore or remove these files where the body fails; None is skipped."""
     with restore_files([resolve_target(path) for path in outputs if path is not None]):
         yield
+
+
+def is_folder_document(path: Path) -> bool:
+    """Return whether a file is the document of a result folder, such as the result.json of a run:
+    it lists the other files of its folder.
+    """
+    if path.suffix != ".json" or not path.is_file():
+        return False
+    try:
+        content = read_json(path, "output", "choose another name", TABLE_SIZE)
+    except FileError:
+        return False
+    return isinstance(content, dict) and isinstance(content.get(FILES), dict)
 
 
 def _is_same_file(path: Path, other: Path) -> bool:
@@ -89,9 +110,7 @@ def resolve_folder(path: Path) -> Path:
 
 @contextmanager
 def replace_folder(
-    path: Path,
-    read_back: Callable[[Path], object] | None = None,
-    check: Callable[[Path], None] | None = None,
+    path: Path, read_back: Callable[[Path], object], check: Callable[[Path], None] | None = None
 ) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 

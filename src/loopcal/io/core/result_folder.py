@@ -16,17 +16,16 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from loopcal import serialization
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.descriptors import watch_folder
 from loopcal.io.core.json_text import read_json, to_json
 from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.outputs import replace_folder, resolve_folder
+from loopcal.io.core.outputs import FILES, replace_folder, resolve_folder
+from loopcal.io.core.read_back import require_same
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
-
-FILES = "files"
-"""Key of the list of files in the document."""
 
 _BLANK = "0" * 64
 """Stands for the document's own digest where this is computed."""
@@ -70,8 +69,8 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
     ------
     FileError
         The path is a file, or the working folder; its place is not writable; the folder is in use
-        (without `force`); or it contains an input, or anything but an unchanged result of this
-        kind.
+        (without `force`), or protected; or it contains an input, or anything but an unchanged
+        result of this kind.
     """
     target = resolve_folder(path)
     with report_write_errors(path):
@@ -89,6 +88,14 @@ def refuse_folder(path: Path, kind: FolderKind, force: bool, inputs: Sequence[Pa
                 finding = report_finding("files.folder-in-use", content=kind.content)
                 raise FileError(finding, path)
             refuse_other_content(path, kind)
+            _refuse_protected(path, target)
+
+
+def _refuse_protected(path: Path, target: Path) -> None:
+    """Raise FileError where a folder, known to be loopcal's, could not be removed once replaced."""
+    if not all(os.access(place, os.W_OK | os.X_OK) for place, _, _ in os.walk(target)):
+        sentence = "this folder is protected against changes, so it cannot be replaced"
+        raise FileError(f"{sentence}; choose another name, or permit writing in it", path)
 
 
 def _refuse_place(path: Path, target: Path) -> None:
@@ -137,23 +144,34 @@ def write_result_folder(
     kind: FolderKind,
     document: Mapping[str, Any],
     files: Mapping[str, bytes],
+    read_back: Callable[[Path], object],
     force: bool = False,
-    read_back: Callable[[Path], object] | None = None,
 ) -> None:
     """Write a folder whole or not at all.
 
     Parameters
     ----------
     document : content of the document, to which the list of files is added.
-    files : name -> content. force : see `refuse_folder`.
-    read_back : reads the complete folder before it takes its name.
+    files : name -> content.
+    read_back : reads the complete folder before it takes its name. The document, and that the
+        folder is one that loopcal may replace, are checked for every kind.
+    force : see `refuse_folder`.
 
     Raises
     ------
     FileError : see `refuse_folder`; or the folder cannot be written.
     """
+
+    def check(folder: Path) -> None:
+        _check_content(folder, kind)
+        read = read_json(folder / kind.document, "result", "repeat the command", TABLE_SIZE)
+        for key in document.keys() - {FILES}:
+            is_same = key in read and read[key] == serialization.to_json(document[key])
+            require_same(f"{key!r} of {kind.document} is what was computed", True, is_same)
+        read_back(folder)
+
     refuse_folder(path, kind, force)
-    with replace_folder(path, read_back, lambda old: refuse_folder(old, kind, force)) as folder:
+    with replace_folder(path, check, lambda old: refuse_folder(old, kind, force)) as folder:
         for name, content in files.items():
             file = folder / name
             file.parent.mkdir(exist_ok=True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import stat
@@ -21,6 +22,15 @@ from loopcal.io.core.replacement import create_temporary, place_file, remove_lef
 OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """To open a file without waiting; not every system has all of these flags."""
 
+ACTIONS = {
+    errno.EACCES: "check its permissions",
+    errno.EPERM: "check its permissions",
+    errno.ELOOP: "this path contains a symbolic link that leads back to itself: make it anew, or "
+    "name the file itself",
+    errno.ENOTDIR: "part of its path is a file, not a folder: correct the path",
+}
+"""What to do about a file that the operating system does not open, by the number of its error."""
+
 
 def as_path(path: Any, what: str) -> Path:
     """Return a path given as text or Path.
@@ -32,6 +42,13 @@ def as_path(path: Any, what: str) -> Path:
     if not isinstance(path, (str, os.PathLike)):
         sentence = f"the path of a {what} is needed here, not {type(path).__name__}"
         raise ArgumentTypeError(f"{sentence}; pass text or a Path")
+    try:
+        name = os.fsencode(path)
+    except UnicodeEncodeError:
+        name = b"\0"
+    if b"\0" in name:
+        sentence = f"the path of a {what} contains a null character or half of a character"
+        raise ArgumentTypeError(f"{sentence}, which no file name can have; correct the path")
     return Path(path)
 
 
@@ -94,8 +111,8 @@ def open_bytes(path: str | Path, what: str) -> Iterator[BufferedReader]:
             f"this {what} does not exist; check the name and the folder", path
         ) from None
     except OSError as error:
-        sentence = f"this {what} cannot be read ({_reason(error)}); check its permissions"
-        raise FileError(sentence, path) from error
+        action = ACTIONS.get(error.errno or 0, "check the file, its path and its permissions")
+        raise FileError(f"this {what} cannot be read ({_reason(error)}); {action}", path) from error
 
 
 def _open_ordinary_file(path: Path, what: str) -> int:
@@ -140,25 +157,19 @@ def resolve_target(path: str | Path) -> Path:
         raise FileError("this symbolic link has no target; choose another name", path) from None
 
 
-def write_text(
-    path: str | Path, text: str, read_back: Callable[[Path], object] | None = None
-) -> None:
+def write_text(path: str | Path, text: str, read_back: Callable[[Path], object]) -> None:
     """Write a UTF-8 file whole or not at all; see `write_bytes`."""
     write_bytes(path, text.encode("utf-8"), read_back)
 
 
-def write_bytes(
-    path: str | Path, content: bytes, read_back: Callable[[Path], object] | None = None
-) -> None:
+def write_bytes(path: str | Path, content: bytes, read_back: Callable[[Path], object]) -> None:
     """Write a file whole or not at all; see `replace_file`."""
     with replace_file(path, read_back) as temporary:
         temporary.write_bytes(content)
 
 
 @contextmanager
-def replace_file(
-    path: str | Path, read_back: Callable[[Path], object] | None = None
-) -> Iterator[Path]:
+def replace_file(path: str | Path, read_back: Callable[[Path], object]) -> Iterator[Path]:
     """Yield an empty temporary file that takes the place of `path` where the body succeeds.
 
     A symbolic link stays a link; its target is written. An old file keeps its permissions.
@@ -185,17 +196,13 @@ def replace_file(
             place_file(temporary, target, Path(path))
 
 
-def check_readable(
-    path: str | Path, temporary: Path, read_back: Callable[[Path], object] | None
-) -> None:
+def check_readable(path: str | Path, temporary: Path, read_back: Callable[[Path], object]) -> None:
     """Read a file or folder before it takes the name `path`.
 
     Raises
     ------
     FileError : `read_back` raises, which is a defect of loopcal.
     """
-    if read_back is None:
-        return
     try:
         read_back(temporary)
     except MemoryError:
@@ -221,11 +228,11 @@ def report_write_errors(path: str | Path) -> Iterator[None]:
     """Raise FileError in place of every OSError of the body, which writes `path`."""
     try:
         yield
-    except FileNotFoundError:
-        folder = Path(path).parent
-        sentence = f"cannot write here: folder {folder} does not exist; create it first"
-        raise FileError(sentence, path) from None
     except OSError as error:
+        folder = Path(path).parent
+        if isinstance(error, FileNotFoundError) and not folder.is_dir():
+            sentence = f"cannot write here: folder {folder} does not exist; create it first"
+            raise FileError(sentence, path) from None
         raise FileError(
             f"cannot write here ({_reason(error)}); choose another place", path
         ) from error

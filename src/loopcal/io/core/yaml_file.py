@@ -133,7 +133,7 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-    from loopcal.io.core.bounded_yaml import LimitError
+    from loopcal.io.core.bounded_yaml import KeyTypeError, LimitError
 
     try:
         return make_round_trip_yaml().load(text)
@@ -143,12 +143,16 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
         raise FileError(f"duplicate key {quote(key)}; remove one", path, line) from None
     except LimitError as error:
         raise error.limit.make_error(what, path, line=error.line + first_line) from None
+    except KeyTypeError as error:
+        raise FileError(f"{error}; write text there", path, error.line + first_line) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = _shorten(error.problem or error.context or "not YAML")
         sentence = f"not valid YAML ({problem}); check indentation, brackets and colons"
         raise FileError(sentence, path, mark.line + first_line if mark else None) from None
     except (YAMLError, ValueError, RecursionError) as error:
+        if "integer string conversion" in str(error):  # Python reads no more than 4300 digits
+            raise FileError("a number has thousands of digits; write a shorter one", path) from None
         sentence = f"not valid YAML ({_shorten(error)}); correct the syntax"
         raise FileError(sentence, path) from None
 
@@ -256,5 +260,6 @@ def _finite(value: float, file: YamlFile, location: Location) -> float:
     except OverflowError:
         is_finite = False
     if not is_finite:
-        raise file.error(f"{name_location(location)!r} is {value}; write a finite number", location)
+        shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
+        raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
     return value

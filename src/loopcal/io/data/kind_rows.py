@@ -151,7 +151,7 @@ def read_observations(
             source=str(table.path),
             is_noise_assumed=entry.is_noise_assumed,
         )
-    return observations, tuple(map(table.place, rows.tolist()))
+    return observations, table.places(rows.tolist())
 
 
 def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
@@ -161,7 +161,7 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     if several is None:
         kind = read_kind(file, content, ()).with_tool(robot.tool)
         refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
-        rows = np.arange(len(table.rows))
+        rows = np.arange(len(table))
         noise, is_assumed = (
             read_noise(file, content, kind, ()),
             read_noise_source(file, content, ()),

@@ -31,6 +31,7 @@ from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
+from loopcal.io.data.column_names import find_column_fault
 from loopcal.mechanism import PoseRecord
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
@@ -63,7 +64,8 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
 
     Raises
     ------
-    FileError : no or an unknown kind, or a setting that does not fit it.
+    FileError : no or an unknown kind, a setting that does not fit it, or a name of a target that no
+        column can have.
     """
     from loopcal.measure import KINDS
 
@@ -84,9 +86,13 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
             raise file.error(sentence, (*location, key))
     given = {key: _to_setting(values[key], kind, key) for key in settings}
     try:
-        return kind(**given)
+        made = kind(**given)
     except DataError as error:
         raise file.error(f"{error}", (*location, next(iter(settings), "kind"))) from None
+    for column in made.columns:
+        if fault := find_column_fault(column.name, "measured value"):
+            raise file.error(fault, (*location, "targets" if "targets" in settings else "kind"))
+    return made
 
 
 def list_kind_settings(kind: type[Kind]) -> dict[str, Any]:

@@ -95,11 +95,10 @@ def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) ->
     readings = tuple(actuator.name for actuator in robot.actuators)
     require_columns(planned, ("pose", *readings), f"a reading of {robot.name}")
     kept = ("pose", *readings)
-    columns = [planned.text(name) for name in kept]
     planned = replace(
         planned,
         units={name: planned.units[name] for name in kept},
-        rows=tuple(zip(*columns, strict=True)),
+        columns={name: planned.columns[name] for name in kept},
     )
     return _join_tables((table, planned), robot, allow_outside_stroke=True, allow_duplicates=True)
 
@@ -155,11 +154,9 @@ def _join_shared_errors(entries: Sequence[KindRows]) -> dict[str, float]:
 def _place_poses(data: Measurements, places: Sequence[Sequence[str]]) -> dict[int, str]:
     """Return the place of the first row of each pose, such as `data.csv:12`."""
     first: dict[int, str] = {}
-    for rows, of_rows in zip(data.observations, places, strict=True):
-        named = rows.rows.reshape(len(rows), rows.kind.poses_per_row)
-        for poses, place in zip(named.tolist(), of_rows, strict=True):
-            for pose in poses:
-                first.setdefault(pose, place)
+    for rows, of_rows in zip(reversed(data.observations), reversed(places), strict=True):
+        repeated = [place for place in of_rows for _ in range(rows.kind.poses_per_row)]
+        first |= zip(rows.rows.ravel()[::-1].tolist(), reversed(repeated), strict=True)
     return first
 
 
@@ -237,8 +234,10 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
     )
 
 
-def load_pose_names(path: str | Path) -> tuple[str, ...]:
-    """Read the names of commanded poses (n,); "1", "2", ... without a column `pose`.
+def load_pose_names(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Read the names of commanded poses (n,), and their places such as `poses.csv:12`.
+
+    The names are "1", "2", ... without a column `pose`.
 
     Raises
     ------
@@ -252,7 +251,7 @@ def load_pose_names(path: str | Path) -> tuple[str, ...]:
             row = first[name] + 1
             sentence = f"pose {name!r} is also row {row}; give each pose a name of its own"
             raise table.row_error(i, sentence)
-    return names
+    return names, tuple(map(table.place, range(len(names))))
 
 
 def _read_tables(path: Paths) -> tuple[Table, ...]:
@@ -320,7 +319,7 @@ def load_instrument(path: str | Path, robot: Mechanism) -> Instrument:
     FileError : a value that does not fit, at its line; noise that the settings do not state.
     """
     table = read_table(path)
-    return _build_instrument(table, read_kinds(table, robot))
+    return build_instrument(table, read_kinds(table, robot))
 
 
 def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
@@ -349,7 +348,7 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
                 report_finding(code, kind=entry.kind.name, parameters=tuple(parameters)),
                 entry.location,
             )
-    return _build_instrument(table, kinds)
+    return build_instrument(table, kinds)
 
 
 def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
@@ -357,10 +356,10 @@ def has_empty_readings(path: str | Path, robot: Mechanism) -> bool:
     table = read_table(path)
     columns = [actuator.name for actuator in robot.actuators if actuator.name in table.units]
     cells = (cell for name in columns for cell in table.text(name))
-    return bool(columns and table.rows) and not any(cells)
+    return bool(columns and len(table)) and not any(cells)
 
 
-def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
+def build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
     from loopcal.measure import Gaussian, Instrument, Sensor
 

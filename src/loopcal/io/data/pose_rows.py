@@ -22,7 +22,6 @@ from loopcal.errors import suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.references import find_reference
-from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextColumn, list_columns
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
@@ -93,9 +92,10 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
         repeated: dict[int, tuple[int, int]] = {}
         for name, row in file.first.items():
             if name in file.read or (name in file.unread and name not in read):
-                place = origin.setdefault(name, (i, row))
-                if place != (i, row):
-                    repeated[row] = place
+                if name in origin:
+                    repeated[row] = origin[name]
+                else:
+                    origin[name] = (i, row)
             elif name not in read and states_readings:
                 sentence = f"pose {name!r} has no readings in any file; add them in one"
                 raise file.table.row_error(row, sentence)
@@ -160,9 +160,8 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     if controller is not None:
         chosen = [first[name] for name in first if name in read]
         if chosen:
-            poses = tuple(names[row] for row in chosen)
-            with name_files(table.path):
-                blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses).q
+            poses, places = [names[row] for row in chosen], [table.place(row) for row in chosen]
+            blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses, places).q
         rows = blank
     sigma = read_reading_sigma(table, robot, rows)
     return _FilePoses(
@@ -356,6 +355,8 @@ def _refuse_contradictions(
 
 def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArray:
     """Return block numbers (n,): by the column `block` of a pose's first row, else each alone."""
+    if not any("block" in file.table.units for file in files):
+        return np.arange(len(labels))
     named: dict[str, tuple[str, str]] = {}
     for file in (file for file in files if "block" in file.table.units):
         cells = file.table.text("block")

@@ -13,15 +13,16 @@ import numpy as np
 from loopcal.io.core.csv_table import read_template, require_columns
 from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.data.kind_rows import read_kinds
-from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_file import build_instrument, load_measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import IntArray
 
 if TYPE_CHECKING:
-    from loopcal.measure import Measurements, Observations
+    from loopcal.measure import Instrument, Measurements, Observations
 
 ROUNDING = 1e-7
-"""Change of a covariance, in those of its rows: a file states their roots with nine digits."""
+"""Change of a covariance, in those of its rows, and of a standard deviation: a file states the
+latter with nine digits."""
 
 
 def check_written_measurements(path: Path, data: Measurements, robot: Mechanism) -> None:
@@ -46,13 +47,17 @@ def check_written_measurements(path: Path, data: Measurements, robot: Mechanism)
         _check_rows(before, after, order)
 
 
-def check_written_template(path: Path, robot: Mechanism) -> None:
+def check_written_template(path: Path, robot: Mechanism, instrument: Instrument) -> None:
     """Read a measurement file without rows; raise LoopcalError where its columns have no meaning or
-    are not complete.
+    are not complete, or it states another instrument.
     """
     table = read_template(path)
     empty = replace(table, rows=(("",) * len(table.names),), lines=(table.header_line + 1,))
-    read_kinds(empty, robot)
+    read = build_instrument(empty, read_kinds(empty, robot)).sensors
+    require_same("kinds", [s.kind.name for s in instrument.sensors], [s.kind.name for s in read])
+    for before, after in zip(instrument.sensors, read, strict=True):
+        name = f"noise of {before.kind.name}"
+        require_same_numbers(name, before.noise.sigma, after.noise.sigma, ROUNDING)
     require_columns(table, [actuator.name for actuator in robot.actuators], "a reading")
 
 

@@ -26,7 +26,13 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import NAME_COLUMNS, format_row, read_table, refuse_settings_beside
+from loopcal.io.core.csv_table import (
+    NAME_COLUMNS,
+    format_header,
+    format_row,
+    read_table,
+    refuse_settings_beside,
+)
 from loopcal.io.core.limits import PATTERN_SECONDS
 from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
@@ -177,13 +183,15 @@ class Conversion:
 
     Parameters
     ----------
-    text : the measurement file. table : its header and rows. passed : number of lines without data.
+    text : the measurement file. table : its header and rows. settings : its settings.
+    passed : number of lines without data.
     misfits : lines that do not fit the profile, with the reason.
     findings : differences between lines of a pose that the file does not keep.
     """
 
     text: str
     table: tuple[tuple[str, ...], ...]
+    settings: Mapping[str, Any]
     passed: int
     misfits: tuple[tuple[int, str], ...]
     findings: tuple[Finding, ...] = ()
@@ -230,10 +238,12 @@ def convert_export(
         if lines[0].header is None:  # nothing shows that the profile is meant for this file
             raise FileError(f"{sentence}; compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
-    settings = _format_settings(path, profile, misfits, findings)
+    settings = {"format": FORMAT, **profile.record.settings}
+    lines = _format_remarks(path, profile, misfits, findings)
+    lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
     table = _tabulate(profile, rows)
-    text = "\n".join([*settings, *map(format_row, table)]) + "\n"
-    return Conversion(text, table, skipped, tuple(misfits), findings)
+    text = "\n".join([*lines, *map(format_row, table)]) + "\n"
+    return Conversion(text, table, settings, skipped, tuple(misfits), findings)
 
 
 def save_conversion(conversion: Conversion, path: str | Path) -> None:
@@ -246,9 +256,11 @@ def save_conversion(conversion: Conversion, path: str | Path) -> None:
 
     def check(written: Path) -> None:
         table = read_table(written)
-        for before, after in zip(conversion.table[1:], table.rows, strict=True):
+        header, *rows = conversion.table
+        require_same("columns", header, format_header(table.units))
+        for before, after in zip(rows, table.rows, strict=True):
             require_same("row", before, after)
-        require_same("columns", len(conversion.table[0]), len(table.names))
+        require_same("settings", conversion.settings, table.settings.content)
 
     refuse_settings_beside(Path(path))
     write_text(path, conversion.text, check)
@@ -358,26 +370,23 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
     return dict(zip(QUATERNION, quaternion, strict=True))
 
 
-def _format_settings(
+def _format_remarks(
     path: Path, profile: Profile, misfits: Sequence[tuple[int, str]], findings: Sequence[Finding]
 ) -> list[str]:
-    """Return the remarks and settings of the measurement file."""
+    """Return the remarks at the top of the measurement file."""
     origin = format_comment(f"converted from {path.name} by {profile.file.path.name}")
     lines = [f"## {origin}"]
     if misfits:
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
-    lines += [f"## {format_comment(str(finding))}" for finding in findings]
-    settings = {"format": FORMAT, **profile.record.settings}
-    return lines + [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
+    return lines + [f"## {format_comment(str(finding))}" for finding in findings]
 
 
 def _tabulate(profile: Profile, rows: Sequence[Row]) -> tuple[tuple[str, ...], ...]:
     """Return the header and the rows of the measurement file."""
     columns = list_headers(profile)
-    headers = (f"{n} [{symbol}]" if symbol is not None else n for n, symbol in columns.items())
     # a target without a line has no covariance
     absent = {name: "0" if name.startswith(COVARIANCE) else "" for name in columns}
-    table = [tuple(headers)]
+    table = [format_header(columns)]
     for i, row in enumerate(rows, 1):
         cells = {**absent, "pose": str(i), **row}
         table.append(tuple(cells[name] for name in columns))

@@ -7,6 +7,7 @@ import codecs
 import math
 import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,7 @@ from loopcal.io.exports.profile import (
     strip_target,
 )
 from loopcal.io.robot.robot_file import check_format
+from loopcal.plain_text import quote
 from loopcal.units import Dimension, find_unit, list_symbols
 
 if TYPE_CHECKING:
@@ -46,6 +48,9 @@ if TYPE_CHECKING:
 FORMAT = 1
 TEXTS = ("pose", USE_COLUMN.name, "block", "session", "group")
 """Columns of text that an export may have."""
+
+SOME_TIME = datetime(2026, 5, 4, 10, 22, 31, tzinfo=UTC)
+"""A time that a format must write and read."""
 
 STATED = re.compile(r"[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]$")
 """The unit behind a name in a header, as in `X [mm]` or `X (mm)`."""
@@ -195,11 +200,25 @@ def _check_source(
         if value is not None and (name != owner or not is_text):
             sentence = f"{key!r} belongs to {owner!r}, not to {name!r}; remove it"
             raise file.error(sentence, (*place, key))
+    if source.format is not None:
+        _check_time_format(file, source.format, (*place, "format"))
     if source.match is not None:
         refuse_pattern(file, source.match, (*place, "match"))
         if source.pattern is None or "pose" not in source.pattern.groupindex:
             sentence = "this pattern finds no pose; put its part of the name in (?P<pose>..)"
             raise file.error(sentence, (*place, "match"))
+
+
+def _check_time_format(file: YamlFile, text: str, place: Location) -> None:
+    """Raise FileError for a format with which Python cannot read the times that it writes."""
+    try:
+        datetime.strptime(SOME_TIME.strftime(text), text)
+    except (ValueError, re.error):  # strptime makes a regular expression of it
+        sentence = (
+            f"{quote(text)} is not a format of times; write each of its parts once, such as "
+            "'%d.%m.%Y %H:%M:%S'"
+        )
+        raise file.error(sentence, place) from None
 
 
 def _check_scale(file: YamlFile, name: str, source: ColumnSource, place: Location) -> None:

@@ -60,6 +60,10 @@ UPPER = {ord(small): small.upper() for small in "abcdefghijklmnopqrstuvwxyz"}
 READ = ("M665", "M666", "M851")
 """Commands whose words are read."""
 
+ECHO = re.compile(r"\s*echo:", re.IGNORECASE)
+MARLIN_COMMANDS, REPRAP_COMMANDS = ("M851",), ("M307", "M584")
+"""What only a report of Marlin begins with, and commands that only one of the firmwares has."""
+
 WITH_TEXT = ("M16", "M23", "M28", "M30", "M32", "M117", "M118")
 """Commands that are followed by text."""
 
@@ -258,7 +262,14 @@ class DeltaFirmware:
 
 
 def _refuse_marlin(file: GcodeFile) -> None:
-    """Raise FileError for a single trim B, and for positive adjustments."""
+    """Raise FileError for a file of RepRapFirmware, a single trim B, and positive adjustments."""
+    program, name = "RepRapFirmware", "reprap"
+    if file.has("M665", "L") and ":" in file.text("M665", "L"):
+        finding = report_finding(
+            "files.other-firmware", what="a list of lengths in M665 L", program=program, format=name
+        )
+        raise file.error(finding, "M665", "L")
+    _refuse_commands(file, REPRAP_COMMANDS, program, name)
     if [letter for letter in TRIMS if file.has("M665", letter)] == ["B"]:
         sentence = "M665 B without A and C is a radius in older Marlin and a rod trim in newer"
         raise file.error(f"{sentence}; remove it, or write all three", "M665", "B")
@@ -269,8 +280,26 @@ def _refuse_marlin(file: GcodeFile) -> None:
             raise file.error(f"{sentence} {act}", "M666", tower)
 
 
+def _refuse_commands(file: GcodeFile, commands: Sequence[str], program: str, name: str) -> None:
+    """Raise FileError for commands that only another firmware has."""
+    for command in commands:
+        if command in file.commands:
+            finding = report_finding(
+                "files.other-firmware", what=command, program=program, format=name
+            )
+            raise FileError(finding, file.path, file.commands[command][0] + 1)
+
+
 def _refuse_reprap(file: GcodeFile) -> None:
-    """Raise FileError for a tilted bed."""
+    """Raise FileError for a file of Marlin, and for a tilted bed."""
+    program, name = "Marlin", "marlin"
+    number = file.commands["M665"][0]
+    if ECHO.match(file.lines[number]):
+        finding = report_finding(
+            "files.other-firmware", what="'echo:' in front of M665", program=program, format=name
+        )
+        raise FileError(finding, file.path, number + 1)
+    _refuse_commands(file, MARLIN_COMMANDS, program, name)
     for letter in "AB":
         if file.number("M666", letter, 0.0) != 0.0:
             sentence = f"M666 {letter} tilts the bed, which a robot of the family linear-delta"

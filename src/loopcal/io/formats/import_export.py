@@ -39,9 +39,13 @@ def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
 
     Raises
     ------
-    MechanismError : it cannot be built; with the name of the file that it came from.
+    FileError, MechanismError : it cannot be built; with the name of the file that it came from. The
+        lines of its text are not those of that file.
     """
-    return build_robot(parse_yaml(imported.robot_text, path, "robot file"))
+    try:
+        return build_robot(parse_yaml(imported.robot_text, path, "robot file"))
+    except FileError as error:
+        raise FileError(error.sentence, path) from error
 
 
 def save_imported(path: Path, imported: Imported, output: Path, data: Path | None) -> Mechanism:

@@ -45,6 +45,11 @@ from loopcal.io.formats.value_file import Name, Value, ValueFile
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
 
+STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
+PROBED = "delta_calibrate"
+SHOWN = 4
+"""Sections that are named of a file that is not a printer.cfg."""
+
 MARK = "#*#"
 HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
 NEW_BLOCK = (HEADER, "#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.", MARK)
@@ -93,7 +98,7 @@ class KlipperConfig(ValueFile):
         (section, option), end = name, self.line_end
         line = f"{MARK} {option} = {text}{end}"
         if self.header is None:
-            lines += [end, *(line + end for line in NEW_BLOCK)]
+            lines += [*([end] if lines else []), *(line + end for line in NEW_BLOCK)]
         if section in self.saved:
             lines.insert(self.saved[section] + 1, line)
             return
@@ -104,8 +109,22 @@ class KlipperConfig(ValueFile):
 
 
 def read_config(path: Path) -> KlipperConfig:
-    """Read a configuration; FileError where it is unreadable, or its saved part was edited."""
-    return parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
+    """Read a configuration.
+
+    Raises
+    ------
+    FileError : it is unreadable, its saved part was edited, or it is not that of a delta printer.
+    """
+    cfg = parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
+    is_stated = cfg.has("printer", "kinematics")
+    kinematics = cfg.text("printer", "kinematics") if is_stated else ""
+    sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
+    if kinematics == "delta" or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
+        return cfg
+    finding = report_finding(
+        "files.not-a-delta-configuration", kinematics=kinematics, sections=sections[:SHOWN]
+    )
+    raise cfg.error(finding, "printer", "kinematics")
 
 
 def parse_config(lines: Sequence[str], path: Path) -> KlipperConfig:
@@ -143,8 +162,6 @@ def parse_config(lines: Sequence[str], path: Path) -> KlipperConfig:
     return KlipperConfig(path, tuple(lines), options, saved, header, tuple(includes))
 
 
-STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
-PROBED = "delta_calibrate"
 FULL_STEPS = 200.0
 MM = 1e-3
 
@@ -168,9 +185,6 @@ def read(path: Path, options: ImportOptions) -> Imported:
     FileError : an option is missing or not a number, or the printer is not a delta.
     """
     cfg = read_config(path)
-    if (kinematics := cfg.text("printer", "kinematics")) != "delta":
-        sentence = f"kinematics is {kinematics!r}, but loopcal only reads Klipper's delta printers"
-        raise cfg.error(f"{sentence} (kinematics: delta)", "printer", "kinematics")
     probes = _parse_probes(cfg)
     program, has_distances = "a printer.cfg of Klipper", bool(probes.distances)
     text = format_robot(parse_geometry(cfg), options, path, program, has_distances)
@@ -226,8 +240,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     if into is not None:
         return read_config(into).export(into, wanted, defaults)
     new = parse_config((), Path("printer.cfg"))
-    written = new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
-    return replace(written, text=written.text.lstrip("\n"))
+    return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
 
 
 def _parse_probes(cfg: KlipperConfig) -> _Probes:
@@ -256,19 +269,19 @@ def _list_records(cfg: KlipperConfig, name: str, parts: Sequence[str]) -> list[s
         a line of the record, or of the next one.
     """
     pattern = re.compile(rf"{name}(\d+)({'|'.join(parts)})")
-    found: dict[int, list[str]] = {}
+    records: dict[int, list[str]] = {}
     for section, option in cfg.values:
         if section == PROBED and (match := pattern.fullmatch(option)):
-            found.setdefault(int(match[1]), []).append(option)
-    for place, number in enumerate(sorted(found)):
-        present = found[number]
+            records.setdefault(int(match[1]), []).append(option)
+    for place, number in enumerate(sorted(records)):
+        present = records[number]
         lacking = [part for part in parts if f"{name}{number}{part}" not in present]
         code = "files.probe-part-missing" if lacking else "files.probe-left-out"
         if lacking or number != place:
             missing = f"{name}{number}{lacking[0]}" if lacking else f"{name}{place}"
             finding = report_finding(code, present=present[0], missing=missing, section=PROBED)
             raise cfg.error(finding, PROBED, present[0])
-    return [f"{name}{number}" for number in range(len(found))]
+    return [f"{name}{number}" for number in range(len(records))]
 
 
 def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:

@@ -54,7 +54,7 @@ def write_csv(source: ExportSource, into: Path | None) -> Exported:
         read = csv.DictReader(io.StringIO(read_text(written, "table of parameters")))
         require_same("rows", rows, list(read))
 
-    return Exported(stream.getvalue(), _report_intervals(source), check)
+    return Exported(stream.getvalue(), check, _report_intervals(source))
 
 
 def write_json(source: ExportSource, into: Path | None) -> Exported:
@@ -71,7 +71,7 @@ def write_json(source: ExportSource, into: Path | None) -> Exported:
     def check(written: Path) -> None:
         require_same("document", document, json.loads(read_text(written, "table of parameters")))
 
-    return Exported(text + "\n", _report_intervals(source), check)
+    return Exported(text + "\n", check, _report_intervals(source))
 
 
 def _report_intervals(source: ExportSource) -> tuple[Finding, ...]:

@@ -17,6 +17,7 @@ from loopcal.io.core.text_file import read_bytes
 from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.mechanism import Mechanism
 from loopcal.plain_text import quote
+from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -114,13 +115,13 @@ class Exported:
 
     Attributes
     ----------
-    findings : changes, and what it cannot express.
     read_back : reads the written file; raises LoopcalError where it does not state the values.
+    findings : changes, and what it cannot express.
     """
 
     text: str
+    read_back: Callable[[Path], object]
     findings: tuple[Finding, ...] = ()
-    read_back: Callable[[Path], object] | None = None
 
 
 @dataclass(frozen=True)
@@ -182,10 +183,13 @@ def format_head(
 
 
 def parse_number(text: str, what: str, path: Path, line: int) -> float:
-    """Return a finite number of a file; FileError with its line for other text."""
+    """Return a number of a file; FileError with its line for other text, or beyond `LARGEST`."""
     value = parse_finite(text)
     if value is None:
         sentence = f"{what} is {quote(text)}, but a finite number is needed; correct it"
+        raise FileError(sentence, path, line)
+    if not abs(value) <= LARGEST:
+        sentence = f"{what} is {quote(text)}, beyond {LARGEST:g}; correct it"
         raise FileError(sentence, path, line)
     return value
 

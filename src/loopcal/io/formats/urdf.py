@@ -156,7 +156,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     rest = (report_finding("files.not-expressed", format="the URDF", names=others),)
     text = get_byte_order_mark(into) + urdf.text
     findings = (*report_changes(changes), *(rest if others else ()))
-    return Exported(text, findings, partial(_check_written, urdf=urdf))
+    return Exported(text, partial(_check_written, urdf=urdf), findings)
 
 
 def _check_written(path: Path, urdf: Urdf) -> None:
@@ -165,6 +165,7 @@ def _check_written(path: Path, urdf: Urdf) -> None:
     require_same("joints", list(urdf.joints), list(read.joints))
     for name, joint in urdf.joints.items():
         require_same_numbers(f"origin of {name}", joint.origin, read.joints[name].origin)
+    require_same("the text is complete", True, read.text == urdf.text)
 
 
 def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:

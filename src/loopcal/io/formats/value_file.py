@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -159,17 +160,20 @@ class ValueFile(ABC):
         findings: Sequence[Finding] = (),
     ) -> Exported:
         """Return the text with other numbers; with all of them, where `into` names no file."""
-        check = partial(self._check_written, wanted=wanted, defaults=defaults)
         if into is None:
-            return Exported("".join(self.correct(wanted, {})[0].lines), tuple(findings), check)
-        file, changes = self.correct(wanted, defaults)
-        text = get_byte_order_mark(into) + "".join(file.lines)
-        return Exported(text, (*report_changes(changes), *findings), check)
+            file, mark = self.correct(wanted, {})[0], ""
+        else:
+            file, changes = self.correct(wanted, defaults)
+            findings, mark = (*report_changes(changes), *findings), get_byte_order_mark(into)
+        check = partial(file.check_written, wanted=wanted, defaults=defaults)
+        return Exported(mark + "".join(file.lines), check, tuple(findings))
 
-    def _check_written(
+    def check_written(
         self, path: Path, wanted: Mapping[Name, float | str], defaults: Mapping[Name, float]
     ) -> None:
-        """Read a written file; raise LoopcalError for a value that is not the wanted one."""
+        """Read a written file; raise LoopcalError for another text, or for a value that is not the
+        wanted one.
+        """
         read = self.with_lines(read_text(path, "written file").splitlines(keepends=True))
         for name, value in wanted.items():
             if isinstance(value, str):
@@ -177,6 +181,9 @@ class ValueFile(ABC):
             else:
                 is_same = self.is_same(read.number(*name, defaults.get(name)), value)
             require_same(f"{self.title.format(*name)} is {value}", True, is_same)
+        lines = zip_longest("".join(self.lines).split("\n"), "".join(read.lines).split("\n"))
+        for number, (before, after) in enumerate(lines, 1):
+            require_same(f"line {number}", before, after)
 
 
 def format_number(value: float) -> str:

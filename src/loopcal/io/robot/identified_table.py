@@ -53,6 +53,13 @@ def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = 
     return add_key(file, table) if table else file
 
 
+def remove_mark(text: str) -> str:
+    """Return the text of a robot file without the lines that say that its calibration failed."""
+    while text.startswith(NOT_CALIBRATED):
+        text = text.partition("\n")[2]
+    return text
+
+
 def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
     """Return the robot's values (p,) [SI], with those of the file's table in place.
 

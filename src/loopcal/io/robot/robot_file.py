@@ -28,7 +28,13 @@ from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.core.yaml_text import remove_key
 from loopcal.io.data.column_names import find_column_fault
-from loopcal.io.robot.identified_table import TABLE, add_table, read_possible_values
+from loopcal.io.robot.identified_table import (
+    TABLE,
+    add_table,
+    read_identified_values,
+    read_possible_values,
+    remove_mark,
+)
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,
@@ -116,20 +122,29 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
     Raises
     ------
     FileError : the file cannot be written. MechanismError : the robot was not loaded from a file.
+    ArgumentTypeError : there is not one uncertainty for each parameter.
     """
+    count = len(robot.parameters.names)
+    if plus_minus is not None and np.shape(plus_minus) != (count,):
+        raise ArgumentTypeError(
+            f"plus_minus has shape {np.shape(plus_minus)}; give one uncertainty for each of the "
+            f"{count} parameters, such as fit.plus_minus"
+        )
     write_robot(path, format_robot(robot, plus_minus), robot)
 
 
 def write_robot(path: str | Path, text: str, robot: Mechanism) -> None:
     """Write the text of a robot file, which is read back as this robot; raise as `save_robot`."""
-    write_text(path, text, lambda written: check_same_robot(robot, load_robot(written)))
+    write_text(path, text, lambda written: check_same_robot(robot, text, load_robot(written)))
 
 
-def check_same_robot(robot: Mechanism, read: Mechanism) -> None:
+def check_same_robot(robot: Mechanism, text: str, read: Mechanism) -> None:
     """Raise DataError where a robot that was read from a file is not the one that was written.
 
-    Values may differ by the rounding of one number, because a file states them in its unit.
+    `text` was to be written. Values may differ by the rounding of one number, because a file states
+    them in its unit.
     """
+    require_same("the text is complete", True, get_source(read).file.text == text)
     require_same("actuators", robot.actuators, read.actuators)
     require_same("parameters", robot.parameters.names, read.parameters.names)
     require_same_numbers("nominal values", robot.parameters.nominal, read.parameters.nominal)
@@ -137,8 +152,16 @@ def check_same_robot(robot: Mechanism, read: Mechanism) -> None:
 
 
 def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
-    """Return the text that `save_robot` writes."""
-    return add_table(get_source(robot).nominal_file, robot, plus_minus).text
+    """Return the text that `save_robot` writes.
+
+    That the calibration of the file failed is not said of other values.
+    """
+    source = get_source(robot)
+    text = add_table(source.nominal_file, robot, plus_minus).text
+    stored = robot.parameters.nominal
+    if TABLE in source.file.content:
+        stored = read_identified_values(source.file, robot.nominal)
+    return text if np.array_equal(robot.values, stored) else remove_mark(text)
 
 
 def get_source(robot: Mechanism) -> RobotSource:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.io.core.csv_table import format_row, read_table, require_columns
+from loopcal.io.core.csv_table import format_header, format_row, read_table, require_columns
 from loopcal.io.core.numbers import format_exact
 from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.text_file import write_text
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
 
 NAMES = ("rx", "ry", "rz", "x", "y", "z")
+STATUS = f"{NOTE} status"
 DIGITS = 6
 """Significant digits of an expected error."""
 
@@ -77,6 +78,11 @@ def _check_written(path: Path, result: Compensation) -> None:
     numbers = [table.numbers(name, unit.dimension) for name, unit in columns]
     wanted = np.where(result.usable[:, None], values, np.nan)
     require_same_numbers("readings or commands", wanted, np.column_stack(numbers))
+    for name, unit, errors in _list_errors(result):
+        cells = tuple(_format_error(v / unit.factor_to_si) for v in errors.tolist())
+        require_same(name, cells, table.text(name))
+    findings = tuple(map(str, result.findings))
+    require_same(STATUS, findings, table.text(STATUS))
 
 
 def _list_columns(result: Compensation) -> tuple[list[tuple[str, Unit]], FloatArray]:
@@ -89,29 +95,33 @@ def _list_columns(result: Compensation) -> tuple[list[tuple[str, Unit]], FloatAr
     return columns, result.commands
 
 
-def format_compensation(result: Compensation) -> str:
-    """Return the result as CSV text, units in the header."""
-    robot = result.robot
-    columns, values = _list_columns(result)
+def _list_errors(result: Compensation) -> list[tuple[str, Unit, FloatArray]]:
+    """Return column, unit and values (n,) [SI] of the expected errors."""
     errors = {"before": result.before, "remaining": result.remaining}
     if result.uncertainty is not None:
         errors["U"] = result.uncertainty.expanded
-    dimensions = (Dimension.LENGTH if name in "xyz" else Dimension.ANGLE for name in NAMES)
-    axes = [(n, robot.get_unit(d)) for n, d in zip(NAMES, dimensions, strict=True)]
-    header = ["pose", *(f"{name} [{unit}]" for name, unit in columns)]
-    header += [f"{NOTE} {title} {name} [{unit}]" for title in errors for name, unit in axes]
-    lines = [format_row([*header, f"{NOTE} status"])]
+    dimensions = [Dimension.LENGTH if name in "xyz" else Dimension.ANGLE for name in NAMES]
+    return [
+        (f"{NOTE} {title} {name}", result.robot.get_unit(dimension), values[:, k])
+        for title, values in errors.items()
+        for k, (name, dimension) in enumerate(zip(NAMES, dimensions, strict=True))
+    ]
+
+
+def format_compensation(result: Compensation) -> str:
+    """Return the result as CSV text, units in the header."""
+    columns, values = _list_columns(result)
+    errors = _list_errors(result)
+    units = {name: unit.symbol for name, unit in columns}
+    units |= {name: unit.symbol for name, unit, _ in errors}
+    lines = [format_row(["pose", *format_header(units), STATUS])]
     usable = result.usable
     for i, label in enumerate(result.labels):
         cells = [
             format_exact(float(v), unit.factor_to_si) if usable[i] else ""
             for v, (_, unit) in zip(values[i], columns, strict=True)
         ]
-        cells += [
-            _format_error(float(v) / unit.factor_to_si)
-            for error in errors.values()
-            for v, (_, unit) in zip(error[i], axes, strict=True)
-        ]
+        cells += [_format_error(v[i] / unit.factor_to_si) for _, unit, v in errors]
         lines.append(format_row([label, *cells, str(result.findings[i])]))
     return "\n".join(lines) + "\n"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loopcal.io.core.csv_table import format_row, read_table
+from loopcal.io.core.csv_table import format_header, format_row, read_table
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.text_file import write_text
@@ -40,7 +40,7 @@ def save_draws(
         table = read_table(written)
         of_weight = [] if weight is None else [WEIGHT]
         require_same("columns", (*of_weight, *names), table.names)
-        numbers = np.array(table.rows, dtype=float)
+        numbers = np.array(list(table.columns.values()), dtype=float).T
         require_same_numbers("draws", draws, numbers[:, len(of_weight) :] * factors, ROUNDING)
         if weight is not None:
             require_same_numbers("weights", weight, numbers[:, 0])
@@ -62,7 +62,7 @@ def format_draws(
     names, units, factors : (p,) names, symbols of units, and their factors to SI.
     weight : (T,), optional.
     """
-    header = [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
+    header = format_header(dict(zip(names, units, strict=True)))
     lines = [format_row([*([] if weight is None else [WEIGHT]), *header])]
     for i, row in enumerate(draws):
         own = [] if weight is None else [repr(float(weight[i]))]

@@ -131,8 +131,8 @@ def write_plan_folder(
     texts: Mapping[str, str],
     document: Mapping[str, Any],
     pictures: Mapping[str, bytes],
+    read_back: Callable[[Path], object],
     force: bool = False,
-    read_back: Callable[[Path], object] | None = None,
 ) -> None:
     """Write the folder of a plan whole or not at all.
 
@@ -140,15 +140,15 @@ def write_plan_folder(
     ----------
     path : the folder to make. texts : name -> text of a file.
     document : content of plan.json; `format` and `files` are added.
-    pictures : name -> content. force : replace an older, unchanged plan.
-    read_back : see `write_result_folder`.
+    pictures : name -> content. read_back : see `write_result_folder`.
+    force : replace an older, unchanged plan.
 
     Raises
     ------
     FileError : see `write_result_folder`.
     """
     files = {name: text.encode() for name, text in texts.items()} | dict(pictures)
-    write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, force, read_back)
+    write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, read_back, force)
 
 
 def check_written_plan(folder: Path, plan: Plan | SurfacePlan) -> None:

@@ -34,6 +34,7 @@ from loopcal.io.core.result_folder import (
 )
 from loopcal.io.core.text_file import as_path, sha256
 from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.identified_table import remove_mark
 from loopcal.io.robot.robot_file import (
     check_same_robot,
     format_robot,
@@ -45,13 +46,14 @@ from loopcal.io.runs.run_result import (
     FORMAT,
     RESULT,
     read_result,
+    refuse_other_estimates,
     refuse_other_parameters,
-    report_damage,
 )
 from loopcal.io.runs.run_verdict import (
     FAILED_ROBOT,
     ROBOT,
     WARNING,
+    find_file_failure,
     find_run_failure,
     name_robot_file,
 )
@@ -112,9 +114,9 @@ def write_run_folder(
     result: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
     robot_text: str,
+    read_back: Callable[[Path], object],
     force: bool = False,
     robot_name: str = ROBOT,
-    read_back: Callable[[Path], object] | None = None,
 ) -> Path:
     """Write a run folder whole or not at all, and return it.
 
@@ -122,8 +124,8 @@ def write_run_folder(
     ----------
     path : the folder to make. result : content of result.json; `format` and `files` are added.
     arrays : name -> array, SI. robot_text : of the corrected robot file.
-    force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
     read_back : see `write_result_folder`.
+    force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
 
     Raises
     ------
@@ -132,7 +134,7 @@ def write_run_folder(
     path = as_path(path, "run folder")
     np.savez(stream := BytesIO(), allow_pickle=False, **arrays)
     files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
-    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force, read_back)
+    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, read_back, force)
     return path
 
 
@@ -159,10 +161,8 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     digest = result["files"].get(ARRAYS, "none") if "files" in result else None
     arrays = read_run_arrays(path / ARRAYS, digest)
     for name, key in (("estimate", "parameters"), ("local_estimate", "local")):
-        rows = result["fit"].get(key, ())
-        if name in arrays and len(arrays[name]) != len(rows):
-            problem = f"'fit.{key}' has {len(rows)} entries, but the array {name!r} of {ARRAYS} has"
-            raise report_damage(path / RESULT, f"{problem} {len(arrays[name])}")
+        if name in arrays:
+            refuse_other_estimates(path / RESULT, result, key, arrays[name], name)
     return result, arrays
 
 
@@ -309,21 +309,34 @@ def save_run(
     MechanismError : the robot was not loaded from a file.
     """
     document = build_document(report, inputs, command)
-    text = format_robot(report.robot, report.identification.plus_minus)
+    text = remove_mark(format_robot(report.robot, report.identification.plus_minus))
     name = name_robot_file(report, force)
-    text = WARNING + text if name == FAILED_ROBOT else text
+    text = WARNING + text if report.failures else text
     arrays = report.arrays()
-    check = partial(_check_written_run, arrays=arrays, robot=report.robot)
-    return write_run_folder(path, document, arrays, text, force, name, check)
+    check = partial(_check_written_run, arrays=arrays, robot=report.robot, text=text)
+    return write_run_folder(path, document, arrays, text, check, force, name)
 
 
-def _check_written_run(path: Path, arrays: Mapping[str, np.ndarray], robot: Mechanism) -> None:
+def _check_written_run(
+    path: Path, arrays: Mapping[str, np.ndarray], robot: Mechanism, text: str
+) -> None:
     """Read a run; raise LoopcalError where it does not hold these numbers."""
     run = load_run(path)
-    check_same_robot(robot, run.robot)
+    _read_everything(run)
+    check_same_robot(robot, text, run.robot)
     require_same("arrays", sorted(arrays), sorted(run.arrays))
     for name, array in arrays.items():
         require_same(f"bytes of {name}", array.tobytes(), run.arrays[name].tobytes())
+
+
+def _read_everything(run: Run) -> None:
+    """Read whatever another command reads from a run; raise LoopcalError where it cannot."""
+    budget = run.result.get("expected_error")
+    if "posterior_unit" in run.arrays:
+        run.load_posterior()
+    if budget is not None and budget.get("sources") is not None:
+        run.load_budget()
+    _ = (run.fitted_rows, run.held_out, run.excluded, run.failure, run.load_uncertainty())
 
 
 def build_document(
@@ -371,12 +384,14 @@ def load_run_or_robot(path: str | Path) -> Run:
 
 
 def find_failure(path: str | Path) -> Finding | None:
-    """Return why the numbers of a run, or of a robot file in its folder, are not for a machine."""
+    """Return why the numbers of a run, or of a robot file, are not for a machine.
+
+    The robot file of a calibration that failed states it, wherever the file is.
+    """
     path = as_path(path, "run folder or robot file")
     folder = path.parent if path.name in (ROBOT, FAILED_ROBOT) else path
-    if not (folder / RESULT).is_file():
-        return None
-    return find_run_failure(folder, read_run_folder(folder)[0])
+    result = read_run_folder(folder)[0] if (folder / RESULT).is_file() else {}
+    return find_run_failure(folder, result) or find_file_failure(path)
 
 
 def load_posterior(path: str | Path) -> Posterior:

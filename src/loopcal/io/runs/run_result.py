@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
+
+import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
@@ -22,6 +25,7 @@ from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import YamlFile
 from loopcal.mechanism import Mechanism
+from loopcal.units import UNITS
 
 RESULT = "result.json"
 FORMAT = 2
@@ -47,6 +51,8 @@ class StoredParameter(_Part):
 
     name: str
     plus_minus: float | None
+    estimate: float | None = None
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -154,6 +160,9 @@ NEEDED = ("verdict", "passed", "reasons", "split", "files")
 """Keys that every run of format 2 states, beside those that every run states."""
 NEVER_NULL = ("verdict", "passed")
 
+ROUNDING = 1e-14
+"""Relative difference of an estimate in its unit and in SI."""
+
 LARGEST = 1e100
 """Errors and variances of a budget are smaller; their squares are numbers."""
 
@@ -193,7 +202,7 @@ def refuse_other_parameters(
     ----------
     result : of `read_result`, which states the identified parameters. count : number of all
         parameters before the calibration. robot : read from the file `path`; others may be free,
-        too, because `--choose-model` identifies some of them.
+        too, because a choice of the model identifies some of them.
 
     Raises
     ------
@@ -208,6 +217,32 @@ def refuse_other_parameters(
     raise FileError(
         report_finding("files.run-robot-changed", result=RESULT, name=different[0]), path
     )
+
+
+def refuse_other_estimates(
+    path: Path, result: Mapping[str, Any], key: str, array: np.ndarray, name: str
+) -> None:
+    """Refuse a result that states other estimates than the arrays of its run.
+
+    Parameters
+    ----------
+    path : of result.json, whose content is `result`. key : of its rows under `fit`.
+    array : the estimates [SI]; `name` is that of the array.
+
+    Raises
+    ------
+    FileError : `files.run-damaged`.
+    """
+    rows, holds = result["fit"].get(key, ()), f"but the array {name!r} of the run holds"
+    if len(array) != len(rows):
+        raise report_damage(path, f"'fit.{key}' has {len(rows)} entries, {holds} {len(array)}")
+    for row, value in zip(rows, array.tolist(), strict=True):
+        if row.get("estimate") is None or "unit" not in row:  # of an earlier version
+            continue
+        factor = UNITS[row["unit"]].factor_to_si if row["unit"] in UNITS else math.nan
+        if not math.isclose(row["estimate"] * factor, value, rel_tol=ROUNDING):
+            stated = f"{row['estimate']!r} {row['unit']} for {row['name']}"
+            raise report_damage(path, f"'fit.{key}' states {stated}, {holds} {value!r} [SI]")
 
 
 def report_damage(path: Path, problem: str) -> FileError:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.findings import Finding, report_finding
+from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.identified_table import NOT_CALIBRATED
 
 if TYPE_CHECKING:
@@ -62,3 +63,10 @@ def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
     if "verdict" not in result and (status != CONVERGED or "passed" not in result):
         return report_finding("gates.run-without-verdict", run=str(path))
     return None
+
+
+def find_file_failure(path: Path) -> Finding | None:
+    """Return `gates.run-not-calibrated` for a robot file that states it; None for other paths."""
+    if not path.is_file() or not read_yaml(path, "robot file").text.startswith(NOT_CALIBRATED):
+        return None
+    return report_finding("gates.run-not-calibrated", run=str(path), reasons=())

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.kinematics import Solution, check_arguments, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import compute_limb_frames
@@ -20,9 +21,9 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 MIN_DRAWS = 2000
-"""Positions drawn before a workspace is called empty."""
-MIN_REACHABLE_SHARE = 1e-3
-"""Share of them that must be reachable."""
+"""Positions drawn before a workspace is refused."""
+MIN_REACHABLE_SHARE = 1e-2
+"""Share of them that must be reachable: drawing n positions tries at most 100 n."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,8 @@ class WorkspaceSample:
     rejected: Mapping[str, int]
 
     def __repr__(self) -> str:
-        share = f"{100 * self.reachable_share:.3g} % of the stated workspace is reachable"
-        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share}>"
+        share = f"{round_to_digits(100 * self.reachable_share)} % of the stated workspace"
+        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share} is reachable>"
 
 
 def sample_workspace(
@@ -175,9 +176,9 @@ def sample_workspace(
         if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
             reason, count = rejected.most_common(1)[0]
             raise MechanismError(
-                f"the workspace of {robot.name} is empty: {kept} of {tried} random positions are "
-                f"reachable; most frequent reason: {reason} ({count} positions); correct "
-                "`workspace:`, the strokes or the limits"
+                f"{robot.name} reaches almost nothing of its workspace: {kept} of {tried} random "
+                f"positions (at least {MIN_REACHABLE_SHARE:.0%} are needed); most frequent reason: "
+                f"{reason} ({count} positions); correct `workspace:`, the strokes or the limits"
             )
     coordinates = np.concatenate(batches)[:n]
     return WorkspaceSample(

@@ -38,6 +38,9 @@ CURVE_OF_BUILDUP = 1 / (4 * np.pi)
 reading.
 """
 
+POSITIVE = ("length", "lead", "gain")
+"""What named parameters are mapped onto that keeps its sign: rods, screws and scales."""
+
 Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
 Term = tuple[Dimension, float, Tolerance, str, float]
 """Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
@@ -108,6 +111,24 @@ def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
     if isinstance(named, NamedAngle):
         return Dimension.ANGLE, named.angle
     return Dimension.RATIO, named.ratio
+
+
+def is_always_positive(named: NamedParameter) -> bool:
+    """Return whether only values above zero of a named parameter exist, if its nominal value is.
+
+    Raises
+    ------
+    MechanismError
+        The file says so, but the nominal value is not above zero.
+    """
+    is_stated = isinstance(named, NamedLength) and named.positive
+    nominal = get_quantity(named)[1]
+    if is_stated and not nominal > 0.0:
+        raise MechanismError(
+            f"parameter {named.name!r} is stated to be positive, but its nominal value is "
+            f"{nominal * 1e3:g} mm; correct the value, or leave out 'positive'"
+        )
+    return is_stated or any(entry.axis in POSITIVE for entry in named.maps)
 
 
 def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:

@@ -303,12 +303,17 @@ class MapEntry:
 
 @dataclass(frozen=True)
 class NamedLength:
-    """A named parameter that is a length, with its nominal value."""
+    """A named parameter that is a length, with its nominal value.
+
+    `positive: true` says that no machine has it at zero or below, such as a radius. It is always so
+    where a nominal value above zero is mapped onto a rod's length, a lead or a gain.
+    """
 
     name: str
     length: Length
     maps: tuple[MapEntry, ...]
     tolerance: LengthTolerance | None = None
+    positive: bool = False
 
 
 @dataclass(frozen=True)

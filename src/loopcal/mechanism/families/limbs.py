@@ -40,6 +40,7 @@ from loopcal.mechanism.families.limb_parameters import (
     drive_errors,
     find_engine_axis,
     get_quantity,
+    is_always_positive,
 )
 from loopcal.mechanism.families.limb_placement import (
     EX,
@@ -327,7 +328,8 @@ def _named(named: NamedParameter, members: Members, drives: Drives) -> ErrorMode
     dimension, nominal = get_quantity(named)
     sd = standard_deviation(named.tolerance, named.name)
     maps = [m for entry in named.maps for m in _map_entry(named, entry, members, drives)]
-    return single_error(named.name, dimension, nominal, sd, *maps)
+    is_positive = is_always_positive(named)
+    return single_error(named.name, dimension, nominal, sd, *maps, positive=is_positive)
 
 
 def _map_entry(

@@ -30,6 +30,7 @@ from loopcal.planning.design.exchange import (
     draw_groups,
     exchange_from_start,
     exchange_groups,
+    is_exhausted,
     list_starts,
     require_determined,
 )
@@ -120,7 +121,8 @@ def choose_design(
     chosen, last = exchange_groups(candidates, among[best], random)
     values = tuple(scoring.value(score) for score in (*history, *scores, *last[1:]))
     ends = tuple(scoring.value(score) for score in (history[-1], last[-1]))
-    design = Design(np.sort(usable[chosen]), values[-1], values, ends, scoring.space)
+    final = np.sort(usable[chosen]), values[-1], values, ends, scoring.space
+    design = Design(*final, is_converged=not is_exhausted(last, n))
     return CertifiedDesign(design, relaxed, relaxed.efficiency(design.value))
 
 

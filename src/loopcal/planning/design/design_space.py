@@ -95,6 +95,7 @@ class Design:
     history : values of the best start: after it began, and after each exchange.
     values : final value of each start.
     space : the directions in which the value counts.
+    is_converged : whether no single exchange improves it; False where the exchanges ran out.
     """
 
     chosen: IntArray
@@ -102,6 +103,7 @@ class Design:
     history: tuple[float, ...]
     values: tuple[float, ...]
     space: ObservableSpace
+    is_converged: bool = True
 
 
 def factor_rows(rows: FloatArray) -> FloatArray:

@@ -48,6 +48,9 @@ LinearizeGroups = Callable[[IntArray, FloatArray], FloatArray]
 SWEEP_GAIN = 1e-3
 """Sweeps end when one has multiplied the efficiency by less than 1 + this."""
 
+EXCHANGES = 100
+"""Exchanges of each group of a design, on average and at most: a few are enough."""
+
 PROBES = 4
 """Copies of each group at random levels, which with the first design define the observable
 directions.
@@ -106,7 +109,8 @@ def fedorov_exchange(
     values = tuple(scoring.value(score) for score in history)
     final = tuple(scoring.value(score) for score in scores)
     chosen = np.sort(candidates.indices[chosen])
-    return Design(chosen, values[-1], values, final, scoring.space)
+    is_converged = not is_exhausted(history, n)
+    return Design(chosen, values[-1], values, final, scoring.space, is_converged)
 
 
 def list_starts(
@@ -158,13 +162,13 @@ def exchange_groups(
 
     Returns
     -------
-    chosen : (n,). history : scores at the beginning and after each exchange.
+    chosen : (n,). history : scores at the beginning and after each exchange; see `is_exhausted`.
     """
     scoring, rows = candidates.scoring, candidates.rows
     chosen, n = chosen.copy(), len(chosen)
     R = candidates.factor(chosen)
     history, terms, idle = [scoring.score(R)], compute_swap_terms(scoring, R, rows), 0
-    while idle < n:
+    while idle < n and not is_exhausted(history, n):
         for j in stream.permutation(n):
             gain = score_swaps(terms, int(chosen[j]))
             if not candidates.repeats:
@@ -178,9 +182,14 @@ def exchange_groups(
                 if score > history[-1]:
                     chosen, terms, idle = trial, compute_swap_terms(scoring, R, rows), 0
                     history.append(score)
-            if idle >= n:
+            if idle >= n or is_exhausted(history, n):
                 break
     return chosen, history
+
+
+def is_exhausted(history: Sequence[float], n: int) -> bool:
+    """Return whether the exchange of n groups ended because it had made all of its exchanges."""
+    return len(history) > EXCHANGES * n
 
 
 def complete_design(candidates: ScaledCandidates, chosen: IntArray, n: int) -> IntArray:
@@ -226,6 +235,7 @@ class MovedDesign:
         after each.
     evaluated : number of groups that were linearized in all.
     space : the directions in which the value counts.
+    is_converged : whether the last sweep gained hardly anything; False where the sweeps ran out.
     """
 
     design: FloatArray
@@ -234,6 +244,7 @@ class MovedDesign:
     history: tuple[float, ...]
     evaluated: int
     space: ObservableSpace
+    is_converged: bool
 
 
 def coordinate_exchange(
@@ -278,7 +289,7 @@ def coordinate_exchange(
     allowed = is_allowed(probes)
     weight = len(design) / int(allowed.sum())
     scoring = build_scoring(probes[allowed], weight, criterion, prior, space)
-    history, evaluated = [_score_design(scoring, rows)], len(probes)
+    history, evaluated, is_converged = [_score_design(scoring, rows)], len(probes), False
     for sweep in range(sweeps):
         used = scoring if np.isfinite(history[-1]) else scoring.with_ridge(RIDGE)
         for c, values in enumerate(levels):
@@ -294,11 +305,12 @@ def coordinate_exchange(
             design[accepted, c] = np.asarray(values)[best[accepted]]
             rows[accepted] = trials[accepted, best[accepted]]
         history.append(_score_design(scoring, rows))
-        if history[-1] - history[-2] < SWEEP_GAIN * scoring.height:
+        is_converged = history[-1] - history[-2] < SWEEP_GAIN * scoring.height
+        if is_converged:
             break
     require_determined(history[-1], len(design), len(design), space)
     values = tuple(scoring.value(score) for score in history)
-    return MovedDesign(design, rows, values[-1], values, evaluated, space)
+    return MovedDesign(design, rows, values[-1], values, evaluated, space, is_converged)
 
 
 def _require_allowed(rows: FloatArray) -> None:

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every file that the package writes is read before it takes its name, whoever writes it.
+
+`COMMANDS` has a command for each function of the package that writes a file. A search in the source
+finds these functions, so that a new one fails here until it is tested.
+"""
+
+import ast
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+import loopcal
+from loopcal.cli import main
+from loopcal.errors import FileError
+from loopcal.papers.writing import write_folder
+from tests.papers.small_reproduction import MADE_BY, build_reproduction
+from tools.fuzz.sources import SOURCES
+
+PACKAGE = Path(loopcal.__file__).parent
+
+CORE = ("write_text", "write_bytes", "replace_file", "replace_folder", "write_result_folder")
+"""Functions of `loopcal.io.core` that write; all need a function that reads what was written."""
+
+LIBRARY = {"savez", "save", "savetxt", "savefig", "dump", "to_csv", "tofile", "writelines"}
+LIBRARY |= {"mkstemp", "fdopen", "mkdir", "makedirs", "hardlink_to", "copy2", "NamedTemporaryFile"}
+"""Functions of Python and libraries that can write."""
+
+USES_LIBRARY = {
+    "cli/defect_report.py": "the report of a defect is for people, and must not fail",
+    "cli/terminal.py": "writes to the null device",
+    "io/core/outputs.py": "makes the folder for a folder",
+    "io/core/replacement.py": "makes, renames and restores temporary files",
+    "io/core/result_folder.py": "writes folders, and has them read",
+    "io/core/text_file.py": "writes files, and has them read",
+    "io/runs/run_folder.py": "makes arrays.npz in memory",
+    "papers/drawing.py": "draws into memory",
+    "report/pictures.py": "draws into memory",
+}
+"""Modules that use them, and why they may."""
+
+COMMANDS = {
+    "io/robot/robot_file.py:write_robot": (
+        "new five-bar -o F.yaml",
+        "simulate five-bar -o d.csv --draw-errors --truth F.yaml",
+        "import robot.g --format reprap -o F.yaml",
+        "import robot.urdf --closures loops.yaml -o F.yaml",
+    ),
+    "cli/robot_commands.py:new": ("new five-bar -o new.yaml --measurements F.csv",),
+    "cli/robot_commands.py:check": tuple(
+        f"check five-bar --plot F{ending}" for ending in (".png", ".svg", ".pdf")
+    ),
+    "io/data/measurement_writer.py:save_measurements": (
+        "simulate five-bar --draw 4 -o F.csv",
+        "import printer.cfg -o p.yaml --data F.csv",
+    ),
+    "io/exports/conversion.py:save_conversion": (
+        "import spheres.csv --profile spheres.yaml -o F.csv",
+    ),
+    "io/runs/draws_file.py:save_draws": (
+        "bootstrap run --count 5 -o F.csv",
+        "sample run --count 100 -o F.csv",
+    ),
+    "io/runs/compensation_file.py:save_compensation": ("compensate run targets.csv -o F.csv",),
+    "cli/exchange_commands.py:export": (
+        "export delta.yaml -o F.cfg",
+        "export delta.yaml --into printer.cfg -o F.cfg",
+        "export delta.yaml --format marlin -o F.g",
+        "export delta.yaml --format reprap --into robot.g -o F.g",
+        "export run -o F.json",
+        "export run -o F.csv",
+        "export hexapod.yaml --into hexapod.hal -o F.hal",
+        "export tripod.yaml --into robot.urdf -o F.urdf",
+    ),
+    "cli/exchange_commands.py:_correct_file": (
+        "import printer.cfg -o p.yaml --data p.csv --corrected F.cfg",
+    ),
+    "io/runs/run_folder.py:write_run_folder": ("calibrate five-bar data.csv --hold-out 0.25 -o F",),
+    "io/runs/plan_folder.py:write_plan_folder": (
+        "plan five-bar --kind position --candidates 20 --poses 7 --hold-out 2 -o F",
+    ),
+    "papers/writing.py:write_folder": ("STUDY",),
+}
+"""Commands that write the file or folder F, by the function that writes it."""
+
+FILES = {
+    "cli/exchange_commands.py:_correct_file": ("F.cfg",),
+    "io/runs/run_folder.py:write_run_folder": ("result.json", "robot.yaml", "arrays.npz"),
+    "io/runs/plan_folder.py:write_plan_folder": (
+        "plan.csv",
+        "measurements.csv",
+        "plan.json",
+        "plan.png",
+    ),
+    "papers/writing.py:write_folder": ("result.json", "extra.csv", "extra.json", "curve.png"),
+}
+"""Names of the files of folders, and of commands that compute for long: one damage each."""
+
+
+@cache
+def parse_source() -> tuple[tuple[str, ast.AST, str], ...]:
+    """Return module, node, and the outermost function around it, of all names and calls."""
+    nodes = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        text = path.read_text("utf-8")
+        if not any(name in text for name in (*CORE, *LIBRARY, "open(")):
+            continue
+        module = path.relative_to(PACKAGE).as_posix()
+        body = ast.parse(text).body
+        methods = (node for top in body if isinstance(top, ast.ClassDef) for node in top.body)
+        for top in chain((top for top in body if not isinstance(top, ast.ClassDef)), methods):
+            nodes += [(module, node, getattr(top, "name", "")) for node in ast.walk(top)]
+    return tuple(nodes)
+
+
+def list_names() -> Iterator[tuple[str, str, ast.AST, str]]:
+    """Yield module, name, its node, and the function around it, of all names in use."""
+    for module, node, owner in parse_source():
+        if isinstance(node, ast.Name | ast.Attribute):
+            yield module, node.id if isinstance(node, ast.Name) else node.attr, node, owner
+
+
+def list_openings() -> Iterator[str]:
+    """Yield the modules that open a file with a mode that writes."""
+    for module, call, _ in parse_source():
+        if isinstance(call, ast.Call) and ast.unparse(call.func).rpartition(".")[2] == "open":
+            words = [*call.args, *(keyword.value for keyword in call.keywords)]
+            modes = [word.value for word in words if isinstance(word, ast.Constant)]
+            if any(re.fullmatch(r"[wax][bt+]*|r.?\+", str(mode)) for mode in modes):
+                yield module
+
+
+def test_no_module_writes_files_itself() -> None:
+    """Only the core does, and what writes into memory or to nobody."""
+    methods = {
+        module
+        for module, name, node, _ in list_names()
+        if isinstance(node, ast.Attribute) and name in ("write_text", "write_bytes")
+    }
+    library = {module for module, name, *_ in list_names() if name in LIBRARY}
+    assert methods | library | set(list_openings()) == set(USES_LIBRARY)
+
+
+def test_every_writer_has_a_command_here() -> None:
+    writers = {
+        f"{module}:{owner}"
+        for module, name, node, owner in list_names()
+        if name in CORE and isinstance(node, ast.Name) and not module.startswith("io/core/")
+    }
+    assert writers == set(COMMANDS)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory, root) -> Path:
+    """Return a folder with the inputs of all commands."""
+    folder = tmp_path_factory.mktemp("inputs")
+    for name, text in SOURCES.items():
+        (folder / name).write_text(text)
+    for name in ("spheres.csv", "spheres.yaml"):
+        shutil.copy(root / "examples" / "exports" / f"cmm-{name}", folder / name)
+    (folder / "targets.csv").write_text("pose,x [mm],y [mm]\na,0,330\nb,10,320\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for command in (
+            "simulate five-bar --draw 10 --kind position --draw-errors -o data.csv",
+            "calibrate five-bar data.csv -o run",
+            "simulate linear-delta --draw-errors --draw 2 -o d.csv --truth delta.yaml",
+            "import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml",
+            "import robot.urdf --closures loops.yaml -o tripod.yaml",
+        ):
+            assert main(command.split()) == 0
+    return folder
+
+
+def halve(content: bytes) -> bytes:
+    """Return the first half."""
+    return content[: len(content) // 2]
+
+
+def change_digit(content: bytes) -> bytes:
+    """Return the content with another last digit, not in a remark of a table."""
+    *_, last = re.finditer(rb"^(?!##).*[0-9]", content, re.MULTILINE)
+    digit = b"1" if last[0][-1:] != b"1" else b"2"
+    return content[: last.end() - 1] + digit + content[last.end() :]
+
+
+def run(command: str) -> int:
+    """Run a command; return its exit code, or 1 where a study cannot be written."""
+    if command != "STUDY":
+        return main([*command.split(), "--force"])
+    try:
+        write_folder("F", build_reproduction(), MADE_BY, force=True)
+    except FileError as error:
+        sys.stderr.write(str(error))
+        return 1
+    return 0
+
+
+@pytest.mark.parametrize(
+    ("writer", "command"), [(writer, c) for writer, words in COMMANDS.items() for c in words]
+)
+def test_a_damaged_file_replaces_nothing(
+    inputs, tmp_path, monkeypatch, capsys, writer: str, command: str
+) -> None:
+    """Each file of the output loses its second half, or a digit, as if its writer were wrong."""
+    shutil.copytree(inputs, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    assert run(command) in (0, 2)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    names = FILES.get(writer, (command.rsplit(" ", 1)[-1],))
+    survived = []
+    for name in names:
+        if not any(path.name == name for path in before):
+            continue
+        is_text = not name.endswith((".png", ".svg", ".pdf", ".npz"))
+        damages = (halve, change_digit) if writer not in FILES else (change_digit,)
+        for damage in damages if is_text else (halve,):
+            with monkeypatch.context() as patch:
+                patch.setattr(Path, "write_bytes", write_damaged(name, damage))
+                capsys.readouterr()
+                code = run(command)
+            message = " ".join(capsys.readouterr().err.split())
+            if code != 1 or "This is a defect of loopcal" not in message:
+                survived.append((name, damage.__name__, code, message))
+    after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert survived == []
+    assert {p for p in before | after if before.get(p) != after.get(p)} <= {tmp_path / "d.csv"}
+
+
+def write_damaged(name: str, damage: Callable[[bytes], bytes]) -> Callable[[Path, bytes], int]:
+    """Return a function in place of Path.write_bytes that damages the files of one name."""
+    write = Path.write_bytes
+
+    def write_bytes(path: Path, content: bytes) -> int:
+        return write(path, damage(content) if path.name.endswith(name) else content)
+
+    return write_bytes
