@@ -31,6 +31,12 @@ NOTE = (
     "Medians of the converged trials, and their 95 % intervals by the number of trials. Shares of "
     "coverage should be 0.95."
 )
+FRAMES = {
+    "fitted": "Pose errors are stated without motions of frames that the measurements do not fix.",
+    "base": "Pose errors are in the base frame.",
+}
+"""Frame of the scores of a study -> what the page says about it."""
+
 SHOWN = ("position", "orientation", "covered_parameters")
 """Scores of the table on the screen by default."""
 
@@ -55,7 +61,7 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
     state = "" if summary.is_complete else f" (of {total}; the study is not complete)"
     page: list[Block] = [
         f"{study.title}: {len(study.cells)} cells, {summary.trials} trials{state}",
-        NOTE,
+        f"{NOTE} {FRAMES[study.scores.frame]}",
         tabulate_medians(study, summary, shown),
     ]
     counts: dict[str, int] = {}
