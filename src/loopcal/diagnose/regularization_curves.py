@@ -36,7 +36,7 @@ PER_DECADE = 4
 """Values of lam per factor of ten where no fit is repeated."""
 
 MOST_FITTED = 13
-"""Values of lam, and of k, that are fitted again for each fold."""
+"""Values of lam, and of k, that are fitted again for each fold, beside those of rules."""
 
 LOWEST, HIGHEST = 1e-12, 10.0
 """Range of lam in units of the largest squared singular value; a rule may choose more."""
@@ -150,17 +150,18 @@ def compute_regularization_curves(
     rules_lam = _apply_rules(d, {"GCV": GCV(), "marginal likelihood": MarginalLikelihood()})
     lam, k = list_lam(d, [rule.value for rule in rules_lam]), np.arange(len(free) + 1)
     rules_k = _apply_rules(d, {"GCV": TruncationGCV()})
+    if problem.nuisance is not None:
+        lam, k = lam[_spread(len(lam), MOST_FITTED)], k[_spread(len(k), MOST_FITTED)]
+    # what the rules choose has its own score
+    lam = np.unique([*lam, *(rule.value for rule in rules_lam)])
+    k = np.unique([*k, *(int(rule.value) for rule in rules_k)])
+    methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
     if problem.nuisance is None:
         scheme: Scheme = "leave-one-out"
-        methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
         result = score_leave_one_out(fit.robot, data, methods)
         score, error, left_out = result.score, result.standard_error, result.blocks
     else:
         scheme, left_out = "folds", folds
-        lam = lam[_spread(len(lam), MOST_FITTED)]
-        marked = [int(rule.value) for rule in rules_k]
-        k = np.unique([*k[_spread(len(k), MOST_FITTED)], *marked])
-        methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
         score, error = _score_folds(robot, data, methods, options, folds, seed, progress)
     n = len(lam)
     ridge = _mark("lam", lam, score[:n], error[:n], rules_lam)
