@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.json_text import read_json, to_json
 from loopcal.io.core.text_file import write_bytes, write_text
 from loopcal.report.numbers import ABSENT, format_number
+from loopcal.report.pictures import check_picture
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block
 from loopcal.studies.cells import list_factors, list_varied_factors
@@ -95,7 +95,7 @@ def write_summary(
     write_text(folder / JSON, text, read_back=lambda path: read_json(path, "summary", "repeat it"))
     write_text(folder / CSV, table.to_csv(), read_back=lambda path: check_table(path, table))
     for name, content in figures.items():
-        write_bytes(folder / name, content, functools.partial(_check_content, content=content))
+        write_bytes(folder / name, content, check_picture)
 
 
 def check_table(path: Path, table: Table) -> None:
@@ -103,12 +103,6 @@ def check_table(path: Path, table: Table) -> None:
     rows = list(csv.reader(path.read_text("utf-8").splitlines()))
     if [tuple(row) for row in rows[1:]] != list(table.rows):
         raise ValueError("the rows of the table differ")
-
-
-def _check_content(path: Path, content: bytes) -> None:
-    """Raise ValueError where a file does not contain what was written."""
-    if path.read_bytes() != content:
-        raise ValueError("the content of the picture differs")
 
 
 def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) -> Table:

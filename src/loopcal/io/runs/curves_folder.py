@@ -50,4 +50,4 @@ def write_curves(
         for name, content in files.items():
             require_same(name, content, (folder / name).read_bytes())
 
-    write_result_folder(path, CURVES, {"format": FORMAT, **document}, files, force, read_back)
+    write_result_folder(path, CURVES, {"format": FORMAT, **document}, files, read_back, force)
