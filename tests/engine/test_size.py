@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The NumPy engine is the specification of every other engine, so it stays readable in one sitting.
 
-The limit: five files and 850 lines of at most 100 columns, about an hour of reading, with the
+The limit: five files and 870 lines of at most 100 columns, about an hour of reading, with the
 docstrings that state shapes, units and formulas (a third of the lines). It was 800 lines until each
-attribute of a limb's chain was declared with its type, on a line of its own.
+attribute of a limb's chain was declared with its type, on a line of its own, and 850 until rows
+could end near a known goal, by which `inverse` tests the working mode.
 """
 
 import ast
 from pathlib import Path
 
 
-def test_engine_has_at_most_five_files_and_850_lines(root: Path):
+def test_engine_has_at_most_five_files_and_870_lines(root: Path):
     files = sorted((root / "src" / "loopcal" / "engine").glob("*.py"))
     assert len(files) <= 5
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 850
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 870
 
 
 def test_engine_imports_numpy_only(root: Path):

@@ -211,21 +211,16 @@ def compensate(
     count.begin(TASK)
     unchanged = forward(robot, uncorrected.q)
     before = geometry.pose_difference(unchanged.T, wanted)
-    if mode == "readings":
-        result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
-    else:
+    result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
+    if mode == "commands":
         result = _shift_commands(robot, old, uncorrected, best, steps, count)
     count.begin(TASK)
     distances, not_compensable = result.distances, geometry.pose_difference(best.T, wanted)
-    findings = _report_targets(robot, uncorrected, best, result, not_compensable)
     is_solved = uncorrected.converged & best.converged & result.final.converged
     final, commands = _blank_rows(result, ~is_solved)
     names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
-    uncertainty = None
     if posterior is not None:
-        uncertainty = pose_uncertainty(posterior, final, frame=frame, origin_name=names[0])
         before = _remove_unfixed_frames(posterior, old, wanted, before, frame)
-    has_before = uncorrected.converged & unchanged.converged
     after = geometry.pose_difference(result.final.T, wanted)
     return Compensation(
         mode=mode,
@@ -236,13 +231,15 @@ def compensate(
         commands=commands,
         wanted=wanted,
         reached=final.T,
-        before=np.where(has_before[:, None], before, np.nan),
-        remaining=np.where(is_solved[:, None], after, np.nan),
-        not_compensable=np.where(is_solved[:, None], not_compensable, np.nan),
+        before=_keep_rows(before, uncorrected.converged & unchanged.converged),
+        remaining=_keep_rows(after, is_solved),
+        not_compensable=_keep_rows(not_compensable, is_solved),
         residual_position=np.linalg.norm(distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(distances[..., :3], axis=2),
-        uncertainty=uncertainty,
-        findings=findings,
+        uncertainty=None
+        if posterior is None
+        else pose_uncertainty(posterior, final, frame=frame, origin_name=names[0]),
+        findings=_report_targets(robot, uncorrected, best, result, not_compensable),
     )
 
 
@@ -316,6 +313,11 @@ def _shift_commands(
         final = forward(robot, solution.q)
         distances.append(geometry.pose_difference(final.T, best.T))
     return _Iteration(final, commands, np.stack(distances))
+
+
+def _keep_rows(errors: FloatArray, is_kept: BoolArray) -> FloatArray:
+    """Return errors (n, 6) of the chosen rows (n,), and NaN for the others."""
+    return np.where(is_kept[:, None], errors, np.nan)
 
 
 def _blank_rows(result: _Iteration, rows: BoolArray) -> tuple[Solution, FloatArray | None]:

@@ -127,12 +127,7 @@ def calibrate(
     """  # noqa: D301
     from loopcal import workflow
     from loopcal.io import load_robot, load_stored_values
-    from loopcal.io.runs.run_folder import (
-        build_document,
-        load_posterior,
-        refuse_run_folder,
-        save_run,
-    )
+    from loopcal.io.runs.run_folder import build_document, load_run, refuse_run_folder, save_run
     from loopcal.io.runs.run_verdict import name_robot_file
     from loopcal.report.calibration_view import view_calibration
 
@@ -142,7 +137,7 @@ def calibrate(
         make_fit_options(options),
         hold_out,
         seed=seed,
-        prior=None if prior is None else load_posterior(prior),
+        prior=None if prior is None else load_run(prior).load_posterior(),
         compare_with=None if compare is None else load_stored_values(compare, machine),
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},

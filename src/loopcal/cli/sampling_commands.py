@@ -209,7 +209,7 @@ def region(
       loopcal region run -p 'leg1.*' --rule scheffe --json
     """  # noqa: D301
     from loopcal.cli.options import refuse_given
-    from loopcal.io.runs.run_folder import load_posterior
+    from loopcal.io.runs.run_folder import load_run
     from loopcal.report.sampling_view import view_region
     from loopcal.sampling import compute_joint_region, compute_simultaneous_intervals
 
@@ -217,7 +217,7 @@ def region(
         posterior = load_fit(source, data, options)[0].posterior
     else:
         refuse_given(options, "with a run folder")
-        posterior = load_posterior(source)
+        posterior = load_run(source).load_posterior()
     chosen = names or None
     intervals = compute_simultaneous_intervals(posterior, chosen, level, rule)
     joint = compute_joint_region(posterior, chosen, level) if names else None

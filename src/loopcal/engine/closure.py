@@ -110,14 +110,30 @@ class Chain:
     that end in a distance have `distance`, `direction` and `moment`.
     """
 
+    group: Group
+    links: PlacedLinks
+    theta: FloatArray
+    size: float
+    last: int
+    before: list[FloatArray]
+    axes: list[FloatArray]
+    origins: list[FloatArray]
+    platform: FloatArray
+    tip: FloatArray
+    tip_rotation: FloatArray
+    arm: FloatArray
+    gap: FloatArray
+    distance: FloatArray
+    direction: FloatArray
+    moment: FloatArray
+
     def __init__(
         self, group: Group, links: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
     ) -> None:
         self.group, self.links, self.theta, self.size = group, links, theta, size
         self.last = len(group.joints) + 1
         # rotation before each link, axis of each joint, origin behind each link
-        self.before, self.origins = [links.nominal[0]], [links.origin[0]]
-        self.axes: list[FloatArray] = []
+        self.before, self.axes, self.origins = [links.nominal[0]], [], [links.origin[0]]
         rotation, point = links.rotation[0], links.origin[0]
         for j, letter in enumerate(group.joints):
             axis, value = rotation[:, 2], theta[j]

@@ -3,9 +3,8 @@
 
 result.json    `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validation` and more, under
                `made_by` its provenance (see MADE_BY), and under `files` the SHA-256 of the other
-               files; parameters in the units of the robot
-               file, the rest in SI; a number that is not finite is null, with the reason under
-               `nulls`
+               files; parameters in the units of the robot file, the rest in SI; a number that is
+               not finite is null, with the reason under `nulls`
 arrays.npz     `Identification.arrays()`, `initial` (values of all parameters before the
                calibration) and the fitted rows, by name, SI (no pickles)
 robot.yaml     the corrected robot file: the nominal file plus its `identified:` table; of a
@@ -394,11 +393,7 @@ def find_failure(path: str | Path) -> Finding | None:
     return find_run_failure(folder, result) or find_file_failure(path)
 
 
-def load_posterior(path: str | Path) -> Posterior:
-    """Read estimates and uncertainties of a run; raise as `load_run`, `Run.load_posterior`."""
-    return load_run(path).load_posterior()
-
-
 def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
     """Read a run folder with its uncertainties, or a robot file (or shipped robot) without any."""
-    return load_posterior(path) if Path(path).is_dir() else load_run_or_robot(path).robot
+    source = load_run_or_robot(path)
+    return source.load_posterior() if Path(path).is_dir() else source.robot
