@@ -134,6 +134,8 @@ UNCHECKED = {
     *("save_measurements(path)", "save_measurements(data)", "save_robot(path)", "save_run(path)"),
     *("save_run(report)", "save_run(inputs)", "load_robot(source)", "identify(loss)"),
     *("suggest_measurements(sigma)", "validate(uncertainty)"),
+    *("sample_truth(seed)", "simulate_trials(seed)"),
+    *("load_study(path)", "study(source)", "study(folder)", "study(executor)"),
 }
 """Parameters of public functions that check them themselves, or use objects of any class."""
 

@@ -202,9 +202,8 @@ def format_study() -> str:
     for name, record in {**LEVELS, "scores": Scores, "questions": Question}.items():
         plain = getattr(record, "PLAIN", None)
         short = f" A plain value is its `{plain}`." if plain else ""
-        sections.append(
-            f"### `{name}`\n\n{summarize(record)}{short}\n\n{format_record(record, ('coordinates',))}"
-        )
+        table = format_record(record, ("coordinates",))
+        sections.append(f"### `{name}`\n\n{summarize(record)}{short}\n\n{table}")
         sections += [_format_nested(nested) for nested in list_nested_records(record)]
     return "\n".join(sections)
 

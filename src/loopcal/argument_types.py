@@ -22,6 +22,7 @@ from loopcal.errors import ArgumentTypeError, DataError
 ORIGINS: Mapping[str, str] = {
     "CalibrationOptions": "such as CalibrationOptions(hold_out=0.25)",
     "CalibrationReport": "as from calibrate(robot, data)",
+    "Disturbance": "such as Disturbance()",
     "FitOptions": "such as FitOptions(noise='estimated')",
     "Identifiability": "as from identifiability(robot, data)",
     "Identification": "as from identify(robot, data)",
@@ -180,6 +181,11 @@ def _are_named_names(value: object) -> bool:
     )
 
 
+def _are_two_lists_of_names(value: object) -> bool:
+    """Return whether a value is a list or tuple of two lists of texts."""
+    return isinstance(value, (list, tuple)) and len(value) == 2 and all(map(_are_names, value))
+
+
 _CHECKS: Mapping[str, _Check] = {
     "None": ("", lambda value: value is None),
     "bool": ("True or False", lambda value: isinstance(value, (bool, np.bool_))),
@@ -190,6 +196,7 @@ _CHECKS: Mapping[str, _Check] = {
     "FloatArray": ("an array of numbers", _is_array),
     "Sequence[str]": ("a list of names", _are_names),
     "tuple[str, ...]": ("a list of names", _are_names),
+    "tuple[Sequence[str], Sequence[str]]": ("two lists of names", _are_two_lists_of_names),
     "Mapping[str, float]": ("a dict of numbers by name", _are_named_numbers),
     "Mapping[str, Sequence[str]]": ("a dict of lists of names by name", _are_named_names),
     "tuple[float, float]": ("two numbers", _are_two_numbers),

@@ -207,8 +207,8 @@ def test_full_disk_loses_only_the_block(tmp_path) -> None:
 MOUNTS = """\
 22 1 8:1 / / rw,relatime - ext4 /dev/sda1 rw
 23 22 0:21 / /proc rw - proc proc rw
-30 22 0:40 / /home rw,relatime shared:1 - nfs4 server:/home rw
-31 30 8:2 / /home/me/local\\040disk rw - xfs /dev/sdb rw
+30 22 0:40 / /srv rw,relatime shared:1 - nfs4 server:/srv rw
+31 30 8:2 / /srv/me/local\\040disk rw - xfs /dev/sdb rw
 32 22 0:41 / /mnt/share rw - fuse.sshfs me@host:/ rw
 33 22 0:42 / /mnt/share rw - cifs //host/share rw
 """
@@ -218,9 +218,9 @@ MOUNTS = """\
     ("path", "kind", "refused"),
     [
         ("/var/study", "ext4", False),
-        ("/homework", "ext4", False),
-        ("/home/me/study", "nfs4", True),
-        ("/home/me/local disk/study", "xfs", False),
+        ("/srvwork", "ext4", False),
+        ("/srv/me/study", "nfs4", True),
+        ("/srv/me/local disk/study", "xfs", False),
         ("/mnt/share/a", "cifs", True),
     ],
 )

@@ -3,7 +3,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,6 +108,7 @@ class BlockStream:
 
 
 Seed = int | BlockStream
+Distribution = Literal["normal", "uniform"]
 
 
 def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Generator:

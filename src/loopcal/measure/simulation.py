@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
 from loopcal.measure.disturbances import NO_DISTURBANCE, Disturbance, reach_poses
-from loopcal.measure.instrument import Instrument, Seed, Sensor, make_random_stream
+from loopcal.measure.instrument import Distribution, Instrument, Seed, Sensor, make_random_stream
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -98,10 +98,7 @@ class Trials:
 
 
 def sample_truth(
-    robot: Mechanism,
-    n_trials: int,
-    seed: Seed,
-    distribution: Literal["normal", "uniform"] = "normal",
+    robot: Mechanism, n_trials: int, seed: Seed, distribution: Distribution = "normal"
 ) -> FloatArray:
     """Draw true parameter values from the tolerances: `nominal + tolerance * standard normal`.
 
@@ -121,8 +118,15 @@ def sample_truth(
     Returns
     -------
     truth : (t, p) [SI]
+
+    Raises
+    ------
+    DataError
+        If there is no such distribution.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
+    if distribution not in get_args(Distribution):
+        raise DataError(f"distribution is {distribution!r}; give 'normal' or 'uniform'")
     table = robot.parameters
     own = np.array([entry.tolerance or 0.0 for entry in table.entries])
     effects = np.column_stack([np.diag(own), table.common_effects]) * table.free[:, None]

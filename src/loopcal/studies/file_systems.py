@@ -58,9 +58,9 @@ def find_type(mounts: str, path: Path) -> str:
     Examples
     --------
     >>> disk = "1 0 8:1 / / rw - ext4 /dev/a rw"
-    >>> server = "2 1 0:40 / /home rw shared:1 - nfs4 host:/b rw"
+    >>> server = "2 1 0:40 / /srv rw shared:1 - nfs4 host:/b rw"
     >>> mounts = chr(10).join([disk, server])
-    >>> find_type(mounts, Path("/home/user/study")), find_type(mounts, Path("/tmp"))
+    >>> find_type(mounts, Path("/srv/user/study")), find_type(mounts, Path("/tmp"))
     ('nfs4', 'ext4')
     """
     kind, depth = "", -1

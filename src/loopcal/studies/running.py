@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from loopcal.io.core.text_file import as_path
 from loopcal.studies.driver import WHOLE, RunReport, Share, run_blocks
 from loopcal.studies.execution import Executor, Processes, Serial
 from loopcal.studies.study import Study
@@ -43,9 +44,10 @@ def study(
     -----
     When it is interrupted, what was computed stays in the folder; continue with `resume`.
     """
+    path = as_path(folder, "study folder")
     given = StudySource(source) if isinstance(source, Study) else read_source(source, quick)
-    run_study(given, Path(folder), executor or make_local(workers), resume, progress=progress)
-    return StudyResult(Path(folder))
+    run_study(given, path, executor or make_local(workers), resume, progress=progress)
+    return StudyResult(path)
 
 
 def read_source(path: str | Path, quick: bool = False) -> StudySource:

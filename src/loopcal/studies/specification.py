@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+from loopcal.measure.instrument import Distribution
 from loopcal.units import Angle, Length
 
 FACTORS: Mapping[str, str] = {
@@ -27,7 +28,6 @@ FACTORS: Mapping[str, str] = {
 MOST_POSES = 10_000
 """Largest number of measured or held-out poses of a trial."""
 
-Distribution = Literal["normal", "uniform"]
 MethodName = Literal["auto", "map", "least-squares", "ridge", "truncated-svd"]
 
 

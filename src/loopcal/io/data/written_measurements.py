@@ -52,7 +52,8 @@ def check_written_template(path: Path, robot: Mechanism, instrument: Instrument)
     are not complete, or it states another instrument.
     """
     table = read_template(path)
-    empty = replace(table, rows=(("",) * len(table.names),), lines=(table.header_line + 1,))
+    columns = dict.fromkeys(table.names, ("",))
+    empty = replace(table, columns=columns, lines=(table.header_line + 1,))
     read = build_instrument(empty, read_kinds(empty, robot)).sensors
     require_same("kinds", [s.kind.name for s in instrument.sensors], [s.kind.name for s in read])
     for before, after in zip(instrument.sensors, read, strict=True):
