@@ -312,4 +312,8 @@ def test_run_of_a_chosen_set_of_parameters_is_read_back_and_exported(tmp_path, r
     assert main(f"calibrate linear-delta {heights} -o {run} --choose-model".split()) == 0
     stated = json.loads((run / "result.json").read_text("utf-8"))["fit"]["parameters"]
     assert len(stated) < sum(load_run(run).robot.parameters.free)
+    posterior = load_run(run).load_posterior()
+    table = posterior.robot.parameters
+    assert [table.names[i] for i in posterior.places] == [row["name"] for row in stated]
+    assert main(f"region {run}".split()) == 0
     assert main(f"export {run} -o {tmp_path / 'printer.cfg'}".split()) == 0

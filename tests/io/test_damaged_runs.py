@@ -20,6 +20,7 @@ import loopcal as lc
 from loopcal.cli import main
 from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.poses.smooth_errors import describe_smooth_errors
+from loopcal.io.runs.run import Run
 from loopcal.io.runs.run_arrays import (
     DISCREPANCY,
     FINITE,
@@ -29,7 +30,6 @@ from loopcal.io.runs.run_arrays import (
     RULES,
     find_problem,
 )
-from loopcal.io.runs.run_folder import Run
 from loopcal.io.runs.run_result import read_result
 from loopcal.report.budget_view import view_budget
 from tests.io.changed_documents import change_value, list_places

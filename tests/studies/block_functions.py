@@ -9,11 +9,20 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.typing import FloatArray
+
+
+def make_cluster(workers: int) -> Any:
+    """Return a context with a real scheduler and real worker processes of dask."""
+    import distributed
+
+    cluster: Any = distributed.LocalCluster  # its annotations leave out what is documented
+    return cluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
 
 
 @dataclass(frozen=True)

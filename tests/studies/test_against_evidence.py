@@ -5,13 +5,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from loopcal.studies import compute_block
-from loopcal.studies.specification import EffectsLevel, InstrumentLevel, MethodLevel, PosesLevel
+from loopcal.studies.specification import (
+    EffectsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    MethodName,
+    PosesLevel,
+)
 from tests.studies.studies import make_study
 
 EVIDENCE = Path(__file__).parents[2] / "docs" / "evidence" / "coverage.json"
@@ -40,7 +47,7 @@ def test_coverage_and_rank_agree(case):
         block=250,
         instruments={"i": instrument},
         poses={"20": PosesLevel(20)},
-        methods={method: MethodLevel(method)},
+        methods={method: MethodLevel(cast(MethodName, method))},
         effects={"noise": EffectsLevel(noise=noise)},
     )
     values = np.concatenate([compute_block(task).values for task in study.list_tasks()])

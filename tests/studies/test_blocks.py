@@ -41,7 +41,7 @@ def test_scores_equal_calibrations_made_by_hand():
     robot, stream = lc.load_robot("linear-delta"), make_stream(3, 0)
     commanded, held_out = (inverse(robot, content[key]) for key in ("measured", "held_out"))
     table = robot.parameters
-    tolerance = table.free * [entry.tolerance for entry in table.entries]
+    tolerance = table.free * np.array([entry.tolerance for entry in table.entries], dtype=float)
     for i in range(study.block):
         deviation = tolerance * make_random_stream(stream, i, 1).standard_normal(len(tolerance))
         truth = robot.with_values(table.nominal + deviation)

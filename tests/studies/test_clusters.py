@@ -3,16 +3,22 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
-import distributed
 import pytest
 
 from evidence.study_interruption import Contents, read_contents
 from loopcal.errors import FileError
 from loopcal.studies.execution import Dask, Executor, Processes, Ray, Serial
 from loopcal.studies.running import read_source, run_study
-from tests.studies.block_functions import die_once, draw_numbers, list_tasks, refuse_third
+from tests.studies.block_functions import (
+    die_once,
+    draw_numbers,
+    list_tasks,
+    make_cluster,
+    refuse_third,
+)
 from tests.studies.small_study import CELLS, write_study
 from tests.studies.test_execution import check_numbers, collect
 
@@ -34,9 +40,7 @@ def test_every_kind_of_worker_computes_identical_blocks(tmp_path, monkeypatch) -
     assert len(expected) == CELLS * 4
     assert len(set(expected.values())) == len(expected)
     assert compute(tmp_path / "processes", Processes(2)) == expected
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None
-    ) as cluster:
+    with make_cluster(2) as cluster:
         assert compute(tmp_path / "dask", Dask(cluster.scheduler_address)) == expected
     assert compute(tmp_path / "ray", Ray(processors=2)) == expected
 
@@ -47,7 +51,7 @@ def test_ray_survives_lost_workers_and_passes_errors_on(tmp_path, monkeypatch) -
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     import ray
 
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     try:
         answers = collect(Ray().map_blocks(draw_numbers, list_tasks(20)))
         check_numbers(answers, 20)

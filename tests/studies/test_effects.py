@@ -90,6 +90,7 @@ def test_drift_moves_what_is_measured_and_not_the_machine(name):
     plain = simulate_trials(robot, truth, poses, EXACT, 1)
     moved = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
     assert_array_equal(moved.T, plain.T)
+    assert disturbance.motion is not None
     shift = (moved.measured[0] - plain.measured[0])[..., 3:]
     assert_allclose(shift, disturbance.motion, atol=1e-15)
 
@@ -124,6 +125,7 @@ def test_backlash_lags_behind_the_direction_of_motion():
     trials = simulate_trials(robot, truth, poses, EXACT, 1, disturbance=disturbance)
     plain = simulate_trials(robot, truth, poses, EXACT, 1)
     direction = np.sign(np.diff(trials.readings, axis=0))
+    assert disturbance.readings is not None
     assert_allclose(disturbance.readings[0, 1:], -1e-5 * direction)
     T = forward_trials(robot, truth, trials.readings[None] + disturbance.readings).T
     assert_allclose(trials.T, T, atol=1e-12)

@@ -13,9 +13,9 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import dask
-import distributed
 import numpy as np
 import pytest
 
@@ -30,6 +30,7 @@ from tests.studies.block_functions import (
     die_once,
     draw_numbers,
     list_tasks,
+    make_cluster,
     refuse_third,
 )
 
@@ -37,13 +38,11 @@ ROOT = str(Path(__file__).parents[2])
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[distributed.LocalCluster]:
+def cluster() -> Iterator[Any]:
     """Return a real scheduler and two real worker processes of dask."""
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "2s"}),  # to a worker that was killed
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None
-        ) as cluster,
+        make_cluster(2) as cluster,
     ):
         yield cluster
 
@@ -70,6 +69,7 @@ def collect(answers) -> dict[int, Answer]:
 def check_numbers(answers: dict[int, Answer], count: int) -> None:
     assert sorted(answers) == list(range(count))
     for number, answer in answers.items():
+        assert answer.result is not None
         assert np.array_equal(answer.result, draw_numbers(NumberTask(number)))
 
 
@@ -120,8 +120,10 @@ def test_processes_have_one_thread_of_linear_algebra_each(monkeypatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     answers = list(Processes(2).map_blocks(count_threads, list_tasks(8)))
-    assert len({answer.result[0] for answer in answers} - {os.getpid()}) == 2
-    assert all(answer.result[1] == ["1", "1", "1"] for answer in answers)
+    results = [answer.result for answer in answers if answer.result is not None]
+    assert len(results) == 8
+    assert len({process for process, _ in results} - {os.getpid()}) == 2
+    assert all(threads == ["1", "1", "1"] for _, threads in results)
     assert (os.environ["OMP_NUM_THREADS"], os.environ.get("MKL_NUM_THREADS")) == ("7", None)
 
 
@@ -189,16 +191,13 @@ def is_running(process: int) -> bool:
 def test_dask_without_scheduler_or_workers_is_refused() -> None:
     with expect_refusal("workers.cluster-not-reached", StudyError):
         list(Dask("tcp://127.0.0.1:1", patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
-    with (
-        distributed.LocalCluster(n_workers=0, dashboard_address=None) as empty,
-        expect_refusal("workers.cluster-without-workers", StudyError),
-    ):
+    with make_cluster(0) as empty, expect_refusal("workers.cluster-without-workers", StudyError):
         address = empty.scheduler_address
         list(Dask(address, patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
 
 
 def test_scheduler_that_ends_is_reported() -> None:
-    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
+    cluster = make_cluster(1)
     answers = Dask(cluster.scheduler_address).map_blocks(draw_numbers, list_tasks(500, pause=0.05))
     next(answers)
     cluster.close()

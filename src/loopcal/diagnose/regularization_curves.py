@@ -153,8 +153,8 @@ def compute_regularization_curves(
     if problem.nuisance is not None:
         lam, k = lam[_spread(len(lam), MOST_FITTED)], k[_spread(len(k), MOST_FITTED)]
     # what the rules choose has its own score
-    lam = np.unique([*lam, *(rule.value for rule in rules_lam)])
-    k = np.unique([*k, *(int(rule.value) for rule in rules_k)])
+    lam = np.union1d(lam, [rule.value for rule in rules_lam])
+    k = np.union1d(k, [int(rule.value) for rule in rules_k])
     methods = (*map(Ridge, lam.tolist()), *(TruncatedSVD(int(i)) for i in k))
     if problem.nuisance is None:
         scheme: Scheme = "leave-one-out"

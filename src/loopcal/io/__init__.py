@@ -9,6 +9,6 @@ from loopcal.io.data.measurement_writer import save_measurements as save_measure
 from loopcal.io.robot.robot_file import load_robot as load_robot
 from loopcal.io.robot.robot_file import save_robot as save_robot
 from loopcal.io.robot.stored_values import load_stored_values as load_stored_values
-from loopcal.io.runs.run_folder import Run as Run
+from loopcal.io.runs.run import Run as Run
 from loopcal.io.runs.run_folder import load_run as load_run
 from loopcal.io.runs.run_folder import save_run as save_run

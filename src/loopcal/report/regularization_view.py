@@ -87,11 +87,9 @@ def tabulate_curve(curve: RegularizationCurve) -> Table:
     """Return a table of some values of a curve."""
     method, number = WORDS[curve.name]
     count = len(curve.values)
+    score, error = curve.score.tolist(), curve.standard_error.tolist()
     places = np.unique(np.linspace(0, count - 1, min(ROWS, count)).round().astype(int))
-    rows = tuple(
-        (f"{curve.values[i]:.4g}", *_format_score(curve.score[i], curve.standard_error[i]))
-        for i in places
-    )
+    rows = tuple((f"{curve.values[i]:.4g}", *_format_score(score[i], error[i])) for i in places)
     columns = (Column(number), Column("held-out error"), Column("standard error"))
     return Table(method, columns, rows)
 

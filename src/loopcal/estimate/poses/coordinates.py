@@ -187,7 +187,7 @@ class TwistCoordinates:
         unmasked = LinearizedPoses(
             poses.state.T,
             np.zeros(0, dtype=bool),
-            np.zeros((*shape, 6, len(self.free))),
+            np.zeros((*shape, 6, len(self.free.places))),
             joints_by_parameters=slopes,
             by_coordinates=Y,
             joints_by_coordinates=turns,

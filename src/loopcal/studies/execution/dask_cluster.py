@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +32,9 @@ class Dask:
     address: str
     patience: float = PATIENCE
 
-    def map_blocks(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[Answer[T, R]]:
+    def map_blocks(
+        self, function: Callable[[T], R], tasks: Iterable[T]
+    ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks on the cluster; see `Executor.map_blocks`.
 
         The scheduler itself computes the tasks of a lost worker again, a few times.

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -47,7 +47,9 @@ class Answer(Generic[T, R]):
 class Executor(Protocol):
     """Workers that compute tasks. Each kind of them is one class with this method."""
 
-    def map_blocks(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[Answer[T, R]]:
+    def map_blocks(
+        self, function: Callable[[T], R], tasks: Iterable[T]
+    ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks and yield their answers as they finish, in any order.
 
         The number of tasks in flight is bounded, so `tasks` may be endless. A lost worker costs

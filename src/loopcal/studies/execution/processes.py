@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import signal
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic
@@ -43,7 +43,9 @@ class Processes:
 
     workers: int
 
-    def map_blocks(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[Answer[T, R]]:
+    def map_blocks(
+        self, function: Callable[[T], R], tasks: Iterable[T]
+    ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks by processes; see `Executor.map_blocks`."""
         pool = _Pool(function, TaskQueue(tasks), self.workers)
         try:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +32,9 @@ class Ray:
     address: str | None = None
     processors: int | None = None
 
-    def map_blocks(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[Answer[T, R]]:
+    def map_blocks(
+        self, function: Callable[[T], R], tasks: Iterable[T]
+    ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks on the cluster; see `Executor.map_blocks`.
 
         Ray itself computes the tasks of a lost worker again, `MOST_LOSSES` - 1 times.

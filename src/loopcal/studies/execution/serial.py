@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 
 from loopcal.studies.execution.interface import Answer, R, T, compute_timed
@@ -13,7 +13,9 @@ from loopcal.studies.execution.interface import Answer, R, T, compute_timed
 class Serial:
     """No workers: this process computes."""
 
-    def map_blocks(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[Answer[T, R]]:
+    def map_blocks(
+        self, function: Callable[[T], R], tasks: Iterable[T]
+    ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks in their order; see `Executor.map_blocks`."""
         for task in tasks:
             result, seconds = compute_timed(function, task)
