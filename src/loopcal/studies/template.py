@@ -8,7 +8,8 @@ import os
 from importlib.resources import files
 from pathlib import Path
 
-from loopcal.io.core.text_file import write_text
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import read_text, write_text
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots
 from loopcal.studies.study_file import load_study
 
@@ -32,4 +33,10 @@ def write_template(path: Path, robot: str) -> None:
         name = Path(os.path.relpath(file, path.parent)).as_posix()
     text = (files("loopcal.studies") / "template.yaml").read_text("utf-8")
     quoted = name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)
-    write_text(path, text.replace(f"[{PLACE}]", f"[{quoted}]"), read_back=load_study)
+    text = text.replace(f"[{PLACE}]", f"[{quoted}]")
+
+    def read_back(written: Path) -> None:
+        require_same("text", text, read_text(written, "study file"))
+        load_study(written)
+
+    write_text(path, text, read_back=read_back)

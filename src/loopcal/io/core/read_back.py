@@ -10,11 +10,20 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 
+LONGEST = 200
+"""Characters of a value in a message."""
+
 
 def require_same(what: str, written: Any, read: Any) -> None:
     """Raise DataError where what was read differs from what was written."""
     if written != read:
-        raise DataError(f"{what}: {written!r} was written, but {read!r} is read")
+        raise DataError(f"{what}: {_shorten(written)} was written, but {_shorten(read)} is read")
+
+
+def _shorten(value: Any) -> str:
+    """Return the beginning of what Python shows for a value."""
+    text = repr(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 def require_same_numbers(
