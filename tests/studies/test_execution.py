@@ -15,7 +15,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import dask
+import dask.config
 import numpy as np
 import pytest
 

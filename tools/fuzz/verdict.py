@@ -95,7 +95,8 @@ def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
         yield Find("memory", command, outcome.err[-300:])
     if not is_usage and re.search(r"defect of loopcal|Traceback", outcome.err):
         yield Find("defect-message", normalize(outcome.err), outcome.err[-600:])
-    if match := NO_NUMBER.search(outcome.err + outcome.out):
+    said = re.sub(r"'[^'\n]*'", "''", outcome.err + outcome.out)  # without what the input says
+    if match := NO_NUMBER.search(said):
         yield Find("no-number", f"{command}: {match[0]}", (outcome.err + outcome.out)[-600:])
     if re.search(r"object at 0x|<class '|NoneType|dtype\(|array\(\[", outcome.err):
         yield Find("internal-words", f"{command}: {normalize(outcome.err)}", outcome.err[-600:])

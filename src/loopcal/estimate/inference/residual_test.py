@@ -210,7 +210,7 @@ def count_sigma_degrees(noise: str, uncertainty: float) -> float:
     if uncertainty == 0.0:
         return np.inf
     u = max(uncertainty, ASSUMED_UNCERTAINTY) if noise == "assumed" else uncertainty
-    return 0.5 / u**2
+    return 0.5 / u / u  # the square of a tiny one is zero
 
 
 def _compute_tail(degrees: float, square: float) -> float:
