@@ -14,6 +14,7 @@ from loopcal.diagnose.conventions import (
     list_interpretations,
     list_reading_interpretations,
 )
+from loopcal.diagnose.conventions.equal_interpretations import select_measured
 from loopcal.diagnose.conventions.reading_interpretations import list_orders
 from loopcal.diagnose.conventions.selection import ALLOWED
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -316,3 +317,12 @@ def test_sign_of_small_heights_is_undecided_and_said_so() -> None:
         assert result.finding.code == "conventions.height-sign-undecided"
     touched = simulate_measurements(truth, at, instrument, 0, controller=truth)
     assert compare_conventions(robot, touched).finding is None  # heights of 0 have no sign
+
+
+def test_few_poses_that_are_all_measured_are_selected() -> None:
+    """There is no other pose to add."""
+    robot = load_cached_robot("five-bar")
+    poses = sample_workspace(robot, 3, 1).coordinates
+    instrument = Instrument((Sensor(Position(), Gaussian(np.full(3, 1e-5))),))
+    data = simulate_measurements(robot, poses, instrument, 1)
+    assert select_measured(data).tolist() == [0, 1, 2]

@@ -77,7 +77,8 @@ def test_stated_sigmas_count_as_eight_degrees_of_freedom():
 
 @pytest.mark.parametrize(
     ("noise", "u", "degrees"),
-    [("given", 0.25, 8.0), ("given", 0.1, 50.0), ("given", 0.0, np.inf), ("estimated", 0.25, 0.0),
+    [("given", 0.25, 8.0), ("given", 0.1, 50.0), ("given", 0.0, np.inf), ("given", 1e-300, np.inf),
+     ("estimated", 0.25, 0.0),
      ("assumed", 0.25, 2.0), ("assumed", 0.0, np.inf)],
 )  # fmt: skip
 def test_all_checks_count_stated_sigmas_alike(noise, u, degrees):

@@ -115,6 +115,12 @@ def test_exactly_the_parameters_of_null_directions_have_infinite_variance():
     np.testing.assert_allclose(sd[known] ** 2, np.diag(covariance)[known], rtol=1e-12)
 
 
+def test_penalty_whose_square_is_zero_counts_as_none():
+    d = decompose(np.zeros((1, P + 1, P + 1)), row_counts(1))
+    penalty = np.full((1, P), 2.6e-320)
+    assert np.isinf(d.variances(penalty, 1.0, np.ones((1, P)))).all()
+
+
 def test_zero_matrix_has_rank_zero_and_infinite_condition():
     d = decompose(empty_factor(1, P), np.zeros(1, dtype=np.int64))
     assert d.rank[0] == 0

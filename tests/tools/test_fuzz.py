@@ -67,6 +67,7 @@ def answer(code, out="", err="", before=(), after=()) -> Outcome:
         (answer(0, out="error: nan mm\n"), ["no-number", "non-finite"]),
         (answer(0, out="information\n"), []),
         (answer(1, err="loopcal: a gap of unknown mm stays open\n"), ["no-number"]),
+        (answer(1, err="loopcal: a.csv:1: '-inf um' is not finite\n"), []),
         (answer(0, out='{"text": "it is -inf deg"}\n'), ["no-number", "non-finite"]),
         (answer(4, err="loopcal: the time limit was reached\n"), ["exit-code"]),
         (answer(0, after={"a.csv": b"x\ninf\n"}), ["non-finite"]),
@@ -126,9 +127,13 @@ def test_three_hundred_random_inputs_have_their_answers(root) -> None:
 )
 def test_no_random_input_of_the_evidence_broke_a_rule(root, name) -> None:
     """Readings that fit nothing, with redundant actuators and a robust refit, or a study with more
-    trials, may take over ten seconds.
+    trials, may take over ten seconds. A find of the longest run that was mended names its test.
     """
     counts = json.loads((root / name).read_text("utf-8"))
     slow = {s: f["count"] for s, f in counts["finds"].items() if "TimeIsUp processor" in s}
-    assert set(counts["finds"]) == set(slow)
+    others = [f for s, f in counts["finds"].items() if s not in slow]
+    for find in others:
+        file, _, test = find["mended"].partition("::")
+        assert f"def {test}(" in (root / file).read_text("utf-8")
+    assert not others or name.startswith("evidence")
     assert 10_000 * sum(slow.values()) <= counts.get("counts", counts)["inputs"]

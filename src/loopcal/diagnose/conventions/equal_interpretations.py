@@ -42,7 +42,7 @@ def find_equal_orders(free: FreeParameters, data: Measurements) -> tuple[Interpr
     measured = sum(o.n_residuals for o in data.observations)
     if not is_redundant(free) or measured >= MEASURED:
         return ()
-    few = data.take(_select_measured(data))
+    few = data.take(select_measured(data))
     equal = []
     for interpretation in list_reading_interpretations(few, free.robot.actuators):
         if interpretation.slip in ORDERS:
@@ -65,7 +65,7 @@ def compute_opposite_misfit(free: FreeParameters, data: Measurements) -> float:
     return compute_quick_misfit(free, replace(data, observations=opposite))
 
 
-def _select_measured(data: Measurements) -> IntArray:
+def select_measured(data: Measurements) -> IntArray:
     """Return the measured poses, and others spread over the data up to `FEWEST_POSES`."""
     measured = np.unique(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
     others = np.setdiff1d(np.arange(data.n_poses), measured)
