@@ -163,6 +163,7 @@ class _Server:
         """Run the command; the first copies serve. Return the exit code of this process."""
         self._reset()
         os.chdir(self.folder)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
         sys.argv = ["loopcal", *self.case.words.split()]
         self._redirect()
         if not self.case.exchange:

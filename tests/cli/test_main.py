@@ -8,6 +8,7 @@ import click
 import pytest
 
 from loopcal.cli import commands, main, robot_commands
+from loopcal.cli.study_commands import study
 from loopcal.errors import MechanismError
 
 NAMES = sorted(commands.list_commands(click.Context(commands)))
@@ -24,6 +25,14 @@ def test_help_of_every_command_has_an_example_and_the_option_json(name, capsys) 
     assert main([name, "--help"]) == 0
     text = capsys.readouterr().out
     assert f"    loopcal {name} " in text
+    assert "--json" in text or name == "study"  # its commands have it
+
+
+@pytest.mark.parametrize("name", sorted(study.commands))
+def test_help_of_every_command_of_studies_has_an_example_and_the_option_json(name, capsys) -> None:
+    assert main(["study", name, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"    loopcal study {name} " in text
     assert "--json" in text
 
 

@@ -236,6 +236,9 @@ COUNTED = {
     "DRAWS": ("sample linear-delta d.csv --count",),
     "TRIALS": ("reproduce hexapod-42 --trials",),
     "STEPS": ("compensate run t.csv --steps", "per-leg hexapod-42 d.csv --steps"),
+    "FOLDS": ("regularize linear-delta d.csv --folds",),
+    "REPLICATES": ("study extend results --replicates",),
+    "WORKERS": ("study run s.yaml -o results --workers", "study extend results --workers"),
 }
 
 
@@ -255,7 +258,8 @@ def test_every_option_that_takes_a_count_has_a_limit() -> None:
     for name in (name for members in SECTIONS.values() for name in members):
         command = find_command(name)
         assert command is not None, name
-        for option in command.params:
+        subcommands = command.commands.values() if isinstance(command, click.Group) else ()
+        for option in (o for c in (command, *subcommands) for o in c.params):
             if isinstance(option.type, Count):
                 used.add(option.type.limit)
             elif isinstance(option.type, click.types.IntParamType):

@@ -11,6 +11,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.options import (
+    Count,
     data_argument,
     data_options,
     file_option,
@@ -30,7 +31,7 @@ from loopcal.cli.options import (
 @file_option("-o", "--output", help="Folder to make, with the curves and their figure.")
 @click.option(
     "--folds",
-    type=click.IntRange(min=2),
+    type=Count("FOLDS", 2),
     default=5,
     metavar="N",
     help="Number of folds of poses where frames, targets or surfaces are unknown.",
@@ -93,7 +94,7 @@ def regularize(
         )
     if output is not None:
         picture = render_figure(draw_regularization(curves), ".png")
-        made_by = collect_provenance(sys.argv, inputs, {"folds": seed})
+        made_by = collect_provenance(["loopcal", *sys.argv[1:]], inputs, {"folds": seed})
         document = {**curves.to_dict(), "made_by": made_by}
         write_curves(output, document, tabulate_points(curves).to_csv(), picture, force)
     if as_json:

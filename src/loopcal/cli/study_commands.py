@@ -12,7 +12,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
-from loopcal.cli.options import FILE, file_option, flag_option, force_option, json_option
+from loopcal.cli.options import FILE, Count, file_option, flag_option, force_option, json_option
 from loopcal.cli.study_options import (
     choose_work,
     count_processors,
@@ -125,7 +125,11 @@ def run(
 @study.command()
 @folder_argument
 @click.option(
-    "--replicates", type=click.IntRange(min=1), required=True, metavar="N", help="Trials of a cell."
+    "--replicates",
+    type=Count("REPLICATES", 1),
+    required=True,
+    metavar="N",
+    help="Trials of a cell.",
 )
 @worker_options
 @json_option

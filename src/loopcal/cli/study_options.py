@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.options import add_options, flag_option, refuse_given
+from loopcal.cli.options import Count, add_options, flag_option, refuse_given
 from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from loopcal.cli.time_limit import TimeLimitError, format_duration
 
@@ -47,7 +47,7 @@ class ShareType(click.ParamType):  # pyright: ignore[reportMissingTypeArgument] 
 worker_options = add_options(
     click.option(
         "--workers",
-        type=click.IntRange(1, 4096),
+        type=Count("WORKERS", 1),
         metavar="N",
         help="Processes that compute.  [default: the number of processors]",
     ),

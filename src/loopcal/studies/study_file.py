@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from loopcal.errors import LoopcalError
+from loopcal.io.core import limits
 from loopcal.io.core.records import read_record
 from loopcal.io.core.references import find_file_beside
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
@@ -70,7 +71,7 @@ class StudySettings:
     def __post_init__(self) -> None:
         for key, lowest, highest in (
             ("seed", 0, 2**63),
-            ("replicates", 1, 10**9),
+            ("replicates", 1, limits.REPLICATES.most),
             ("block", 1, MOST_TRIALS),
         ):
             value = getattr(self, key)

@@ -298,6 +298,11 @@ RESAMPLES = CountLimit(100_000, "resamples", "`count` of `loopcal bootstrap`")
 DRAWS = CountLimit(1_000_000, "draws", "`count` of `loopcal sample`")
 TRIALS = CountLimit(10_000, "trials", "`trials` of `loopcal reproduce`")
 STEPS = CountLimit(1_000, "steps", "`steps` of `loopcal compensate` and `loopcal per-leg`")
+FOLDS = CountLimit(1_000, "folds", "`folds` of `loopcal regularize`")
+REPLICATES = CountLimit(
+    10**9, "trials of a cell", "`replicates` of study files and of `loopcal study extend`"
+)
+WORKERS = CountLimit(4_096, "workers", "`workers` of `loopcal study run` and `extend`")
 
 COUNT_LIMITS: tuple[CountLimit, ...] = (
     DRAWN_POSES,
@@ -309,5 +314,8 @@ COUNT_LIMITS: tuple[CountLimit, ...] = (
     DRAWS,
     TRIALS,
     STEPS,
+    FOLDS,
+    REPLICATES,
+    WORKERS,
 )
 """The limits of counts, in the order of docs/files.md."""
