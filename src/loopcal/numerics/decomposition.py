@@ -28,11 +28,6 @@ The matrix must be whitened and its columns scaled. Null directions of an exact 
 real machines are near 1e-9.
 """
 
-TINIEST = 1e-150
-"""Sums of a squared singular value and a penalty up to which these count as zero, as their squares
-are.
-"""
-
 NUISANCE_TOLERANCE = 1e-10
 """The same rule for columns that are eliminated (frames, targets, surfaces, offsets, poses).
 
@@ -189,7 +184,7 @@ class Decomposition(TrialBatch):
         """
         square = self.singular_values**2
         sigma2 = np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(square),))[:, None]
-        cut = np.isinf(penalty) | (square + penalty <= TINIEST)
+        cut = np.isinf(penalty) | ((square + penalty) ** 2 <= 0.0)
         finite = np.where(cut, 1.0, penalty)
         total = np.where(cut, 1.0, square + finite)
         bias = finite if prior is None else finite**2 * np.where(finite > 0.0, prior, 0.0)
