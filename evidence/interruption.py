@@ -146,7 +146,8 @@ def examine(case: Case, inputs: Path, moments: int, slow: int) -> dict[str, Any]
             finally:
                 os._exit(code)
         _, status = os.waitpid(copied, 0)
-        assert status == 0, f"{case.words}: {(folder / '.said').read_text()}"
+        said = folder / ".said"
+        assert status == 0, f"{case.words}: {said.read_text() if said.exists() else status}"
         return json.loads(result.read_text())
 
 
