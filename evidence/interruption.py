@@ -296,7 +296,7 @@ class _Server:
             if path.is_dir():
                 shutil.rmtree(path)
             else:
-                path.unlink()
+                path.unlink(missing_ok=True)  # of a copy that is not quite gone
         shutil.copytree(self.base, self.folder, dirs_exist_ok=True)
 
     def _redirect(self) -> None:
