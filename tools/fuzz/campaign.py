@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -27,6 +28,9 @@ from tools.fuzz.verdict import Find, judge
 
 CHUNK = 100
 """Inputs that one worker runs before it is replaced by a fresh one."""
+
+PLACE = re.compile(r"(?<![\w.])/(?:[^\s/\"']+/)+(?=[^\s/\"']+/[^\s/\"']+/[^\s/\"']+\.py\b)")
+"""The beginning of a long path of a source file, which differs from machine to machine."""
 
 Report = Callable[[dict[str, Any], list[dict[str, str]]], None]
 """Is called with each answer and its new finds."""
@@ -122,7 +126,7 @@ def _make_answer(case: Case, maker: Maker, outcome: Outcome, finds: list[Find]) 
         "options": describe(case.words, maker.commands),
         "damage": sorted(set(case.damage)) or ["(none)"],
         "exit_codes": [str(outcome.code)],
-        "finds": [{"signature": f.signature, "detail": f.detail} for f in finds],
+        "finds": [{"signature": f.signature, "detail": PLACE.sub("", f.detail)} for f in finds],
     }
 
 
