@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A command that consists of commands, such as `loopcal study`."""
+"""A command that consists of commands: `loopcal` itself, and `loopcal study`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ class CommandGroup(click.Group):
         """Return the names in the order of the work, which is that of the code."""
         return list(self.commands)
 
+    def find_command(self, name: str) -> click.Command | None:
+        """Return a command as it is defined; None where there is none of this name."""
+        return self.commands.get(name)
+
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command; None where there is none of this name."""
-        command = super().get_command(ctx, cmd_name)
+        command = self.find_command(cmd_name)
         if command is None or isinstance(command, click.Group):
             return command
         return add_time_limit(command)

@@ -19,10 +19,11 @@ from pathlib import Path
 import click
 
 from loopcal.cli import terminal
+from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.hints import find_hint, is_hint_useless
 from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
-from loopcal.cli.time_limit import TimeLimitError, add_time_limit
-from loopcal.errors import LoopcalError, suggest_names
+from loopcal.cli.time_limit import TimeLimitError
+from loopcal.errors import LoopcalError
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
 from loopcal.threads import THREADS
@@ -75,29 +76,16 @@ MODULES = {
 """Modules of this package, and the commands in each; they are imported when they run."""
 
 
-class SectionedGroup(click.Group):
+class SectionedGroup(CommandGroup):
     """A group whose help lists its commands below headings, in the order of the work."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
         return [name for members in SECTIONS.values() for name in members]
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def find_command(self, name: str) -> click.Command | None:
         """Import a command; None where there is none of this name."""
-        command = find_command(cmd_name)
-        if command is None or isinstance(command, click.Group):
-            return command
-        return add_time_limit(command)
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command of the first word, or fail with the names of similar ones."""
-        names = self.list_commands(ctx)
-        if args[0] not in names and not args[0].startswith("-"):
-            similar = suggest_names(args[0], names)
-            ctx.fail(f"{args[0]!r} is not a command{similar}; see loopcal --help")
-        return super().resolve_command(ctx, args)
+        return find_command(name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections."""
