@@ -13,7 +13,8 @@ from loopcal.errors import FileError
 from loopcal.io import load_robot
 from loopcal.io.core.text_file import write_bytes
 from loopcal.mechanism import inverse
-from loopcal.report import draw, save_picture
+from loopcal.report.figures import draw_robot
+from loopcal.report.pictures import save_figure
 from tests import zoo
 
 SHIPPED = sorted(path.stem for path in (Path(loopcal.__file__).parent / "robots").glob("*.yaml"))
@@ -23,7 +24,7 @@ SHIPPED = sorted(path.stem for path in (Path(loopcal.__file__).parent / "robots"
 @pytest.mark.parametrize("name", SHIPPED)
 def test_picture_of_every_shipped_robot_has_units_on_its_axes(name):
     robot = load_robot(name)
-    figure = draw(robot)
+    figure = draw_robot(robot)
     space, above = figure.axes
     for axes in (space, above):
         assert "[mm]" in axes.get_xlabel()
@@ -35,7 +36,7 @@ def test_picture_of_every_shipped_robot_has_units_on_its_axes(name):
 
 def test_rods_are_drawn_from_base_to_platform_in_millimeters():
     robot = zoo.hexapod()
-    above = draw(robot).axes[1]
+    above = draw_robot(robot).axes[1]
     lines = [np.array(line.get_data()).T for line in above.lines]
     for base, top in zip(zoo.HEXAPOD_BASE, zoo.HEXAPOD_PLATFORM, strict=True):
         assert any(
@@ -47,7 +48,7 @@ def test_rods_are_drawn_from_base_to_platform_in_millimeters():
 def test_row_of_a_solution_sets_the_drawn_platform_pose():
     robot = zoo.hexapod()
     found = inverse(robot, np.array([[0.0, 0.0, 0.2, 0, 0, 0], [0.03, -0.02, 0.21, 0, 0, 0]]))
-    figure = draw(robot, found, row=1)
+    figure = draw_robot(robot, found, row=1)
     star = [line for line in figure.axes[1].lines if line.get_marker() == "*"]
     assert_allclose(np.array(star[0].get_data()).ravel(), [30.0, -20.0], atol=1e-9)  # [mm]
     assert "at row 1" in figure.get_suptitle()
@@ -63,4 +64,4 @@ def test_unknown_picture_format_is_refused(tmp_path):
     with pytest.raises(
         FileError, match=r"written as '.docx'; use a name that ends in .png, .svg, .pdf"
     ):
-        save_picture(tmp_path / "robot.docx", zoo.hexapod(), write=write_bytes)
+        save_figure(tmp_path / "robot.docx", draw_robot(zoo.hexapod()), write=write_bytes)

@@ -285,8 +285,8 @@ def _write_plan(
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
+    from loopcal.report.figures import draw_curve, draw_plan
     from loopcal.report.pictures import check_picture, render_figure
-    from loopcal.report.plan_drawing import draw_curve, draw_plan
 
     figures = {}
     if isinstance(result, Plan):

@@ -71,12 +71,9 @@ def regularize(
     from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.io.runs.curves_folder import refuse_curves, write_curves
     from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.report.figures import draw_regularization
     from loopcal.report.pictures import render_figure
-    from loopcal.report.regularization_view import (
-        draw_regularization,
-        tabulate_points,
-        view_regularization,
-    )
+    from loopcal.report.regularization_view import tabulate_points, view_regularization
 
     machine = load_robot(robot)
     inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}

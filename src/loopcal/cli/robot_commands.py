@@ -104,9 +104,10 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     refuse_outputs((plot,), (find_robot_file(robot),), force)
     inspection = inspect_robot(load_robot(robot))
     if plot is not None:
-        from loopcal.report import save_picture
+        from loopcal.report.figures import draw_robot
+        from loopcal.report.pictures import save_figure
 
-        save_picture(plot, inspection.robot, write=write_bytes)
+        save_figure(plot, draw_robot(inspection.robot), write=write_bytes)
     if as_json:
         assembly = {"assembly": inspection.robot.assembly} if expand else {}
         terminal.print_json(inspection.to_dict() | assembly)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures as files: names as they are written, and identical bytes for identical content."""
+"""Pictures as files: written, checked, with identical bytes for identical content."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from xml.parsers import expat
 
 from loopcal.errors import FileError
@@ -30,39 +31,6 @@ METADATA: dict[str, dict[str, None]] = {
     ".pdf": {"CreationDate": None},
 }
 """The time of writing, which is left out, by format."""
-
-TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""Numbers on a logarithmic axis, times powers of ten."""
-
-WIDE, VERY_WIDE = 3.0, 100.0
-"""Ratio of its ends from which a logarithmic axis has these numbers, and from which it has powers
-of ten only; a shorter one has even steps.
-"""
-
-
-def label_logarithmic(axis: Any) -> None:
-    """Write plain numbers at a logarithmic axis of matplotlib."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
-
-    low, high = axis.get_view_interval()
-    subs = TICKS if high < VERY_WIDE * low else (1.0,)
-    axis.set_major_locator(LogLocator(subs=subs) if high > WIDE * low else MaxNLocator(6))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())
-
-
-def show_names(figure: Figure) -> Figure:
-    r"""Show all texts of a figure as they are written; return it.
-
-    matplotlib reads what stands between two `$` as mathematics: `$\frac{` in the name of a robot
-    would make it fail.
-    """
-    from matplotlib.text import Text
-
-    for text in figure.findobj(Text):
-        assert isinstance(text, Text)
-        text.set_parse_math(False)
-    return figure
 
 
 def check_picture(path: Path) -> None:
@@ -93,3 +61,28 @@ def render_figure(figure: Figure, ending: str) -> bytes:
     with rc_context({"svg.hashsalt": SALT}):
         figure.savefig(stream, format=ending[1:], dpi=DPI, metadata=METADATA[ending])
     return stream.getvalue()
+
+
+def save_figure(
+    path: Path, figure: Figure, *, write: Callable[[Path, bytes, Callable[[Path], object]], object]
+) -> None:
+    """Write a figure to a file.
+
+    Parameters
+    ----------
+    write : writes bytes to a file that the given function reads, such as
+        `loopcal.io.core.text_file.write_bytes`.
+
+    Raises
+    ------
+    FileError : the ending of the name is not one of `FORMATS`.
+    """
+    ending = path.suffix.lower()
+    if ending not in FORMATS:
+        raise FileError(
+            f"a picture cannot be written as {path.suffix or 'no format'!r}; use a name that ends "
+            "in "
+            f"{', '.join(FORMATS)}",
+            path,
+        )
+    write(path, render_figure(figure, ending), check_picture)

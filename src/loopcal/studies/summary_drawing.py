@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
-from loopcal.report.pictures import label_logarithmic, render_figure, show_names
-from loopcal.report.robot_drawing import COLORS
+from loopcal.report.figures.style import COLORS, label_logarithmic, show_names, start_figure
+from loopcal.report.pictures import render_figure
 from loopcal.studies.cells import list_factors, list_varied_factors
 from loopcal.studies.level_chains import list_chains
 from loopcal.studies.study import Study
@@ -73,8 +73,6 @@ def draw_score(
     ------
     DataError : an unknown score or factor, or more than `MOST_PANELS` panels.
     """
-    from matplotlib.figure import Figure
-
     (place,) = find_columns(study, [score])
     layout = choose_layout(study, factor)
     groups = _group(summary, layout)
@@ -86,7 +84,7 @@ def draw_score(
     unit = UNITS[study.columns[place].unit]
     columns = min(len(groups), 3)
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(1.4 + 4.2 * columns, 0.9 + 3.4 * rows), layout="constrained")
+    figure = start_figure(1.4 + 4.2 * columns, 0.9 + 3.4 * rows)
     every: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     colors, along = _list_colors(summary, layout), _place_levels(study, layout.axis)
     for axes, (title, cells) in zip(every.flat, groups.items(), strict=False):

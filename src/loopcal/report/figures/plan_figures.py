@@ -14,8 +14,7 @@ from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import DIMENSIONS
 from loopcal.planning.result import Plan
 from loopcal.planning.sample_size import ErrorCurve
-from loopcal.report.pictures import label_logarithmic, show_names
-from loopcal.report.robot_drawing import COLORS
+from loopcal.report.figures.style import COLORS, label_logarithmic, show_names, start_figure
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 
 def draw_plan(plan: Plan) -> Figure:
     """Draw the poses of a plan in pairs of controlled coordinates, with the path between them."""
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     names = plan.robot.controlled
@@ -38,7 +36,7 @@ def draw_plan(plan: Plan) -> Figure:
     pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + (
         [(len(names) - 1, None)] if len(names) % 2 else []
     )
-    figure = Figure(figsize=(4.2 * len(pairs), 4.4), layout="constrained")
+    figure = start_figure(4.2 * len(pairs), 4.4)
     home = locate_home(plan.robot)
     start = [home[i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
     step = np.arange(1, len(plan.poses.labels) + 1)
@@ -77,11 +75,9 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     """Draw expected errors by the number of poses, with the bound that no choice of so many
     candidates can beat.
     """
-    from matplotlib.figure import Figure
-
     dimension = DIMENSIONS[curve.target]
     unit = find_unit(robot.units[dimension])
-    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    figure = start_figure(6.4, 4.4)
     axes: Any = figure.add_subplot(1, 1, 1)
     for errors, line, color, label in (
         (curve.values, "o-", CALIBRATION, f"planned {curve.counted}"),

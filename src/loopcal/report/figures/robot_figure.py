@@ -8,26 +8,20 @@ links comes from `mechanism.frames`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import FileError
 from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
-from loopcal.report.pictures import FORMATS, check_picture, render_figure, show_names
+from loopcal.report.figures.style import COLORS, show_names, start_figure
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Of the limbs in turn; color-blind readers can distinguish them, too (Okabe and Ito, the yellow
-left out).
-"""
 AXIS, GUIDE = 0.06, 0.12
 """Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
 as a share of the robot's size.
@@ -42,11 +36,8 @@ class Stroke:
     style: dict[str, Any]
 
 
-def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
+def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
     """Draw a robot at home, or at a row of a solution, in the length unit of its file."""
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
     state = robot.home_state if solution is None else solution.take(np.array([row])).state
     length = find_unit(robot.units[Dimension.LENGTH])
     strokes = list(
@@ -60,7 +51,8 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
     everything = np.concatenate([s.points for s in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
 
-    figure = Figure(figsize=(11.5, 6.0), layout=ConstrainedLayoutEngine(wspace=0.06))
+    figure = start_figure(11.5, 6.0)
+    figure.get_layout_engine().set(wspace=0.06)
     space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     above = figure.add_subplot(1, 2, 2)
     for stroke in strokes:
@@ -76,35 +68,6 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
     handles = _legend(robot)
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return show_names(figure)
-
-
-def save_picture(
-    path: Path,
-    robot: Mechanism,
-    solution: Solution | None = None,
-    row: int = 0,
-    *,
-    write: Callable[[Path, bytes, Callable[[Path], object]], object],
-) -> None:
-    """Write the picture of a robot to a file.
-
-    Parameters
-    ----------
-    write : writes bytes to a file that the given function reads, such as
-        `loopcal.io.core.text_file.write_bytes`.
-
-    Raises
-    ------
-    FileError : the ending of the name is not one of `FORMATS`.
-    """
-    if path.suffix.lower() not in FORMATS:
-        raise FileError(
-            f"a picture cannot be written as {path.suffix or 'no format'!r}; use a name that ends "
-            "in "
-            f"{', '.join(FORMATS)}",
-            path,
-        )
-    write(path, render_figure(draw(robot, solution, row), path.suffix.lower()), check_picture)
 
 
 def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:
