@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from loopcal.studies.store import NAME, read_store
-from loopcal.studies.study_folder import load_specification
+from loopcal.studies.files.store import NAME, read_store
+from loopcal.studies.files.study_folder import load_specification
 
 REPLICATES, BLOCK, CELLS = 12_500, 50, 4
 KILLS = 20

@@ -9,7 +9,7 @@ import click
 import numpy as np
 import pytest
 
-from loopcal.cli import commands, main
+from loopcal.cli import command_line, main
 from loopcal.io import load_robot
 
 README = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
@@ -62,4 +62,4 @@ def test_demo_prints_what_the_readme_shows(capsys) -> None:
 
 def test_table_of_commands_is_complete() -> None:
     listed = set(re.findall(r"^\| `loopcal ([a-z-]+)", README, re.MULTILINE))
-    assert listed == set(commands.list_commands(click.Context(commands)))
+    assert listed == set(command_line.list_commands(click.Context(command_line)))

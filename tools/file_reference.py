@@ -24,9 +24,9 @@ from loopcal.io.exports.profile import ColumnSource, ProfileRecord
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES, RobotRecord
-from loopcal.studies.scores import list_columns
-from loopcal.studies.specification import Question, Scores
-from loopcal.studies.study_file import LEVELS, StudySettings
+from loopcal.studies.files.study_file import LEVELS, StudySettings
+from loopcal.studies.specification.levels import Question, Scores
+from loopcal.studies.specification.scores import list_columns
 from loopcal.units import DISPLAY_UNITS, Dimension
 from tools.markdown import fill_blocks, format_table
 

@@ -22,8 +22,8 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
-from loopcal.studies.effects import AlteredNoise
-from loopcal.studies.specification import EffectsLevel, Outliers
+from loopcal.studies.simulation.effects import AlteredNoise
+from loopcal.studies.specification.levels import EffectsLevel, Outliers
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

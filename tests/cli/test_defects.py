@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main, robot_commands
+from loopcal.cli import main
+from loopcal.cli.commands import robot_commands
 
 DEFECTS = {
     "RecursionError": "f()",
@@ -22,7 +23,8 @@ DEFECTS = {
 SCRIPT = """
 import sys
 import numpy as np
-from loopcal.cli import main, robot_commands
+from loopcal.cli import main
+from loopcal.cli.commands import robot_commands
 np.seterr(divide="raise")
 f = lambda: f()
 robot_commands.check.callback = lambda **_: {}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.cli import main
-from loopcal.cli.exchange_commands import WRITTEN_FORMATS
+from loopcal.cli.commands.exchange_commands import WRITTEN_FORMATS
 from loopcal.io import load_robot, load_run, save_robot
 from loopcal.io.runs.run_verdict import FAILED_ROBOT, ROBOT, find_run_failure
 from loopcal.mechanism import inverse

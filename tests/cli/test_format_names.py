@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands import and export offer the formats that the library reads and writes."""
 
-from loopcal.cli.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
+from loopcal.cli.commands.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
 from loopcal.io.formats import FORMATS
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loopcal.cli import main
-from loopcal.cli.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
+from loopcal.cli.commands.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.formats import FORMATS
 from tests.cli.delta_printers import list_stored_geometry, read_records

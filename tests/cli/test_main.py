@@ -7,11 +7,12 @@ import sys
 import click
 import pytest
 
-from loopcal.cli import commands, main, robot_commands
-from loopcal.cli.study_commands import study
+from loopcal.cli import command_line, main
+from loopcal.cli.commands import robot_commands
+from loopcal.cli.commands.study_commands import study
 from loopcal.errors import MechanismError
 
-NAMES = sorted(commands.list_commands(click.Context(commands)))
+NAMES = sorted(command_line.list_commands(click.Context(command_line)))
 
 
 def test_help_lists_every_command(capsys) -> None:

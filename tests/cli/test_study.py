@@ -19,8 +19,8 @@ from evidence.study_interruption import read_contents
 from loopcal.cli import main
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
-from loopcal.studies.store import NAME, open_store
-from loopcal.studies.study_result import StudyResult
+from loopcal.studies.files.store import NAME, open_store
+from loopcal.studies.results.study_result import StudyResult
 from tests.studies.small_study import CELLS, write_study
 
 ROOT = str(Path(__file__).parents[2])

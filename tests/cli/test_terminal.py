@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 from loopcal.cli import terminal
-from loopcal.cli.calibration_commands import calibrate, validate
+from loopcal.cli.commands.calibration_commands import calibrate, validate
 from loopcal.cli.hints import HINTS, find_hint, hint_for
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import load_catalog

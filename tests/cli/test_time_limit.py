@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from loopcal.cli import main
-from loopcal.cli.entry_point import SECTIONS, commands
-from loopcal.cli.study_commands import study
+from loopcal.cli.commands.study_commands import study
+from loopcal.cli.entry_point import SECTIONS, command_line
 from loopcal.cli.terminal import ProgressBar
 from loopcal.cli.time_limit import TimeLimitError, limit_time
 
@@ -81,7 +81,7 @@ def test_long_calibration_ends_with_exit_code_4_and_leaves_nothing(tmp_path, cap
 
 @pytest.mark.parametrize("words", EVERY)
 def test_every_command_has_the_option(words: tuple[str, ...]) -> None:
-    result = CliRunner().invoke(commands, [*words, "--help"])
+    result = CliRunner().invoke(command_line, [*words, "--help"])
     assert "--time-limit DURATION" in result.output
 
 

@@ -18,7 +18,7 @@ from loopcal.diagnose.residuals import residual_patterns
 from loopcal.estimate.inference import residual_test
 from loopcal.estimate.methods import prior_conflict
 from loopcal.measure import Gaussian
-from loopcal.studies.effects import AlteredNoise
+from loopcal.studies.simulation.effects import AlteredNoise
 
 SCRIPTS = {"linear-delta": "delta", "five-bar": "five_bar", "hexapod-42": "hexapod"}
 

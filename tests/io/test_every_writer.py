@@ -39,10 +39,10 @@ USES_LIBRARY = {
     "io/core/replacement.py": "makes, renames and restores temporary files",
     "io/core/result_folder.py": "writes folders, and has them read",
     "io/core/text_file.py": "writes files, and has them read",
-    "studies/export.py": "writes a long table row by row, and has it read",
-    "studies/study_folder.py": "writes the files of a new folder, and has it read",
-    "studies/summary_view.py": "makes a table in memory",
-    "cli/regularize_command.py": "makes a table in memory",
+    "studies/results/export.py": "writes a long table row by row, and has it read",
+    "studies/files/study_folder.py": "writes the files of a new folder, and has it read",
+    "studies/results/summary_view.py": "makes a table in memory",
+    "cli/commands/regularize_command.py": "makes a table in memory",
     "io/runs/run_folder.py": "makes arrays.npz in memory",
     "papers/drawing.py": "draws into memory",
     "report/pictures.py": "draws into memory",
@@ -56,8 +56,8 @@ COMMANDS = {
         "import robot.g --format reprap -o F.yaml",
         "import robot.urdf --closures loops.yaml -o F.yaml",
     ),
-    "cli/robot_commands.py:new": ("new five-bar -o new.yaml --measurements F.csv",),
-    "cli/robot_commands.py:check": tuple(
+    "cli/commands/robot_commands.py:new": ("new five-bar -o new.yaml --measurements F.csv",),
+    "cli/commands/robot_commands.py:check": tuple(
         f"check five-bar --plot F{ending}" for ending in (".png", ".svg", ".pdf")
     ),
     "io/data/measurement_writer.py:save_measurements": (
@@ -72,7 +72,7 @@ COMMANDS = {
         "sample run --count 100 -o F.csv",
     ),
     "io/runs/compensation_file.py:save_compensation": ("compensate run targets.csv -o F.csv",),
-    "cli/exchange_commands.py:export": (
+    "cli/commands/exchange_commands.py:export": (
         "export delta.yaml -o F.cfg",
         "export delta.yaml --into printer.cfg -o F.cfg",
         "export delta.yaml --format marlin -o F.g",
@@ -82,7 +82,7 @@ COMMANDS = {
         "export hexapod.yaml --into hexapod.hal -o F.hal",
         "export tripod.yaml --into robot.urdf -o F.urdf",
     ),
-    "cli/exchange_commands.py:_correct_file": (
+    "cli/commands/exchange_commands.py:_correct_file": (
         "import printer.cfg -o p.yaml --data p.csv --corrected F.cfg",
     ),
     "io/runs/run_folder.py:write_run_folder": ("calibrate five-bar data.csv --hold-out 0.25 -o F",),
@@ -90,22 +90,22 @@ COMMANDS = {
         "plan five-bar --kind position --candidates 20 --poses 7 --hold-out 2 -o F",
     ),
     "papers/writing.py:write_folder": ("STUDY",),
-    "studies/template.py:write_template": ("study new --robot five-bar F.yaml",),
+    "studies/files/template.py:write_template": ("study new --robot five-bar F.yaml",),
     "io/runs/curves_folder.py:write_curves": ("regularize five-bar data.csv -o F",),
 }
 """Commands that write the file or folder F, by the function that writes it."""
 
 OF_STUDIES = {
-    "studies/export.py:export_trials": "the table is read to its end and its rows are counted",
+    "studies/results/export.py:export_trials": "the table is read to its end, its rows are counted",
     "studies/replay_run.py:calibrate_trial": "robot file and measurements are read as such",
-    "studies/study_folder.py:_make_folder": "the study file is read with its robots",
-    "studies/summary_view.py:write_summary": "each file is read by the reader of its kind",
+    "studies/files/study_folder.py:_make_folder": "the study file is read with its robots",
+    "studies/results/summary_view.py:write_summary": "each file is read by the reader of its kind",
 }
 """Functions of studies that need a computed study, with their readers; not damaged here."""
 
 FILES = {
     "io/runs/curves_folder.py:write_curves": ("curves.csv",),
-    "cli/exchange_commands.py:_correct_file": ("F.cfg",),
+    "cli/commands/exchange_commands.py:_correct_file": ("F.cfg",),
     "io/runs/run_folder.py:write_run_folder": ("result.json", "robot.yaml", "arrays.npz"),
     "io/runs/plan_folder.py:write_plan_folder": (
         "plan.csv",

@@ -14,7 +14,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.cli.entry_point import SECTIONS, find_command
-from loopcal.cli.options import Count
+from loopcal.cli.options.shared_options import Count
 from loopcal.errors import FileError, MechanismError
 from loopcal.io.core import limits
 from loopcal.io.core.csv_table import read_table

@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.studies.cells import Cell
-from loopcal.studies.specification import (
+from loopcal.studies.files.store import read_store
+from loopcal.studies.files.study_folder import StudySource, load_specification, open_study
+from loopcal.studies.results.study_result import StudyResult, find_columns
+from loopcal.studies.specification.cells import Cell
+from loopcal.studies.specification.levels import (
     InstrumentLevel,
     MethodLevel,
     NoiseLevel,
@@ -18,10 +21,7 @@ from loopcal.studies.specification import (
     Question,
     Robot,
 )
-from loopcal.studies.store import read_store
-from loopcal.studies.study import Study
-from loopcal.studies.study_folder import StudySource, load_specification, open_study
-from loopcal.studies.study_result import StudyResult, find_columns
+from loopcal.studies.specification.study import Study
 
 Scores = dict[str, np.ndarray]
 """Name of a score -> its values (t,)."""

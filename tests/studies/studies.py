@@ -8,8 +8,14 @@ from functools import cache
 from typing import Any
 
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.studies import Study, compute_block
-from loopcal.studies.specification import InstrumentLevel, MethodLevel, PosesLevel, Robot, Scores
+from loopcal.studies import Study, compute_block, list_tasks
+from loopcal.studies.specification.levels import (
+    InstrumentLevel,
+    MethodLevel,
+    PosesLevel,
+    Robot,
+    Scores,
+)
 from loopcal.typing import FloatArray
 
 CAMERA = InstrumentLevel(("component",), ("x", "y", "z"), sigma_position=2e-5)
@@ -41,5 +47,5 @@ def make_study(name: str = "linear-delta", **changes: Any) -> Study:
 def compute_cells(study: Study) -> list[dict[str, FloatArray]]:
     """Return name -> (B,) score of the first block of each cell."""
     names = [column.name for column in study.columns]
-    tasks = [task for task in study.list_tasks() if task.block == 0]
+    tasks = [task for task in list_tasks(study) if task.block == 0]
     return [dict(zip(names, compute_block(task).values.T, strict=True)) for task in tasks]

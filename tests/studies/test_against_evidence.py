@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from loopcal.studies import compute_block
-from loopcal.studies.specification import (
+from loopcal.studies import compute_block, list_tasks
+from loopcal.studies.specification.levels import (
     EffectsLevel,
     InstrumentLevel,
     MethodLevel,
@@ -50,7 +50,7 @@ def test_coverage_and_rank_agree(case):
         methods={method: MethodLevel(cast(MethodName, method))},
         effects={"noise": EffectsLevel(noise=noise)},
     )
-    values = np.concatenate([compute_block(task).values for task in study.list_tasks()])
+    values = np.concatenate([compute_block(task).values for task in list_tasks(study)])
     scores = dict(zip((column.name for column in study.columns), values.T, strict=True))
     assert_array_equal(scores["outcome"], 0)
     assert_array_equal(scores["rank"], rank)

@@ -19,9 +19,9 @@ from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, LeastSquares, identify
 from loopcal.measure import Measurements, Observations, make_random_stream
 from loopcal.mechanism import forward, inverse
-from loopcal.studies import OUTCOMES, compute_block, replay_trial
-from loopcal.studies.block import make_stream
-from loopcal.studies.specification import (
+from loopcal.studies import OUTCOMES, compute_block, list_tasks, replay_trial
+from loopcal.studies.simulation.block import make_stream
+from loopcal.studies.specification.levels import (
     ErrorsLevel,
     InstrumentLevel,
     MethodLevel,
@@ -35,7 +35,7 @@ ROTATION_FREE = ("orientation", "covered_orientation", "angles")
 
 def test_scores_equal_calibrations_made_by_hand():
     study = make_study()
-    (task,) = study.list_tasks()
+    (task,) = list_tasks(study)
     (scores,) = compute_cells(study)
     content = json.loads(task.content)
     robot, stream = lc.load_robot("linear-delta"), make_stream(3, 0)
@@ -122,7 +122,7 @@ def test_all_cells_have_the_same_machines():
 
 def test_more_poses_are_the_same_poses_and_further_ones():
     study = make_study(poses={"12": PosesLevel(12), "15": PosesLevel(15)})
-    few, many = (json.loads(task.content)["measured"] for task in study.list_tasks())
+    few, many = (json.loads(task.content)["measured"] for task in list_tasks(study))
     assert many[:12] == few
 
 
@@ -134,7 +134,7 @@ def test_planned_poses_are_better_than_random_ones():
 
 @pytest.mark.parametrize("distribution", ["normal", "uniform"])
 def test_errors_have_the_stated_distribution(distribution):
-    from loopcal.studies.machines import draw_machines
+    from loopcal.studies.simulation.machines import draw_machines
 
     robot = lc.load_robot("linear-delta")
     level = ErrorsLevel(error_factor=2.0, distribution=distribution)
@@ -197,10 +197,10 @@ def test_a_trial_that_fails_does_not_change_the_others():
 
 CHILD = """
 import hashlib, sys
-from loopcal.studies import compute_block
+from loopcal.studies import compute_block, list_tasks
 from tests.studies.studies import make_study
 study = make_study(replicates=12)
-tasks = list(study.list_tasks())[:: int(sys.argv[1])]
+tasks = list(list_tasks(study))[:: int(sys.argv[1])]
 values = {task.block: compute_block(task).values for task in tasks}
 print(hashlib.sha256(b"".join(values[b].tobytes() for b in sorted(values))).hexdigest())
 """
@@ -208,7 +208,7 @@ print(hashlib.sha256(b"".join(values[b].tobytes() for b in sorted(values))).hexd
 
 def test_blocks_have_the_same_bits_in_every_process():
     study = make_study(replicates=12)
-    values = [compute_block(task).values.tobytes() for task in study.list_tasks()]
+    values = [compute_block(task).values.tobytes() for task in list_tasks(study)]
     here = hashlib.sha256(b"".join(values)).hexdigest()
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "3", "OMP_NUM_THREADS": "3"}
     command = [sys.executable, "-c", CHILD, "-1"]  # in the opposite order, with other threads
@@ -218,7 +218,7 @@ def test_blocks_have_the_same_bits_in_every_process():
 
 def test_a_replayed_trial_gives_the_scores_of_its_block():
     study = make_study(replicates=12)
-    _, task = study.list_tasks()
+    _, task = list_tasks(study)
     column = [c.name for c in study.columns].index("parameters")
     expected = compute_block(task).values[2, column]
     trial = replay_trial(study, 0, 8)
@@ -239,13 +239,13 @@ def test_a_trial_is_the_same_in_blocks_of_any_size():
 
 def test_blocks_differ():
     study = make_study(replicates=12)
-    first, second = (compute_block(task).values for task in study.list_tasks())
+    first, second = (compute_block(task).values for task in list_tasks(study))
     assert np.all(first[:, 1] != second[:, 1])
 
 
 def test_columns_are_those_of_the_study():
     study = make_study()
-    (task,) = study.list_tasks()
+    (task,) = list_tasks(study)
     result = compute_block(task)
     assert result.key == task.key
     assert result.values.shape == (6, len(study.columns))

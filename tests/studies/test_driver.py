@@ -15,11 +15,11 @@ from evidence.study_interruption import examine, read_contents
 from loopcal.errors import FileError
 from loopcal.studies.driver import Share, count_blocks, count_stored, run_blocks
 from loopcal.studies.execution import Answer, Processes, Serial
-from loopcal.studies.merging import merge_studies
+from loopcal.studies.files.merging import merge_studies
+from loopcal.studies.files.store import NAME, open_store
+from loopcal.studies.files.study_folder import StudySource, extend_study, open_study, read_study
+from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.running import read_source, run_study
-from loopcal.studies.store import NAME, open_store
-from loopcal.studies.study_folder import StudySource, extend_study, open_study, read_study
-from loopcal.studies.study_result import StudyResult
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study
 

@@ -17,8 +17,13 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import forward_trials, sample_workspace
-from loopcal.studies.effects import AlteredNoise, alter_noise, draw_motion, make_disturbance
-from loopcal.studies.specification import Backlash, EffectsLevel, Outliers, ThermalGrowth
+from loopcal.studies.simulation.effects import (
+    AlteredNoise,
+    alter_noise,
+    draw_motion,
+    make_disturbance,
+)
+from loopcal.studies.specification.levels import Backlash, EffectsLevel, Outliers, ThermalGrowth
 from loopcal.units import Dimension
 from loopcal.workflow.instrument_description import InstrumentDescription, build_instrument
 from tests.studies.studies import compute_cells, make_study

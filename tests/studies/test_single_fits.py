@@ -7,7 +7,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.studies import OUTCOMES
-from loopcal.studies.specification import (
+from loopcal.studies.specification.levels import (
     EffectsLevel,
     InstrumentLevel,
     MethodLevel,

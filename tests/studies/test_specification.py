@@ -12,7 +12,8 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.studies import Study, compute_block, list_varied_factors, load_study
-from loopcal.studies.specification import (
+from loopcal.studies.simulation.tasks import list_tasks
+from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,
     MethodLevel,
@@ -134,7 +135,7 @@ def test_poses_may_be_those_of_a_file(write, tmp_path):
     study = load_study(write(text))
     level = study.poses["mine"]
     assert level.count == 2
-    assert json.loads(next(study.list_tasks()).content)["measured"] == [
+    assert json.loads(next(list_tasks(study)).content)["measured"] == [
         list(c) for c in level.coordinates
     ]
     (tmp_path / "poses.csv").rename(tmp_path / "others.csv")
@@ -206,16 +207,16 @@ def test_a_key_does_not_change_with_anything_else():
 
 def test_tasks_leave_out_what_is_finished():
     study = make_study(replicates=18, poses={"12": PosesLevel(12), "15": PosesLevel(15)})
-    tasks = list(study.list_tasks())
+    tasks = list(list_tasks(study))
     assert [(task.cell, task.block) for task in tasks] == [(c, b) for c in (0, 1) for b in range(3)]
     assert [task.key for task in tasks] == list_keys(study)
     finished = frozenset(task.key for task in tasks[:4])
-    assert [task.key for task in study.list_tasks(finished=finished)] == list_keys(study)[4:]
-    assert {task.cell for task in study.list_tasks([1])} == {1}
+    assert [task.key for task in list_tasks(study, finished=finished)] == list_keys(study)[4:]
+    assert {task.cell for task in list_tasks(study, [1])} == {1}
 
 
 def test_the_content_of_a_task_is_all_that_a_block_needs():
-    (task,) = make_study().list_tasks()
+    (task,) = list_tasks(make_study())
     content = json.dumps(json.loads(task.content), sort_keys=True)  # another layout
     again = compute_block(replace(task, cell=99, content=content))
     assert again.values.tobytes() == compute_block(task).values.tobytes()

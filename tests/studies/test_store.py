@@ -16,13 +16,20 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.studies import file_systems
-from loopcal.studies.changes import list_conflicts
-from loopcal.studies.file_systems import find_type, is_network
-from loopcal.studies.keys import dump_json
-from loopcal.studies.specification import ErrorsLevel, MethodLevel, NoiseLevel, Robot
-from loopcal.studies.store import NAME, StoreHeader, is_driven, make_store, open_store, read_store
-from loopcal.studies.study import Study
+from loopcal.studies.files import file_systems
+from loopcal.studies.files.file_systems import find_type, is_network
+from loopcal.studies.files.store import (
+    NAME,
+    StoreHeader,
+    is_driven,
+    make_store,
+    open_store,
+    read_store,
+)
+from loopcal.studies.specification.changes import list_conflicts
+from loopcal.studies.specification.keys import dump_json
+from loopcal.studies.specification.levels import ErrorsLevel, MethodLevel, NoiseLevel, Robot
+from loopcal.studies.specification.study import Study
 from tests.findings.expectations import expect_refusal
 
 HEADER = StoreHeader("{}", ("outcome", "position", "rank"), {"numerics": "1"})
@@ -88,7 +95,7 @@ def test_scores_can_be_read_while_they_are_written(folder) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from loopcal.studies.store import open_store
+from loopcal.studies.files.store import open_store
 from tests.studies.test_store import A, make_scores
 with open_store(Path(sys.argv[1])) as store:
     for number in range(10):
@@ -170,7 +177,7 @@ FULL = """
 import sys
 from pathlib import Path
 from loopcal.errors import FileError
-from loopcal.studies.store import make_store, open_store, read_store
+from loopcal.studies.files.store import make_store, open_store, read_store
 from tests.studies.test_store import A, HEADER, make_scores
 folder = Path("disk/study")
 folder.mkdir()

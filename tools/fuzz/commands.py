@@ -51,7 +51,7 @@ PATHS = (
 def list_commands() -> dict[str, click.Command]:
     """Return every command by name, but for groups, whose commands take minutes."""
     names = [name for members in entry_point.MODULES.values() for name in members]
-    group, context = entry_point.commands, click.Context(entry_point.commands)
+    group, context = entry_point.command_line, click.Context(entry_point.command_line)
     commands = {name: group.get_command(context, name) for name in names}
     return {
         name: command

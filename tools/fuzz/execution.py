@@ -233,7 +233,7 @@ def _watched(folder: Path, outcome: Outcome) -> Iterator[None]:
 @contextlib.contextmanager
 def _recorded(outcome: Outcome) -> Iterator[None]:
     """Record exceptions that the command line does not expect, whatever it makes of them."""
-    original = entry_point.commands.main
+    original = entry_point.command_line.main
 
     def watched(*arguments: Any, **options: Any) -> Any:
         try:
@@ -250,7 +250,7 @@ def _recorded(outcome: Outcome) -> Iterator[None]:
             outcome.failures.append((type(error).__name__, _format(error)))
             raise
 
-    entry_point.commands.main = watched  # type: ignore[method-assign]
+    entry_point.command_line.main = watched  # type: ignore[method-assign]
     try:
         with limited_time():
             yield
@@ -260,7 +260,7 @@ def _recorded(outcome: Outcome) -> Iterator[None]:
         if not outcome.failures:
             outcome.failures.append((type(error).__name__, _format(error)))
     finally:
-        entry_point.commands.main = original  # type: ignore[method-assign]
+        entry_point.command_line.main = original  # type: ignore[method-assign]
 
 
 def _format(error: BaseException) -> str:

@@ -73,7 +73,7 @@ MODULES = {
     "study_commands": ("study",),
     "paper_commands": ("reproduce", "per-leg"),
 }
-"""Modules of this package, and the commands in each; they are imported when they run."""
+"""Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
 
 
 class SectionedGroup(CommandGroup):
@@ -100,7 +100,7 @@ def find_command(name: str) -> click.Command | None:
     if module is None:
         return None
     function = name.replace("-", "_") + "_" * keyword.iskeyword(name)
-    return getattr(import_module(f"loopcal.cli.{module}"), function)
+    return getattr(import_module(f"loopcal.cli.commands.{module}"), function)
 
 
 def find_running_command(words: Sequence[str]) -> click.Command | None:
@@ -120,7 +120,7 @@ def find_running_command(words: Sequence[str]) -> click.Command | None:
     },
 )
 @click.version_option(package_name="loopcal", message="loopcal %(version)s")
-def commands() -> None:
+def command_line() -> None:
     """Calibrate the geometry of robots with closed kinematic loops.
 
     \b
@@ -155,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = find_running_command(words)
             if command is not None and not _has_working_folder():
                 return _refuse("the working folder was removed; change to a folder that exists.")
-            code = commands.main(words, prog_name="loopcal", standalone_mode=False)
+            code = command_line.main(words, prog_name="loopcal", standalone_mode=False)
             terminal.flush_output()
             return code if isinstance(code, int) else 0
         except BrokenPipeError:  # the reader of our output stopped (`loopcal ... | head`)

@@ -9,12 +9,12 @@ from contextlib import closing
 from dataclasses import dataclass
 
 from loopcal.findings import Finding, report_finding
-from loopcal.studies.cells import Cell
 from loopcal.studies.execution import Executor
 from loopcal.studies.execution.interface import MOST_LOSSES
-from loopcal.studies.store import StudyStore
-from loopcal.studies.study import Study
-from loopcal.studies.work import BlockTask, compute_block
+from loopcal.studies.files.store import StudyStore
+from loopcal.studies.simulation.tasks import BlockTask, compute_block, list_tasks
+from loopcal.studies.specification.cells import Cell
+from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
 
 MOST_NAMED = 5
@@ -148,4 +148,4 @@ def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blo
     for cell in share.select_cells(study):
         if store.count_blocks(cell.levels, blocks) == len(blocks):
             continue
-        yield from study.list_tasks([cell.number], store.list_keys(cell.levels), blocks=blocks)
+        yield from list_tasks(study, [cell.number], store.list_keys(cell.levels), blocks=blocks)

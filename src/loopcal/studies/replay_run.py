@@ -14,9 +14,9 @@ from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_resul
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.robot.robot_file import format_robot
 from loopcal.io.runs.run_folder import build_document, refuse_run_folder, save_run
-from loopcal.studies.replay import replay_trial
-from loopcal.studies.specification import FACTORS
-from loopcal.studies.study_folder import read_study
+from loopcal.studies.files.study_folder import read_study
+from loopcal.studies.simulation.replay import replay_trial
+from loopcal.studies.specification.levels import FACTORS
 from loopcal.typing import Progress, report_no_progress
 from loopcal.workflow import CalibrationOptions, CalibrationReport, calibrate
 

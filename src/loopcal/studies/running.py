@@ -8,10 +8,10 @@ from pathlib import Path
 from loopcal.io.core.text_file import as_path
 from loopcal.studies.driver import WHOLE, RunReport, Share, run_blocks
 from loopcal.studies.execution import Executor, Processes, Serial
-from loopcal.studies.study import Study
-from loopcal.studies.study_file import load_study
-from loopcal.studies.study_folder import StudySource, open_study
-from loopcal.studies.study_result import StudyResult
+from loopcal.studies.files.study_file import load_study
+from loopcal.studies.files.study_folder import StudySource, open_study
+from loopcal.studies.results.study_result import StudyResult
+from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
 
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from loopcal.report.text_page import Block
-from loopcal.studies.cells import Cell, list_factors
-from loopcal.studies.study import Study
-from loopcal.studies.work import compute_block
+from loopcal.studies.simulation.tasks import compute_block, list_tasks
+from loopcal.studies.specification.cells import Cell, list_factors
+from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
 
 MOST_BLOCKS = 4
@@ -59,7 +59,7 @@ def estimate_time(
     for i, cell in enumerate(chosen):
         progress(i, len(chosen), "computing a block")
         begin = time.perf_counter()
-        result = compute_block(next(study.list_tasks([cell.number])))
+        result = compute_block(next(list_tasks(study, [cell.number])))
         seconds.append(time.perf_counter() - begin)
         failed, trials = failed + int((result.values[:, 0] != 0).sum()), trials + len(result.values)
         if sum(seconds) > LONGEST:

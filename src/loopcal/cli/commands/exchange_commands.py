@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal import` and `loopcal export`: files of controllers and other programs."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.hints import hint_for
+from loopcal.cli.options.shared_options import (
+    FILE,
+    LENGTH,
+    POSITIVE_LENGTH,
+    add_options,
+    file_option,
+    force_option,
+    format_option,
+    json_option,
+    name_option,
+    print_convention_note,
+    read_measurements,
+    refuse_given,
+)
+from loopcal.errors import DataError
+from loopcal.units import Dimension, list_symbols
+
+if TYPE_CHECKING:
+    from loopcal.findings import Finding
+    from loopcal.io.formats.program_format import Format, Imported, ImportOptions
+    from loopcal.mechanism import Mechanism
+    from loopcal.report.text_page import Block
+    from loopcal.workflow import CalibrationReport
+
+READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
+WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
+TAPED = (
+    "lengths measured by hand, which become prior knowledge: lines at the origin (hangprinter), "
+    "arms (klipper, marlin, reprap), joint centers (linuxcnc)"
+)
+"""What the option --sigma-tape is for."""
+
+SHOWN = 20
+"""Lines that do not match a profile that are listed."""
+
+
+@click.command("import")
+@click.argument("file", metavar="FILE", type=FILE)
+@format_option(READ_FORMATS, "Format of FILE; by default chosen by the ending of its name.")
+@file_option(
+    "--profile", help="Instead of --format: how to read FILE, the export of an instrument."
+)
+@file_option(
+    "-o",
+    "--output",
+    help="Robot file to write, which names the robot; with --profile the measurement file.",
+    required=True,
+)
+@file_option("--data", help="Also write the measurements that FILE contains.")
+@file_option(
+    "--corrected", help="Also calibrate with them, and write FILE with the corrected numbers."
+)
+@add_options(
+    *(
+        click.option(
+            f"--sigma-{of}", type=POSITIVE_LENGTH, help=f"Noise of {what}.  [default: {default}]"
+        )
+        for of, what, default in (
+            ("height", "the probe (klipper)", "0.02mm"),
+            ("distance", "distances (klipper)", "0.1mm"),
+            ("line", "lines (hangprinter)", "1mm"),
+            ("position", "known positions (hangprinter)", "1mm"),
+            ("tape", TAPED, "10mm for lines"),
+            ("anchor", "anchors that FILE states (hangprinter)", "none: they are first guesses"),
+        )
+    )
+)
+@click.option(
+    "--unit",
+    "length_unit",
+    type=click.Choice(list_symbols(Dimension.LENGTH)),
+    help="Unit of lengths (linuxcnc).",
+)
+@click.option("--home-z", "home_height", type=LENGTH, help="Height of the home pose (linuxcnc).")
+@file_option(
+    "--closures", help="Loops that a URDF closes (urdf); by default FILE with the ending .yaml."
+)
+@click.option(
+    "--platform",
+    metavar="LINK",
+    help="Link that is the platform (urdf); by default the one on a fixed joint.",
+)
+@force_option("an output file", ", and write --corrected even where the calibration failed")
+@json_option
+def import_(
+    file: Path,
+    format_name: str | None,
+    profile: Path | None,
+    output: Path,
+    data: Path | None,
+    corrected: Path | None,
+    force: bool,
+    as_json: bool,
+    **settings: Any,
+) -> int:
+    """Read FILE, which another program wrote, as a robot file and, where it contains any,
+    measurements.
+
+    With --profile, FILE is text that an instrument exported; it becomes a measurement file (see
+    docs/exports.md).
+
+    With --corrected, the exit code is 2 where the calibration failed, as in loopcal calibrate. Then
+    the corrected file is not written without --force.
+
+    \b
+    Examples:
+      loopcal import printer.cfg -o printer.yaml --data heights.csv
+      loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
+      loopcal import config-override.g --format reprap -o printer.yaml
+      loopcal import export.txt --profile tracker.yaml -o measurements.csv
+      loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
+      loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
+      loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
+    """  # noqa: D301
+    from loopcal.diagnose import compare_stored_geometry
+    from loopcal.io.core.names import make_name
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+    from loopcal.io.formats.import_export import choose_format, save_imported
+    from loopcal.report.calibration_view import with_hint
+
+    if profile is not None:
+        _convert_export(file, profile, output, force, as_json)
+        return 0
+    source = choose_format(file, format_name)
+    read = _find_reader(source)
+    if corrected is not None and data is None:
+        raise DataError(
+            "--corrected calibrates with the measurements in the file; state where to write them, "
+            "such as --data data.csv"
+        )
+    beside = file.with_suffix(".yaml") if source.name == "urdf" else None
+    refuse_outputs((output, data), (file, settings["closures"] or beside), force)
+    refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
+    imported = read(file, _make_import_options(source, make_name(output.stem), settings))
+    with restore_on_failure((output, data)):
+        robot = save_imported(file, imported, output, data)
+        noted = list(imported.findings)
+        if source.stores_fit and imported.measurements is not None:
+            stored = compare_stored_geometry(robot, imported.measurements)
+            noted += [] if stored is None else [stored.finding]
+        correction = None
+        if corrected is not None and data is not None:
+            correction = _correct_file(source, robot, file, data, corrected, force)
+    document: dict[str, Any] = {
+        "robot": output,
+        "data": data,
+        "corrected": corrected if correction is not None and correction.is_written else None,
+        "notes": [str(finding) for finding in noted],
+        "findings": imported.findings,
+    }
+    if as_json:
+        terminal.print_json({**document, **_list_calibration(correction)})
+    else:
+        terminal.print_page(_view_import(robot, document, noted, correction))
+    if correction is None or correction.failure is None:
+        return 0
+    return terminal.print_failures([with_hint(correction.failure, hint_for)])
+
+
+def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
+    """Return the function that reads a format; DataError where loopcal only writes it."""
+    if source.read is None:
+        raise DataError(
+            f"loopcal writes the format {source.name}, but cannot read it; it reads "
+            f"{', '.join(READ_FORMATS)}, and an instrument's export with a profile (--profile, "
+            "docs/exports.md)"
+        )
+    return source.read
+
+
+def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_json: bool) -> None:
+    """Write the measurements of an export; report lines that were skipped or do not match."""
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.exports import convert_export, read_profile, save_conversion
+    from loopcal.report.calibration_view import with_hint
+
+    used = {"file", "profile", "output", "force", "as_json"}
+    names = (option.name or "" for option in click.get_current_context().command.params)
+    refuse_given(
+        (name for name in names if name not in used),
+        "with --profile, which states how the file is read",
+    )
+    refuse_outputs((output,), (file, profile), force)
+    converted = convert_export(file, read_profile(profile))
+    save_conversion(converted, output)
+    if as_json:
+        misfits = [{"line": line, "reason": reason} for line, reason in converted.misfits]
+        document = {
+            "measurements": output,
+            "rows": converted.rows,
+            "passed": converted.passed,
+            "misfits": misfits,
+            "notes": [str(finding) for finding in converted.findings],
+            "findings": converted.findings,
+        }
+        terminal.print_json(document)
+        return
+    page = [
+        f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
+        *(f"note: {with_hint(finding, hint_for)}" for finding in converted.findings),
+        *(
+            f"note: {file}:{line} does not match: {reason}"
+            for line, reason in converted.misfits[:SHOWN]
+        ),
+    ]
+    more = len(converted.misfits) - SHOWN
+    if more > 0:
+        page.append(f"note: {more} more lines do not match; {output} lists them")
+    terminal.print_page(page)
+
+
+def _make_import_options(source: Format, name: str, settings: dict[str, Any]) -> ImportOptions:
+    """Return the options of a format; DataError for one that it does not have."""
+    from loopcal.io.formats.program_format import ImportOptions
+
+    stated = {key: value for key, value in settings.items() if value is not None}
+    for key in stated:
+        if key not in source.read_options:
+            raise DataError(
+                f"{name_option(key)} does not belong to the format {source.name}; leave it out"
+            )
+    return ImportOptions(name, **stated)
+
+
+@dataclass(frozen=True)
+class _Correction:
+    """A calibration with imported measurements, and what it changed in the file.
+
+    `failure` : why it failed; then the file is only written where that was demanded.
+    """
+
+    report: CalibrationReport
+    failure: Finding | None
+    changes: tuple[str, ...]
+    is_written: bool
+
+
+def _list_calibration(correction: _Correction | None) -> dict[str, Any]:
+    """Return the calibration of an import for JSON; its parts are None where there is none."""
+    report = None if correction is None else correction.report
+    return {
+        "fit": report and report.identification,
+        "verdict": report and report.verdict,
+        "reasons": report and report.failures,
+        "changes": correction and correction.changes,
+    }
+
+
+def _correct_file(
+    source: Format, robot: Mechanism, file: Path, data: Path, output: Path, force: bool
+) -> _Correction:
+    """Calibrate with the imported measurements, and write the corrected file."""
+    from loopcal.findings import report_finding
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.formats.import_export import export_robot
+    from loopcal.io.formats.program_format import ExportSource
+    from loopcal.io.runs.run_verdict import list_reasons
+    from loopcal.workflow import calibrate
+
+    report = calibrate(robot, read_measurements([data], robot))
+    print_convention_note(report.conventions, [data])
+    failure, is_written = None, force or not report.failures
+    if report.failures:
+        failure = report_finding(
+            "gates.correction-not-written",
+            file=str(output),
+            reasons=list_reasons(report.failures),
+            is_written=is_written,
+        )
+    if not is_written:
+        return _Correction(report, failure, (), is_written)
+    exported = export_robot(ExportSource(report.robot), source, file)
+    write_text(output, exported.text, exported.read_back)
+    return _Correction(report, failure, tuple(map(str, exported.findings)), is_written)
+
+
+def _view_import(
+    robot: Mechanism,
+    document: dict[str, Any],
+    noted: Sequence[Finding],
+    correction: _Correction | None,
+) -> list[Block]:
+    """Return what was read, what was identified, and which lines were changed."""
+    from loopcal.report.calibration_view import view_fit, with_hint
+
+    n, free = len(robot.parameters), int(robot.parameters.free.sum())
+    counts = f"{len(robot.actuators)} actuators, {n} parameters, {free} free"
+    page: list[Block] = [f"{document['robot']}: {counts}"]
+    if document["data"] is not None:
+        page.append(f"{document['data']}: the measurements of the file")
+    page += [f"note: {with_hint(finding, hint_for)}" for finding in noted]
+    files = shlex.join((str(document["robot"]), str(document["data"] or "DATA")))
+    following = f"Next: loopcal calibrate {files} -o run"
+    if correction is None:
+        return [*page, following]
+    page += [*view_fit(correction.report.identification), *correction.changes]
+    if not correction.is_written:
+        return [*page, following]
+    return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
+
+
+@click.command()
+@click.argument("source", metavar="RUN|ROBOT")
+@format_option(WRITTEN_FORMATS, "Format to write; by default chosen by the ending of -o.")
+@file_option(
+    "--into",
+    help="File of the controller to correct; everything else in it stays as it is.",
+    metavar="FILE",
+)
+@file_option("-o", "--output", help="File to write.", required=True)
+@force_option("the output file", ", and write also the numbers of a calibration that failed")
+@json_option
+def export(
+    source: str,
+    format_name: str | None,
+    into: Path | None,
+    output: Path,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Write the parameters of RUN, or of a robot file, as another program reads them.
+
+    A note names what the format cannot express. The exit code is 2 where the calibration of RUN
+    failed; then nothing is written without --force.
+
+    \b
+    Examples:
+      loopcal export run --format klipper --into printer.cfg -o corrected.cfg
+      loopcal export run --format reprap -o config-override.g
+      loopcal export run -o parameters.csv
+    """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.formats.import_export import choose_format, export_robot, load_source
+    from loopcal.io.runs.run_folder import find_failure
+    from loopcal.report.calibration_view import with_hint
+
+    target = choose_format(output, format_name, is_written=True)
+    refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
+    failure = find_failure(source)
+    failures = [] if failure is None else [failure]
+    if failures and not force:
+        if as_json:
+            document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
+            terminal.print_json(document)
+        return terminal.print_failures(with_hint(failure, hint_for) for failure in failures)
+    exported = export_robot(load_source(source), target, into)
+    write_text(output, exported.text, exported.read_back)
+    if as_json:
+        notes = [str(finding) for finding in exported.findings]
+        document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
+        terminal.print_json(document)
+    else:
+        noted = [with_hint(finding, hint_for) for finding in exported.findings]
+        terminal.print_page([*noted, f"Written to {output}"])
+    return terminal.print_failures(failures)

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal identifiability` and `loopcal simulate`: what measurements determine, and simulated
+ones.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.hints import hint_for
+from loopcal.cli.options.fit_options import rank_tolerance_option
+from loopcal.cli.options.instrument_options import (
+    DESCRIPTION,
+    distribution_option,
+    draw_option,
+    instrument_options,
+    make_instrument,
+    parse_reading_sigma,
+    sigma_reading_option,
+    unknown_options,
+)
+from loopcal.cli.options.shared_options import (
+    POSITIVE_ANGLE,
+    POSITIVE_LENGTH,
+    data_argument,
+    data_options,
+    file_option,
+    flag_option,
+    force_option,
+    is_given,
+    json_option,
+    leave_out_held_out,
+    read_checked_measurements,
+    refuse_given,
+    robot_argument,
+    seed_option,
+    take_flags,
+    verbose_option,
+)
+from loopcal.errors import DataError
+
+if TYPE_CHECKING:
+    from loopcal.diagnose import IdentifiableSubset
+    from loopcal.mechanism import Mechanism
+    from loopcal.workflow.identifiability_report import IdentifiabilityReport
+    from loopcal.workflow.simulated_measurements import SimulatedMeasurements
+
+
+DETAILS = "the first combinations, the singular values and a table of all parameters"
+"""What the summary of identifiability leaves out."""
+
+
+@click.command()
+@robot_argument
+@data_argument("[DATA]...", required=False)
+@file_option("--poses", help="Instead of DATA: CSV file of poses that could be measured.")
+@draw_option
+@seed_option("the drawn poses")
+@unknown_options
+@flag_option(
+    "--reduce",
+    "reduced",
+    help="Also choose a smallest set of parameters, and show what the others are merged into.",
+)
+@file_option(
+    "-o", "--output", help="With --reduce: robot file to write, with the other parameters fixed."
+)
+@force_option("the output file")
+@instrument_options
+@sigma_reading_option
+@rank_tolerance_option
+@click.option(
+    "--useful",
+    type=POSITIVE_LENGTH,
+    metavar="QUANTITY",
+    help="Also show what the data determine to this standard deviation of lengths, such as 1um.",
+)
+@click.option(
+    "--useful-angle",
+    type=POSITIVE_ANGLE,
+    metavar="QUANTITY",
+    help="The same for angles. Default: the length over the size of ROBOT.",
+)
+@data_options
+@verbose_option
+@json_option
+def identifiability(
+    robot: str,
+    data: tuple[Path, ...],
+    poses: Path | None,
+    draw: int,
+    seed: int,
+    reduced: bool,
+    output: Path | None,
+    force: bool,
+    sigma_reading: str | None,
+    rank_tolerance: float | None,
+    useful: float | None,
+    useful_angle: float | None,
+    verbose: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Show which parameters of ROBOT the measurements DATA determine, which combinations they
+    cannot determine, and which further measurement does.
+
+    Without DATA, an instrument is assumed that measures --poses, or poses drawn from the workspace
+    of ROBOT. Its options are --measure (or --kind, --components, --orientation), --frames and the
+    sigmas. With DATA they are those of the file.
+
+    \b
+    Examples:
+      loopcal identifiability hexapod-42 measurements.csv
+      loopcal identifiability hexapod-42 poses.csv tracker.csv inclinometer.csv
+      loopcal identifiability 3-prs --measure x,y,z,phi,theta
+      loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
+      loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
+      loopcal identifiability hexapod-42 measurements.csv --useful 1um
+    """  # noqa: D301
+    from loopcal.io import load_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.numerics.decomposition import RANK_TOLERANCE
+    from loopcal.report.identifiability_view import view_identifiability
+    from loopcal.workflow.identifiability_report import analyze_identifiability
+    from loopcal.workflow.simulated_measurements import predict_noise_free
+
+    if data:
+        _refuse_beside_data(poses)
+    if output is not None and not reduced:
+        raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
+    _check_useful(useful, useful_angle)
+    refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
+    machine, drawn = load_robot(robot), []
+    if data:
+        measurements = leave_out_held_out(
+            read_checked_measurements(data, machine, **take_flags(options))
+        )
+    else:
+        if poses is None:
+            drawn = [_name_drawn_poses(machine, draw, seed)]
+        measurements = predict_noise_free(
+            machine,
+            make_instrument(options),
+            **_read_poses(poses, draw, machine),
+            reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            seed=seed,
+        )
+    tolerance = rank_tolerance or RANK_TOLERANCE
+    accuracy = None if useful is None else (useful, useful_angle)
+    report = analyze_identifiability(machine, measurements, reduced, tolerance, accuracy)
+    if report.subset is not None and output is not None:
+        _write_subset(output, report.subset)
+    if as_json:
+        terminal.print_json(report.to_dict())
+        return
+    page = [*drawn, *view_identifiability(report, verbose), *_list_hints(report, verbose)]
+    if output is not None:
+        page += ["", f"Written to {output}: the robot with the other parameters fixed"]
+    terminal.print_page(page)
+
+
+def _list_hints(report: IdentifiabilityReport, verbose: bool) -> list[str]:
+    """Return hints on options that show more."""
+    asked = report.useful is not None
+    hints = [hint for finding in report.summary if not asked and (hint := hint_for(finding))]
+    hints.append("use --json for all combinations" if verbose else f"use --verbose for {DETAILS}")
+    return [f"Hint: {hint}" for hint in hints]
+
+
+def _check_useful(length: float | None, angle: float | None) -> None:
+    """Refuse an accuracy of angles without one of lengths."""
+    if length is None and angle is not None:
+        raise DataError("--useful-angle belongs to --useful; add --useful, such as --useful 1um")
+
+
+def _refuse_beside_data(poses: Path | None) -> None:
+    """Refuse options that describe measurements where data do."""
+    if poses is not None:
+        raise DataError("DATA and --poses exclude each other; give one of the two")
+    for name in ("measure", "frames"):
+        if is_given(name):
+            raise DataError(
+                "DATA states what is measured and what is unknown; leave out --measure and "
+                "--frames, or DATA"
+            )
+    if is_given("sigma_reading"):
+        raise DataError(
+            "DATA states the noise of its readings (reading_noise); leave out --sigma-reading, or "
+            "DATA"
+        )
+
+
+def _read_poses(poses: Path | None, draw: int, robot: Mechanism) -> dict[str, Any]:
+    """Return the arguments `poses`, `labels` and `places` of a simulation: those of a file, or how
+    many to draw.
+    """
+    from loopcal.io.data.measurement_file import load_pose_names, load_poses
+
+    if poses is None:
+        return {"poses": draw}
+    labels, places = load_pose_names(poses)
+    return {"poses": load_poses(poses, robot), "labels": labels, "places": places}
+
+
+def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
+    """Return what the drawn poses are."""
+    return f"{count} poses drawn from the workspace of {robot.name}, seed {seed}"
+
+
+def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
+    """Write the robot file with the parameters fixed that are left out."""
+    from loopcal.io.robot.derived_robots import save_reduced_robot
+
+    words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
+    save_reduced_robot(subset.robot, words, output)
+
+
+@click.command()
+@robot_argument
+@file_option(
+    "--poses", help="CSV file of commanded poses, one column per coordinate. Their names are kept."
+)
+@draw_option
+@file_option(
+    "--fill",
+    help="Instead of poses and instrument: data file of a plan, to be filled in.",
+    metavar="SHEET",
+)
+@file_option("-o", "--output", help="Measurement file to write.", required=True)
+@instrument_options
+@distribution_option
+@sigma_reading_option
+@flag_option(
+    "--draw-errors",
+    help="Draw the errors of the true machine from the tolerances of the robot file.",
+)
+@file_option("--truth", help="Also write the true machine, as a robot file.")
+@seed_option("poses, errors and noise")
+@force_option("an output file")
+@json_option
+def simulate(
+    robot: str,
+    poses: Path | None,
+    draw: int,
+    fill: Path | None,
+    output: Path,
+    sigma_reading: str | None,
+    draw_errors: bool,
+    truth: Path | None,
+    seed: int,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Command ROBOT to poses by its nominal geometry, and write what an instrument measures of the
+    true machine.
+
+    Without --poses, the poses are drawn evenly from the workspace of ROBOT. The true machine has
+    the identified values of ROBOT, or drawn ones with --draw-errors.
+
+    \b
+    Examples:
+      loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
+      loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
+      loopcal simulate truth.yaml --poses poses.csv --sigma-position 1um -o measurements.csv
+      loopcal simulate linear-delta --kind position --sigma-reading 5um -o measurements.csv
+      loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
+      loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
+    """  # noqa: D301
+    from loopcal.io import load_robot, save_measurements, save_robot
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.workflow.simulated_measurements import simulate_measurements
+
+    refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
+    machine = load_robot(robot)
+    if fill is not None:
+        result, remark = _fill_in(machine, fill, draw_errors, seed)
+    else:
+        result = simulate_measurements(
+            machine,
+            make_instrument(options),
+            **_read_poses(poses, draw, machine),
+            draw_errors=draw_errors,
+            reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            seed=seed,
+        )
+        drawn = _name_drawn_poses(machine, draw, seed)
+        source = drawn if poses is None else f"{poses.name}, seed {seed}"
+        remark = f"simulated by loopcal: {source}"
+    with restore_on_failure((output, truth)):
+        save_measurements(result.data, output, result.truth, remark)
+        if truth is not None:
+            save_robot(result.truth, truth)
+    counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
+    if as_json:
+        terminal.print_json({"output": output, "truth": truth, **counts})
+        return
+    n_poses, n_rows = counts["n_poses"], counts["n_rows"]
+    summary = f"{n_poses} poses of {machine.name}, {n_rows} measured values, seed {seed}"
+    terminal.print_page([f"{output}: {summary}"])
+
+
+def _fill_in(
+    robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
+) -> tuple[SimulatedMeasurements, str]:
+    """Return the filled-in data of a plan, and what they are."""
+    from loopcal.io import load_measurements
+    from loopcal.io.data.measurement_file import (
+        has_empty_readings,
+        load_contact_sheet,
+        load_instrument,
+    )
+    from loopcal.io.runs.plan_folder import find_plan_sheet
+    from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
+
+    refuse_given(
+        ("poses", "draw", *DESCRIPTION[2:], "distribution", "sigma_reading"),
+        f"because --fill {sheet} states poses and instrument",
+    )
+    instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}
+    if has_empty_readings(sheet, robot):
+        planned = load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
+        result = fill_in_contacts(robot, planned, instrument, **how)
+    else:
+        result = fill_in_measurements(robot, load_measurements(sheet, robot), instrument, **how)
+    return result, f"simulated by loopcal: {sheet.name}, seed {seed}"

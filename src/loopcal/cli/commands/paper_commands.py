@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal reproduce` repeats a published study; `loopcal per-leg` uses the method of one."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.options.shared_options import (
+    Count,
+    data_argument,
+    data_options,
+    file_option,
+    flag_option,
+    force_option,
+    json_option,
+    leave_out_held_out,
+    read_checked_measurements,
+    refuse_given,
+    robot_argument,
+    take_flags,
+)
+
+if TYPE_CHECKING:
+    from loopcal.papers.hexapod_42.leg_form import PerLegEstimate
+    from loopcal.papers.printed import Table as PrintedTable
+    from loopcal.papers.reproduction import Reproduction
+    from loopcal.report.tables import Table
+    from loopcal.report.text_page import Block
+
+HEADING = 18
+"""Characters of a line of a heading."""
+
+
+@click.command()
+@click.argument("paper", metavar="[PAPER]", required=False)
+@file_option(
+    "-o",
+    "--output",
+    help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
+    metavar="FOLDER",
+)
+@click.option("--seed", default=0, metavar="N", help="Seed of all random choices.")
+@click.option(
+    "--trials",
+    type=Count("TRIALS"),
+    metavar="N",
+    help="Number of trials behind each statistical number.  [default: 50]",
+)
+@flag_option("--force", help="Replace an earlier result in FOLDER.")
+@json_option
+def reproduce(
+    paper: str | None,
+    output: Path | None,
+    seed: int,
+    trials: int | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Repeat the study PAPER; without PAPER, list the studies.
+
+    Every number called computed comes from this run. Statements of the paper that it does not
+    confirm are listed with the reason.
+
+    \b
+    Examples:
+      loopcal reproduce
+      loopcal reproduce hexapod-42
+      loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
+    """  # noqa: D301
+    from loopcal.papers import PAPERS, TRIALS
+    from loopcal.papers import paper as find_paper
+
+    if paper is None:
+        refuse_given(
+            ("output", "seed", "trials", "force"), "without the name of a study, which is repeated"
+        )
+        _list_papers(as_json)
+        return
+    chosen = PAPERS[paper] if paper in PAPERS else find_paper(paper)
+    if output is not None:
+        from loopcal.papers.writing import refuse_study_folder
+
+        refuse_study_folder(output, force)
+    result = chosen.run(seed, TRIALS if trials is None else trials, _print_step)
+    if output is not None:
+        from loopcal.io.runs.run_folder import collect_provenance
+        from loopcal.papers.writing import write_folder
+
+        command = ["loopcal", *sys.argv[1:]]
+        write_folder(output, result, collect_provenance(command, {}, {"seed": seed}), force)
+    if as_json:
+        terminal.print_json(result.to_dict())
+        return
+    last = "Add -o FOLDER for all tables and figures."
+    if output is not None:
+        last = f"Written to {output}: page.md, tables, figures"
+    terminal.print_page([*_view_reproduction(result), "", last])
+
+
+@click.command()
+@robot_argument
+@data_argument("DATA...")
+@click.option("--steps", type=Count("STEPS", 1), default=3, metavar="N", help="Gauss-Newton steps.")
+@file_option("-o", "--output", help="Robot file to write, with the identified values.")
+@force_option("the output file")
+@data_options
+@json_option
+def per_leg(
+    robot: str,
+    data: tuple[Path, ...],
+    steps: int,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Identify the hexapod ROBOT leg by leg from full poses DATA, as the study hexapod-42 does.
+
+    All equations have weight one, and the noise that the legs share is ignored. The result has no
+    uncertainties and larger errors than that of calibrate; this command is for comparisons.
+
+    \b
+    Examples:
+      loopcal per-leg hexapod-42 measurements.csv
+      loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
+    """  # noqa: D301
+    from loopcal.io import load_robot, save_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.papers.hexapod_42.leg_form import identify_per_leg
+
+    refuse_outputs((output,), (find_robot_file(robot), *data), force)
+    machine = load_robot(robot)
+    measurements = leave_out_held_out(
+        read_checked_measurements(data, machine, **take_flags(options))
+    )
+    estimate = identify_per_leg(machine, measurements, steps)
+    if output is not None:
+        save_robot(estimate.robot, output)
+    if as_json:
+        terminal.print_json(estimate.to_dict())
+        return
+    terminal.print_page(_view_legs(estimate, len(measurements.readings), output))
+
+
+def _view_legs(estimate: PerLegEstimate, poses: int, output: Path | None) -> list[Block]:
+    """Return the parameters, the condition numbers of the legs and the last step."""
+    from loopcal.report.tables import Column, Table, word_column
+
+    columns = (word_column("parameter"), *map(Column, ("unit", "nominal", "estimate", "change")))
+    rows = [
+        (row["name"], row["unit"], f"{row['nominal']:.6g}", f"{row['estimate']:.6g}",
+         f"{row['estimate'] - row['nominal']:+.3g}")
+        for row in estimate.to_dict()["parameters"]
+    ]  # fmt: skip
+    conditions = ", ".join(f"{condition:.0f}" for condition in estimate.conditions)
+    steps = len(estimate.estimate_history) - 1
+    name = estimate.robot.name
+    note = "No uncertainties: this method ignores the noise of the instrument."
+    page: list[Block] = [
+        f"{name} identified leg by leg from {poses} full poses: {steps} steps",
+        f"Condition numbers of the legs: {conditions}",
+        Table("Parameters", columns, tuple(rows)),
+        f"{note} For calibrations use loopcal calibrate.",
+    ]
+    return page if output is None else [*page, f"Written to {output}"]
+
+
+def _print_step(text: str) -> None:
+    """Print a step on standard error where it is a terminal."""
+    if sys.stderr.isatty():
+        terminal.print_message(text)
+
+
+def _list_papers(as_json: bool) -> None:
+    """Print the studies."""
+    from loopcal.papers import PAPERS
+
+    if as_json:
+        rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
+        terminal.print_json({"papers": rows})
+        return
+    for paper in PAPERS.values():
+        terminal.print_page([paper.name, f"    {paper.title}", f"    {paper.source}"])
+
+
+def _view_reproduction(result: Reproduction) -> list[Block]:
+    """Return the summary, the tables and the statements of the paper."""
+    page: list[Block] = [f"{result.paper}: {result.title}"]
+    page += [_make_table(table) for table in (result.summary(), *result.tables)]
+    for title, verdicts in result.verdict_groups.items():
+        page += ["", title]
+        for number, verdict in verdicts:
+            word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
+            place = "" if verdict.is_own_check else f" ({verdict.where})"
+            why = f"{verdict.stability} {verdict.why}".strip()
+            page += [f"{number:2}. {word}: {verdict.claim}{place}", f"    {why}"]
+    return page
+
+
+def _make_table(printed: PrintedTable) -> Table:
+    """Return a table of a study; long headings are broken."""
+    from loopcal.report.tables import Column, Table, word_column
+
+    headings = ["\n".join(textwrap.wrap(column, HEADING)) for column in printed.columns]
+    columns = (word_column(headings[0], wraps=True), *(Column(title) for title in headings[1:]))
+    return Table(printed.title, columns, tuple(printed.text()))

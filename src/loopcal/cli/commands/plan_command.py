@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal plan`: which poses to measure, in which order, and a sheet to measure them by."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.hints import hint_for
+from loopcal.cli.options.constraint_options import Goal, constraint_options, make_constraints
+from loopcal.cli.options.instrument_options import (
+    DESCRIPTION,
+    instrument_options,
+    make_instrument,
+    unknown_options,
+)
+from loopcal.cli.options.shared_options import (
+    Count,
+    data_option,
+    file_option,
+    flag_option,
+    force_option,
+    frame_option,
+    is_given,
+    json_option,
+    name_option,
+    read_checked_measurements,
+    robot_argument,
+    seed_option,
+)
+from loopcal.errors import DataError
+
+if TYPE_CHECKING:
+    from loopcal.measure import Instrument, Measurements
+    from loopcal.mechanism import Mechanism
+    from loopcal.planning import Constraints, Plan, PlanOptions, SurfacePlan
+
+PLANE_LINE = "plane-line"
+"""Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
+
+GROUPS, POINTS = 10, 8
+"""Default numbers of planes with a line, and of points on each."""
+
+_COUNTED = "which is counted by --groups and --points"
+_HELD = "where a measuring machine holds x, y or z to --sigma-position"
+_CHOSEN = "which moves points within the workspace and chooses by criterion D"
+EXCLUDED_BY_PLANE_LINE = {
+    **dict.fromkeys(("poses", "accuracy", "curve"), _COUNTED),
+    **dict.fromkeys(("like", "kind", "components", "orientation", "sigma_angle"), _HELD),
+    **dict.fromkeys(("criterion", "candidates", "allowed"), _CHOSEN),
+    "hold_out": "where every point is fitted",
+    "measured": "which plans without earlier measurements",
+    "frames": "whose surfaces are unknown in every group",
+}
+"""Options that have no effect with --measure plane-line, and why."""
+
+
+@click.command()
+@robot_argument
+@file_option("-o", "--output", help="Folder to make.", required=True)
+@click.option(
+    "--poses",
+    type=Count("PLANNED_POSES"),
+    metavar="N",
+    help="Number of poses for the calibration.  [default: 40]",
+)
+@click.option(
+    "--accuracy",
+    type=Goal(),
+    help="Instead of --poses: expected error to reach, such as 20um or 10urad.",
+)
+@click.option(
+    "--criterion",
+    type=click.Choice(("I", "D")),
+    default="I",
+    help="What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
+    "the parameters (D).",
+)
+@click.option(
+    "--hold-out",
+    type=Count("PLANNED_POSES"),
+    metavar="N",
+    help="Number of further poses for validation, drawn evenly.  "
+    "[default: one for four, at least 5]",
+)
+@data_option("--like", "Measurement file whose settings describe the instrument.")
+@unknown_options
+@instrument_options
+@click.option(
+    "--groups",
+    type=Count("GROUPS"),
+    metavar="N",
+    help="With --measure plane-line: number of planes with a line.  [default: 10]",
+)
+@click.option(
+    "--points",
+    type=Count("POINTS"),
+    metavar="N",
+    help="With --measure plane-line: number of points on each.  [default: 8]",
+)
+@file_option(
+    "--allowed", help="Poses to choose from; by default drawn from the workspace.", metavar="CSV"
+)
+@data_option(
+    "--measured", "Measurements that exist already. May be given several times.", multiple=True
+)
+@constraint_options
+@click.option(
+    "--candidates",
+    type=Count("CANDIDATES", 10),
+    default=1000,
+    metavar="N",
+    help="Number of candidate poses to draw.",
+)
+@flag_option("--curve", help="Also compute the expected errors by the number of poses.")
+@frame_option("fitted, base, or relative (to home)")
+@seed_option("all random choices")
+@force_option("the plan")
+@json_option
+def plan(
+    robot: str,
+    output: Path,
+    like: Path | None,
+    allowed: Path | None,
+    measured: tuple[Path, ...],
+    groups: int | None,
+    points: int | None,
+    seed: int,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the
+    measurement and a data file to fill in.
+
+    The instrument is described by --measure (or --kind, --components, --orientation), --frames and
+    the sigmas, or by a measurement file with --like. Strokes, joint limits and cones of ROBOT are
+    always respected, also on the path between poses.
+
+    \b
+    Examples:
+      loopcal plan hexapod-42 -o plan --poses 30 --sigma-position 5um --sigma-angle 10urad
+      loopcal plan hexapod-42 -o plan --accuracy 20um --kind position
+      loopcal plan 3-prs -o plan --measure x,y,z,phi,theta --max-tilt 20deg --curve
+      loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
+      loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
+      loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
+    """  # noqa: D301
+    from loopcal.io import load_robot
+    from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
+
+    inputs = _list_inputs(robot, like, allowed, measured)
+    refuse_plan_folder(output, force, list(inputs.values()))
+    machine = load_robot(robot)
+    if options["measure"] == PLANE_LINE:
+        _refuse_beside_plane_line()
+        result = _plan_surfaces(
+            machine, groups, points, options["sigma_position"], make_constraints(options), seed
+        )
+        document = result.to_dict()
+    else:
+        if groups is not None or points is not None:
+            raise DataError("--groups and --points belong to --measure plane-line; leave them out")
+        instrument = _find_instrument(machine, like, options)
+        plan_options = _make_plan_options(machine, allowed, measured, seed, options)
+        from loopcal.planning import plan as plan_poses
+
+        with terminal.ProgressBar() as progress:
+            result = plan_poses(machine, instrument, options=plan_options, progress=progress)
+        document = {"format": FORMAT, **result.to_dict()}
+    files = _write_plan(output, result, inputs, seed, force)
+    if as_json:
+        terminal.print_json(document)
+        return
+    data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
+    terminal.print_page(
+        [
+            str(result),
+            *(f"Hint: {hint}" for finding in result.findings if (hint := hint_for(finding))),
+            "",
+            f"Written to {output}: {files}",
+            f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
+        ]
+    )
+
+
+def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
+    """Return the instrument that the options, or the settings of a file, describe."""
+    from loopcal.io.data.measurement_file import load_instrument_to_plan
+
+    if like is None:
+        return make_instrument(options)
+    for name in DESCRIPTION:
+        if is_given(name):
+            raise DataError(
+                f"--like {like} describes the instrument; leave out {name_option(name)}, or --like"
+            )
+    return load_instrument_to_plan(like, robot)
+
+
+def _make_plan_options(
+    robot: Mechanism,
+    allowed: Path | None,
+    measured: tuple[Path, ...],
+    seed: int,
+    options: Mapping[str, Any],
+) -> PlanOptions:
+    """Return the options of the library."""
+    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.planning import PlanOptions
+
+    accuracy = options["accuracy"]
+    if accuracy is not None and options["poses"] is not None:
+        raise DataError(
+            "--poses and --accuracy exclude each other; give the number of poses, or the error to "
+            "reach"
+        )
+    if accuracy is not None and options["curve"]:
+        raise DataError("--accuracy shows its own curve; leave out --curve")
+    goal, target = (None, "pose") if accuracy is None else accuracy
+    earlier, names = _read_earlier(measured, robot) if measured else (None, ())
+    return PlanOptions(
+        n_poses=options["poses"],
+        criterion=options["criterion"],
+        target=target,
+        goal=goal,
+        hold_out=options["hold_out"],
+        frame=options["frame"],
+        constraints=make_constraints(options),
+        allowed_poses=None if allowed is None else load_poses(allowed, robot),
+        n_candidates=options["candidates"],
+        measured=earlier,
+        used_names=names,
+        curve=options["curve"],
+        seed=seed,
+    )
+
+
+def _read_earlier(
+    measured: Sequence[Path], robot: Mechanism
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Return the fitted poses of earlier files, and the names of all their poses."""
+    data = read_checked_measurements(measured, robot)
+    files = " ".join(map(str, measured))
+    if not data.n_rows:
+        raise DataError(
+            f"--measured {files} contains no measured value; fill it in, or leave it out"
+        )
+    if data.is_held_out.all():
+        raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
+    return data.fitted, data.labels
+
+
+def _list_inputs(
+    robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]
+) -> dict[str, Path]:
+    """Return role -> file of everything that is read."""
+    from loopcal.io.robot.robot_file import find_robot_file
+
+    files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
+    files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
+    return {role: path for role, path in files.items() if path is not None}
+
+
+def _write_plan(
+    output: Path, result: Plan | SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
+) -> str:
+    """Write the folder of a plan; return its files in words."""
+    from loopcal.io.runs.plan_folder import (
+        DATA,
+        SHEET,
+        check_written_plan,
+        format_plan_data,
+        format_sheet,
+        format_surface_data,
+        format_surface_sheet,
+        write_plan_folder,
+    )
+    from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.planning import Plan
+    from loopcal.planning.result import list_stops
+    from loopcal.report.figures import draw_curve, draw_plan
+    from loopcal.report.pictures import check_picture, render_figure
+
+    figures = {}
+    if isinstance(result, Plan):
+        texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}
+        figures["plan.png"] = draw_plan(result)
+        if result.curve is not None:
+            figures["curve.png"] = draw_curve(result.robot, result.curve)
+    else:
+        texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
+    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
+    pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
+
+    def read_back(folder: Path) -> None:
+        check_written_plan(folder, result)
+        for name in pictures:
+            check_picture(folder / name)
+
+    write_plan_folder(output, texts, document, pictures, read_back, force)
+    files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
+    return f"{files}, pictures" if pictures else files
+
+
+def _refuse_beside_plane_line() -> None:
+    """Raise DataError for the first option that has no effect with --measure plane-line."""
+    for name, reason in EXCLUDED_BY_PLANE_LINE.items():
+        if is_given(name):
+            raise DataError(
+                f"{name_option(name)} cannot be combined with --measure plane-line, {reason}; "
+                "leave it out"
+            )
+
+
+def _plan_surfaces(
+    robot: Mechanism,
+    groups: int | None,
+    points: int | None,
+    sigma: float,
+    constraints: Constraints,
+    seed: int,
+) -> SurfacePlan:
+    """Plan groups of points on planes and lines."""
+    from loopcal.planning import SurfaceOptions, plan_surfaces
+
+    options = SurfaceOptions(
+        GROUPS if groups is None else groups,
+        POINTS if points is None else points,
+        sigma,
+        constraints,
+        seed,
+    )
+    with terminal.ProgressBar() as progress:
+        return plan_surfaces(robot, options, progress)

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal bootstrap`, `loopcal sample`, `loopcal region`: uncertainty beyond linear intervals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.options.fit_options import fit_options
+from loopcal.cli.options.fit_source import load_fit
+from loopcal.cli.options.shared_options import (
+    Count,
+    add_options,
+    data_argument,
+    data_options,
+    file_option,
+    force_option,
+    json_option,
+    seed_option,
+)
+
+if TYPE_CHECKING:
+    from loopcal.report.text_page import Block
+    from loopcal.sampling.block_bootstrap import Bootstrap
+    from loopcal.sampling.intervals import Intervals
+    from loopcal.sampling.posterior_sample import PosteriorSample
+    from loopcal.typing import FloatArray
+
+MOST_DIGITS = 10
+"""Digits of a number of poses; a longer text is no unit of resampling."""
+
+level_option = click.option(
+    "--level",
+    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    default=0.95,
+    metavar="SHARE",
+    help="Coverage of the intervals.",
+)
+
+source_options = add_options(
+    click.argument("source", metavar="RUN|ROBOT"), data_argument("[DATA...]", required=False)
+)
+"""Decorator of a command that takes a run folder, or a robot and its measurements."""
+
+draw_options = add_options(
+    level_option,
+    seed_option("the random draws"),
+    file_option("-o", "--output", help="CSV file for the draws, one row each.", metavar="CSV"),
+    force_option("the output file"),
+)
+"""Decorator of a command that draws."""
+
+
+@click.command()
+@source_options
+@click.option(
+    "--count", type=Count("RESAMPLES", 2), default=1000, metavar="N", help="Number of resamples."
+)
+@click.option(
+    "--scheme",
+    type=click.Choice(("wild", "pairs", "normal")),
+    default="wild",
+    help="wild: errors of each block times a random factor. pairs: blocks drawn with replacement. "
+    "normal: normal errors of the stated sigma.",
+)
+@click.option(
+    "--unit",
+    metavar="UNIT",
+    help="What is resampled together: pose, block, session, day, or a number of consecutive "
+    "poses.  [default: the largest unit with at least 12 blocks]",
+)
+@click.option(
+    "--interval",
+    "kind",
+    type=click.Choice(("widened", "percentile", "bias-corrected", "studentized")),
+    default="widened",
+    help="How intervals are read from the resamples.",
+)
+@draw_options
+@fit_options
+@data_options
+@json_option
+def bootstrap(
+    source: str,
+    data: tuple[Path, ...],
+    count: int,
+    scheme: Literal["wild", "pairs", "normal"],
+    unit: str | None,
+    kind: Literal["widened", "percentile", "bias-corrected", "studentized"],
+    level: float,
+    seed: int,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Resample a calibration by blocks of poses, fit every resample, and compare the scatter with
+    the stated intervals.
+
+    RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
+    options of the fit.
+
+    \b
+    Examples:
+      loopcal bootstrap run
+      loopcal bootstrap run --unit session --count 2000 -o draws.csv
+      loopcal bootstrap hexapod-42 measurements.csv --method ls
+    """  # noqa: D301
+    from loopcal.report.sampling_view import view_bootstrap
+    from loopcal.sampling import bootstrap as resample
+
+    _refuse_output(output, source, data, force)
+    fit, measurements = load_fit(source, data, options)
+    is_number = unit is not None and unit.isdecimal() and len(unit) < MOST_DIGITS
+    chosen = int(unit) if unit is not None and is_number else unit
+    with terminal.ProgressBar() as progress:
+        result = resample(
+            fit, measurements, count, scheme=scheme, unit=chosen, seed=seed, progress=progress
+        )
+    intervals = result.intervals(level, kind)
+    page = view_bootstrap(result, intervals)
+    _finish(result, intervals, page, output, as_json)
+
+
+@click.command()
+@source_options
+@click.option(
+    "--count", type=Count("DRAWS", 100), default=4000, metavar="N", help="Number of draws."
+)
+@draw_options
+@fit_options
+@data_options
+@json_option
+def sample(
+    source: str,
+    data: tuple[Path, ...],
+    count: int,
+    level: float,
+    seed: int,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Draw parameters from the exact posterior of a calibration, and compare its intervals with the
+    linear ones.
+
+    RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
+    options of the fit.
+
+    \b
+    Examples:
+      loopcal sample run
+      loopcal sample run --count 20000 -o draws.csv
+      loopcal sample linear-delta measurements.csv --method map
+    """  # noqa: D301
+    from loopcal.report.sampling_view import view_posterior
+    from loopcal.sampling import sample_posterior
+
+    _refuse_output(output, source, data, force)
+    fit, measurements = load_fit(source, data, options)
+    with terminal.ProgressBar() as progress:
+        result = sample_posterior(fit, measurements, count, seed=seed, progress=progress)
+    intervals = result.intervals(level)
+    page = view_posterior(result, intervals)
+    _finish(result, intervals, page, output, as_json, result.weight)
+
+
+@click.command()
+@source_options
+@click.option(
+    "-p",
+    "--parameter",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="Parameter, or a pattern such as 'leg1.*'. May be given several times.  [default: all]",
+)
+@click.option(
+    "--rule",
+    type=click.Choice(("maximum", "sidak", "bonferroni", "scheffe")),
+    default="maximum",
+    help="How intervals are made that hold together; maximum gives the narrowest.",
+)
+@level_option
+@fit_options
+@data_options
+@json_option
+def region(
+    source: str,
+    data: tuple[Path, ...],
+    names: tuple[str, ...],
+    rule: Literal["maximum", "sidak", "bonferroni", "scheffe"],
+    level: float,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Show intervals that hold for all selected parameters at once, and their joint region.
+
+    RUN is a run folder. Or give a ROBOT and DATA, and the options of the fit.
+
+    \b
+    Examples:
+      loopcal region run
+      loopcal region run -p radius -p 'tower*.angle'
+      loopcal region run -p 'leg1.*' --rule scheffe --json
+    """  # noqa: D301
+    from loopcal.cli.options.shared_options import refuse_given
+    from loopcal.io.runs.run_folder import load_run
+    from loopcal.report.sampling_view import view_region
+    from loopcal.sampling import compute_joint_region, compute_simultaneous_intervals
+
+    if data:
+        posterior = load_fit(source, data, options)[0].posterior
+    else:
+        refuse_given(options, "with a run folder")
+        posterior = load_run(source).load_posterior()
+    chosen = names or None
+    intervals = compute_simultaneous_intervals(posterior, chosen, level, rule)
+    joint = compute_joint_region(posterior, chosen, level) if names else None
+    if as_json:
+        region_content = None if joint is None else joint.to_dict()
+        terminal.print_json({"intervals": intervals.to_dict(), "region": region_content})
+        return
+    terminal.print_page(view_region(joint, intervals, posterior.robot))
+
+
+def _refuse_output(output: Path | None, source: str, data: tuple[Path, ...], force: bool) -> None:
+    """Refuse an output file that exists, or that is an input."""
+    from loopcal.io.core.outputs import refuse_outputs
+
+    refuse_outputs((output,), (Path(source), *data), force)
+
+
+def _finish(
+    result: Bootstrap | PosteriorSample,
+    intervals: Intervals,
+    page: list[Block],
+    output: Path | None,
+    as_json: bool,
+    weight: FloatArray | None = None,
+) -> None:
+    """Write the draws, where a file is named, and print the page or JSON."""
+    from loopcal.io.runs.draws_file import save_draws
+
+    if output is not None:
+        factors, units = result.fit.free_parameters.display()
+        save_draws(output, result.fit.names, units, factors, result.draws, weight)
+        page = [*page, "", f"Written to {output}"]
+    if as_json:
+        terminal.print_json({**result.to_dict(), "intervals": intervals.to_dict()})
+    else:
+        terminal.print_page(page)

@@ -1,0 +1,363 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal study`: many simulated calibrations, described by a file."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.command_group import CommandGroup
+from loopcal.cli.options.shared_options import (
+    FILE,
+    Count,
+    file_option,
+    flag_option,
+    force_option,
+    json_option,
+)
+from loopcal.cli.options.study_options import (
+    choose_work,
+    count_processors,
+    round_duration,
+    run_and_report,
+    worker_options,
+)
+
+study_argument = click.argument("study_file", metavar="STUDY", type=FILE)
+folder_argument = click.argument("folder", metavar="FOLDER", type=FILE)
+quick_option = flag_option("--quick", help="Use the quick tier of STUDY, which takes seconds.")
+
+
+@click.group(cls=CommandGroup)
+def study() -> None:
+    """Simulate thousands of calibrations to answer questions before anything is measured: which
+    instrument, how many poses, which method.
+
+    \b
+    From a question to its answer:
+      loopcal study new study.yaml
+      loopcal study check study.yaml
+      loopcal study run study.yaml -o results
+      loopcal study summary results
+    """  # noqa: D301
+
+
+@study.command()
+@click.argument("study_file", metavar="STUDY", type=FILE)
+@click.option("--robot", default="linear-delta", metavar="ROBOT", help="A robot, or its file.")
+@force_option("STUDY")
+@json_option
+def new(study_file: Path, robot: str, force: bool, as_json: bool) -> None:
+    """Write a study file to fill in, with a comment for each setting.
+
+    \b
+    Examples:
+      loopcal study new study.yaml
+      loopcal study new study.yaml --robot hexapod-42
+    """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.studies.files.template import write_template
+
+    refuse_outputs((study_file,), (), force)
+    write_template(study_file, robot)
+    if as_json:
+        terminal.print_json({"written": str(study_file), "robot": robot})
+        return
+    terminal.print_page([f"Written: {study_file}", f"Next: loopcal study check {study_file}"])
+
+
+@study.command()
+@study_argument
+@quick_option
+@json_option
+def check(study_file: Path, quick: bool, as_json: bool) -> None:
+    """Read STUDY, show its cells, and estimate the time that it takes from one block of each robot.
+
+    \b
+    Examples:
+      loopcal study check study.yaml
+      loopcal study check study.yaml --quick
+    """  # noqa: D301
+    from loopcal.studies.running import read_source
+    from loopcal.studies.time_estimate import estimate_time, view_estimate
+
+    chosen = read_source(study_file, quick).study
+    with terminal.ProgressBar() as progress:
+        estimate = estimate_time(chosen, count_processors(), progress)
+    if as_json:
+        terminal.print_json(estimate)
+        return
+    page = view_estimate(chosen, estimate, round_duration)
+    terminal.print_page([*page, f"Next: loopcal study run {study_file} -o FOLDER"])
+
+
+@study.command()
+@study_argument
+@file_option("-o", "--output", "folder", required=True, metavar="FOLDER", help="Folder to make.")
+@worker_options
+@flag_option(
+    "--resume",
+    help="Continue FOLDER where it exists. STUDY may have more replicates or levels than before.",
+)
+@quick_option
+@json_option
+def run(
+    study_file: Path, folder: Path, resume: bool, quick: bool, as_json: bool, **options: Any
+) -> int:
+    """Compute STUDY, and store its trials in FOLDER.
+
+    Every block of trials is stored when it is finished. A study that is stopped, by Ctrl-C or in
+    any other way, loses only the blocks in work; --resume continues it.
+
+    \b
+    Examples:
+      loopcal study run study.yaml -o results
+      loopcal study run study.yaml -o results --resume --workers 4
+      loopcal study run study.yaml -o results --dask tcp://scheduler:8786
+      loopcal study run study.yaml -o part-3 --cells 3/10
+    """  # noqa: D301
+    from loopcal.studies.files.study_folder import open_study
+    from loopcal.studies.running import read_source
+
+    source, work = read_source(study_file, quick), choose_work(**options)
+    with open_study(folder, source, resume) as store:
+        return run_and_report(source.study, store, folder, work, as_json)
+
+
+@study.command()
+@folder_argument
+@click.option(
+    "--replicates",
+    type=Count("REPLICATES", 1),
+    required=True,
+    metavar="N",
+    help="Trials of a cell.",
+)
+@worker_options
+@json_option
+def extend(folder: Path, replicates: int, as_json: bool, **options: Any) -> int:
+    """Compute further trials of each cell of a study, until there are N; finished ones are kept.
+
+    \b
+    Examples:
+      loopcal study extend results --replicates 5000
+    """  # noqa: D301
+    from loopcal.studies.files.study_folder import extend_study, load_specification
+
+    work = choose_work(**options)
+    with extend_study(folder, replicates) as store:
+        return run_and_report(load_specification(store), store, folder, work, as_json)
+
+
+@study.command()
+@folder_argument
+@json_option
+def status(folder: Path, as_json: bool) -> None:
+    """Show how much of a study is stored, also while it runs.
+
+    \b
+    Examples:
+      loopcal study status results
+    """  # noqa: D301
+    from loopcal.studies.results.status import read_status, view_status
+
+    state = read_status(folder)
+    if as_json:
+        terminal.print_json(state)
+    else:
+        terminal.print_page(view_status(state, round_duration))
+
+
+@study.command()
+@folder_argument
+@click.option(
+    "--score", "scores", multiple=True, metavar="NAME", help="Score to show; may be repeated."
+)
+@click.option(
+    "--against", metavar="FACTOR", help="Factor along the axis of figures, such as poses."
+)
+@json_option
+def summary(folder: Path, scores: tuple[str, ...], against: str | None, as_json: bool) -> None:
+    """Show medians and coverage of each cell, with intervals, the failed trials by reason, and the
+    answers to the questions of the study file.
+
+    It also writes summary.json and summary.csv, with all scores, and a figure of each shown score
+    into FOLDER.
+
+    \b
+    Examples:
+      loopcal study summary results
+      loopcal study summary results --score position_max --score condition
+      loopcal study summary results --score position --against instrument
+    """  # noqa: D301
+    from loopcal.studies.results.question_view import view_answers
+    from loopcal.studies.results.study_result import StudyResult
+    from loopcal.studies.results.summary_drawing import render_figures
+    from loopcal.studies.results.summary_view import (
+        build_document,
+        list_shown,
+        view_summary,
+        write_summary,
+    )
+
+    result = StudyResult(folder)
+    with terminal.ProgressBar() as progress:
+        progress(0, 1, "summarizing trials")
+        summarized, answered = result.summarize(), result.answer_questions()
+        shown = list_shown(result.study, summarized, scores)
+        page = view_summary(result.study, summarized, shown)
+        figures = render_figures(result.study, summarized, shown, against)
+        write_summary(folder, result.study, summarized, answered, figures)
+    if as_json:
+        terminal.print_json(build_document(summarized, answered))
+        return
+    written = ", ".join(("summary.json", "summary.csv", *figures))
+    terminal.print_page([*page, "", *view_answers(answered), f"Written to {folder}: {written}"])
+
+
+@study.command()
+@folder_argument
+@click.option("--smallest", metavar="FACTOR", help="Ask for its smallest level, such as poses.")
+@click.option("--largest", metavar="FACTOR", help="Ask for its largest level, such as noise.")
+@click.option(
+    "--score", default="position", metavar="NAME", help="Score that stays within the limit."
+)
+@click.option(
+    "--limit", required=True, metavar="LIMIT", help="Of the score, with its unit, such as 10um."
+)
+@click.option(
+    "--share",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.95,
+    metavar="SHARE",
+    help="Share of the machines that stay within the limit.",
+)
+@json_option
+def ask(
+    folder: Path,
+    smallest: str | None,
+    largest: str | None,
+    score: str,
+    limit: str,
+    share: float,
+    as_json: bool,
+) -> None:
+    """Find the smallest or largest level of a factor that reaches a limit on a share of machines.
+
+    The answer says which levels reach it for certain, and which may. Run more replicates where it
+    is not certain, see loopcal study extend.
+
+    \b
+    Examples:
+      loopcal study ask results --smallest poses --limit 10um
+      loopcal study ask results --largest noise --score position_max --limit 0.05mm --share 0.9
+    """  # noqa: D301
+    from loopcal.studies.results.question_view import view_answers
+    from loopcal.studies.results.study_result import StudyResult
+
+    if (smallest is None) == (largest is None):
+        raise click.UsageError("give --smallest FACTOR or --largest FACTOR, one of them")
+    result = StudyResult(folder)
+    answered = (
+        result.find_smallest(smallest, score, limit, share)
+        if smallest is not None
+        else result.find_largest(largest or "", score, limit, share)
+    )
+    if as_json:
+        terminal.print_json(answered)
+    else:
+        terminal.print_page(view_answers([answered]))
+
+
+@study.command()
+@folder_argument
+@file_option("-o", "--output", required=True, metavar="FILE", help="Table: .csv or .parquet.")
+@force_option("FILE")
+@json_option
+def export(folder: Path, output: Path, force: bool, as_json: bool) -> None:
+    """Write all trials of a study as one table, with all factors as columns and numbers in SI.
+
+    \b
+    Examples:
+      loopcal study export results -o trials.csv
+      loopcal study export results -o trials.parquet
+    """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.studies.files.store import read_store
+    from loopcal.studies.files.study_folder import load_specification
+    from loopcal.studies.results.export import export_trials
+
+    refuse_outputs((output,), (), force)
+    with read_store(folder) as store, terminal.ProgressBar() as progress:
+        count = export_trials(load_specification(store), store, output, progress)
+    if as_json:
+        terminal.print_json({"written": str(output), "trials": count})
+    else:
+        terminal.print_page([f"Written: {output} ({count} trials)"])
+
+
+@study.command()
+@click.argument("parts", metavar="PART...", nargs=-1, required=True, type=FILE)
+@file_option("-o", "--output", required=True, metavar="FOLDER", help="Folder to make or to add to.")
+@json_option
+def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
+    """Join folders of jobs that each computed a share of one study (see run --cells).
+
+    \b
+    Examples:
+      loopcal study merge part-1 part-2 part-3 -o results
+    """  # noqa: D301
+    from loopcal.studies.files.merging import merge_studies
+    from loopcal.studies.results.status import read_status, view_status
+
+    with terminal.ProgressBar() as progress:
+        count = merge_studies(parts, output, progress)
+    state = read_status(output)
+    if as_json:
+        terminal.print_json({"new_blocks": count, "status": state})
+        return
+    page = view_status(state, round_duration)
+    terminal.print_page([f"Written to {output}: {count} new blocks", *page])
+
+
+@study.command()
+@folder_argument
+@click.argument("trial", metavar="CELL/TRIAL")
+@file_option("-o", "--output", required=True, metavar="RUN", help="Run folder to make.")
+@force_option("RUN")
+@json_option
+def replay(folder: Path, trial: str, output: Path, force: bool, as_json: bool) -> int:
+    """Repeat one trial of a study as a normal calibration, with all its checks and a run folder.
+
+    Cells and trials count from 0; status lists the cells. A second folder beside the run folder,
+    RUN-input, gets the robot file, the measurements and the true machine.
+
+    \b
+    Examples:
+      loopcal study replay results 3/17 -o trial
+    """  # noqa: D301
+    from loopcal.studies.replay_run import calibrate_trial
+
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", trial)
+    if match is None:
+        raise click.BadParameter(f"{trial!r} is not CELL/TRIAL, such as 3/17")
+    from loopcal.cli.hints import hint_for
+    from loopcal.report.calibration_view import view_calibration
+
+    with terminal.ProgressBar() as progress:
+        done = calibrate_trial(
+            folder, int(match[1]), int(match[2]), output, sys.argv, force, progress
+        )
+    if as_json:
+        terminal.print_json(done.document)
+    else:
+        if done.finding is not None:
+            terminal.print_note(str(done.finding))
+        page = view_calibration(done.report, False, hint_for)
+        terminal.print_page([*page, "", f"Written to {output}, and its inputs to {done.inputs}"])
+    return done.report.exit_code

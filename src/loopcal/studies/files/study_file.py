@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read study files: YAML in which each number states its unit; errors name the line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from loopcal.errors import LoopcalError
+from loopcal.io.core import limits
+from loopcal.io.core.records import read_record
+from loopcal.io.core.references import find_file_beside
+from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
+from loopcal.io.data.measurement_file import load_poses
+from loopcal.io.robot.robot_file import check_format, find_robot_file, get_source, load_robot
+from loopcal.mechanism import Mechanism
+from loopcal.studies.simulation.instruments import make_instrument
+from loopcal.studies.simulation.machines import resolve_patterns
+from loopcal.studies.simulation.methods import make_fit_options
+from loopcal.studies.specification.levels import (
+    FACTORS,
+    EffectsLevel,
+    ErrorsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    NoiseLevel,
+    PosesLevel,
+    Question,
+    Robot,
+    Scores,
+)
+from loopcal.studies.specification.scores import check_question
+from loopcal.studies.specification.study import BLOCK, REPLICATES, Study
+
+T = TypeVar("T")
+
+WHAT, FORMAT = "study file", 1
+
+LEVELS: Mapping[str, type] = {
+    "instruments": InstrumentLevel,
+    "noise": NoiseLevel,
+    "poses": PosesLevel,
+    "errors": ErrorsLevel,
+    "methods": MethodLevel,
+    "effects": EffectsLevel,
+}
+"""Factor -> record of its levels."""
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """The settings of a study file beside its factors.
+
+    Parameters
+    ----------
+    title : what the study is about. seed : of all random numbers, 0 or more.
+    replicates : trials of each cell. block : trials of a block, the unit of work; at most 2000, as
+        a block of a hexapod needs about half a megabyte of memory for each trial.
+    scores : what is computed of every trial. questions : name -> what the summary answers.
+    """
+
+    title: str
+    seed: int = 1
+    replicates: int = REPLICATES
+    block: int = BLOCK
+    scores: Scores = field(default_factory=Scores)
+    questions: dict[str, Question] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key, lowest, highest in (
+            ("seed", 0, 2**63),
+            ("replicates", 1, limits.REPLICATES.most),
+            ("block", 1, MOST_TRIALS),
+        ):
+            value = getattr(self, key)
+            if not lowest <= value <= highest:
+                raise ValueError(f"{key} is {value}; it must be from {lowest} to {highest}")
+
+
+MOST_TRIALS = 2000
+"""Largest number of trials of a block."""
+
+SETTINGS = ("title", "seed", "replicates", "block", "scores", "questions")
+QUICK = "quick"
+
+
+@dataclass(frozen=True)
+class StudyContent:
+    """The content of a study file, and where each of its keys was read.
+
+    Attributes
+    ----------
+    file : for lines. values : key -> content. places : key -> its location in the file, which for
+        replacements of the quick tier is below `quick`.
+    """
+
+    file: YamlFile
+    values: Mapping[str, Any]
+    places: Mapping[str, Location]
+
+
+def load_study(path: str | Path, quick: bool = False) -> Study:
+    """Read a study file.
+
+    Parameters
+    ----------
+    path : the file; its robots are shipped ones, or files beside it.
+    quick : make the replacements that the file states under `quick:`; where it states none, each
+        cell has one block.
+
+    Raises
+    ------
+    FileError : what does not fit, at its line.
+    """
+    file = read_yaml(path, WHAT)
+    check_format(file, FORMAT)
+    refuse_unknown_keys(file, list(file.content), ["format", *SETTINGS, *FACTORS, QUICK])
+    full = {key: value for key, value in file.content.items() if key not in ("format", QUICK)}
+    whole = StudyContent(file, full, {key: (key,) for key in full})
+    study, short = build_study(whole), build_study(_apply_quick_tier(whole))
+    return short if quick else study
+
+
+def _apply_quick_tier(content: StudyContent) -> StudyContent:
+    """Return the content of a study file with the replacements of its quick tier."""
+    file, stated = content.file, content.file.content.get(QUICK)
+    if stated is None:
+        block = content.values.get("block", BLOCK)
+        return StudyContent(file, {**content.values, "replicates": block}, content.places)
+    if not isinstance(stated, dict):
+        raise file.error(
+            "'quick' must state the settings that it replaces; write for example "
+            "'quick: {replicates: 50}'",
+            (QUICK,),
+        )
+    allowed = [key for key in SETTINGS if key != "title"]
+    refuse_unknown_keys(file, list(stated), [*allowed, *FACTORS], (QUICK,))
+    places = {key: (QUICK, key) for key in stated}
+    return StudyContent(file, {**content.values, **stated}, {**content.places, **places})
+
+
+def build_study(content: StudyContent) -> Study:
+    """Return the study of the content of a file; raise as `load_study`."""
+    file, values, places = content.file, content.values, content.places
+    parts = {key: value for key, value in values.items() if key in SETTINGS}
+    location = places["replicates"][:-1] if "replicates" in places else ()
+    settings = read_record(file, parts, StudySettings, None, location)
+    robots = read_robots(content)
+    factors: dict[str, Any] = {
+        key: read_levels(content, key, LEVELS[key]) for key in LEVELS if key in values
+    }
+    study = Study(
+        title=settings.title,
+        robots={name: robot for name, (robot, _) in robots.items()},
+        seed=settings.seed,
+        replicates=settings.replicates,
+        block=settings.block,
+        order=tuple(FACTORS[key] for key in values if key in FACTORS),
+        scores=settings.scores,
+        questions=settings.questions,
+        **factors,
+    )
+    study = replace(study, poses=_load_pose_files(study, robots, content))
+    check_levels(study, {name: robot for name, (_, robot) in robots.items()}, content)
+    return study
+
+
+def _load_pose_files(
+    study: Study, robots: Mapping[str, tuple[Robot, Mechanism]], content: StudyContent
+) -> dict[str, PosesLevel]:
+    """Return the levels of poses, those of files with the poses of these files."""
+    file, levels = content.file, dict(study.poses)
+    for name, value, place in _list_items(content, "poses") if "poses" in content.values else ():
+        stated = value if isinstance(value, dict) else {}
+        if "coordinates" in stated:
+            at = (*place, "coordinates")
+            raise file.error("poses are given by a file; write 'file: poses.csv'", at)
+        if "file" not in stated:
+            continue
+        at = (*place, "file")
+        if len(stated) > 1:
+            raise file.error("a file of poses needs no other setting; remove the others", at)
+        path = find_file_beside(file, stated["file"], at)
+        if path is None:
+            raise file.error(f"there is no file {stated['file']!r} beside the study file", at)
+        try:
+            read = [load_poses(path, robot).tolist() for _, robot in robots.values()]
+        except LoopcalError as error:
+            raise file.error(f"the poses cannot be read: {error}", at) from None
+        if any(poses != read[0] for poses in read):
+            raise file.error("the robots of this study read other poses from this file", at)
+        coordinates = tuple(tuple(pose) for pose in read[0])
+        levels[name] = replace(levels[name], count=len(coordinates), coordinates=coordinates)
+    return levels
+
+
+def read_levels(content: StudyContent, key: str, record: type[T]) -> dict[str, T]:
+    """Return name -> level of a factor: a mapping of records, or a list of plain values."""
+    plain, levels = getattr(record, "PLAIN", None), {}
+    for name, value, place in _list_items(content, key):
+        if isinstance(value, dict):
+            levels[name] = read_record(content.file, value, record, None, place)
+        elif plain is None:
+            raise content.file.error(
+                f"the level {name!r} of {key!r} must state its settings; write "
+                "'name: {setting: value}' lines",
+                place,
+            )
+        else:
+            levels[name] = read_record(content.file, {plain: value}, record, None, place)
+    return levels
+
+
+def read_robots(content: StudyContent) -> dict[str, tuple[Robot, Mechanism]]:
+    """Return name -> robot of the key `robots`: shipped names, or files beside the study file."""
+    file = content.file
+    if "robots" not in content.values:
+        raise file.error("this study names no robot; add for example 'robots: [hexapod-42]'")
+    robots = {}
+    for name, value, place in _list_items(content, "robots"):
+        if not isinstance(value, str):
+            raise file.error(f"the robot {name!r} must be a name or a file", place)
+        try:
+            path = find_file_beside(file, value, place) or find_robot_file(value)
+            robot = load_robot(path)
+        except LoopcalError as error:
+            raise file.error(f"the robot {name!r} cannot be read: {error}", place) from None
+        robots[name] = (Robot(value, get_source(robot).file.text), robot)
+    return robots
+
+
+def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Location]]:
+    """Yield name, content and location of the levels of a factor; a plain value is its own name."""
+    file, node, place = content.file, content.values[key], content.places[key]
+    if isinstance(node, dict):
+        items = [(name, value, (*place, name)) for name, value in node.items()]
+    else:
+        nodes = node if isinstance(node, list) else [node]
+        places = [(*place, i) for i in range(len(nodes))] if isinstance(node, list) else [place]
+        items = [(_name(file, v, p), v, p) for v, p in zip(nodes, places, strict=True)]
+    if not items:
+        raise file.error(f"{key!r} has no level; give at least one", place)
+    names = set()
+    for name, value, at in items:
+        if name in names:
+            raise file.error(f"two levels of {key!r} are named {name!r}; remove one", at)
+        names.add(name)
+        yield name, value, at
+
+
+def _name(file: YamlFile, value: Any, place: Location) -> str:
+    """Return the name of a level that is a plain value."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise file.error(
+            "a level without a name must be a number or a word; write 'name: {setting: value}'",
+            place,
+        )
+    return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
+
+
+def check_levels(study: Study, robots: Mapping[str, Mechanism], content: StudyContent) -> None:
+    """Refuse levels that no block could be computed with, at their lines."""
+    for key, check in (
+        ("instruments", lambda level: make_instrument(level, NoiseLevel())),
+        ("methods", make_fit_options),
+        ("errors", lambda level: _check_errors(level, robots)),
+        ("questions", lambda question: check_question(study, question)),
+    ):
+        for i, (name, level) in enumerate(getattr(study, key).items()):
+            place = content.places.get(key, ())
+            node = content.values.get(key)
+            step = (name,) if isinstance(node, dict) else (i,) if isinstance(node, list) else ()
+            try:
+                check(level)
+            except LoopcalError as error:
+                raise content.file.error(f"{name!r} of {key!r}: {error}", (*place, *step)) from None
+
+
+def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:
+    """Raise DataError where a robot has no parameter of a name, or one of another dimension."""
+    for robot in robots.values():
+        resolve_patterns(robot.parameters, level.tolerances)
+        resolve_patterns(robot.parameters, level.deviations)

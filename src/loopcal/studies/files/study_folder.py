@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a study: the study file as written, its robot files, and the store.
+
+A new folder takes its name when it is complete, so a driver that is killed leaves no half of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from collections.abc import Set as AbstractSet
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import loopcal
+from loopcal.errors import FileError
+from loopcal.findings import report_finding
+from loopcal.io.core.limits import YAML_SIZE
+from loopcal.io.core.outputs import replace_folder, resolve_folder
+from loopcal.io.core.replacement import remove_leftovers
+from loopcal.io.core.text_file import read_bytes
+from loopcal.studies.files.store import (
+    NAME,
+    StoreHeader,
+    StudyStore,
+    make_store,
+    open_store,
+    read_store,
+    refuse_network,
+)
+from loopcal.studies.specification.changes import list_conflicts
+from loopcal.studies.specification.keys import NUMERICS
+from loopcal.studies.specification.study import Study
+
+STUDY_FILE = "study.yaml"
+"""Name of the study file in the folder."""
+
+PROGRAM, NUMERICS_PART = "loopcal", "numerics"
+"""What has a version in a store."""
+
+
+@dataclass(frozen=True)
+class StudySource:
+    """A study, and the file that describes it (None where it was made in Python)."""
+
+    study: Study
+    file: Path | None = None
+
+
+@contextmanager
+def open_study(folder: Path, source: StudySource, resume: bool = False) -> Iterator[StudyStore]:
+    """Open the folder of a study as its driver; it is made where it does not exist.
+
+    Parameters
+    ----------
+    resume : a folder of the same study is continued. The study may have more replicates or further
+        levels than there.
+
+    Raises
+    ------
+    FileError : the folder contains something else, or another study, or (without `resume`) any; or
+        see `open_store`.
+    """
+    if not (folder / NAME).is_file():
+        _make_folder(folder, source)
+    elif not resume:
+        raise FileError(report_finding("store.in-use"), folder)
+    with open_store(folder) as store:
+        header, study = store.header, source.study
+        if changes := list_conflicts(load_specification(store).to_json(), study.to_json()):
+            finding = report_finding("store.specification-changed", changes=changes)
+            raise FileError(finding, folder)
+        if header.specification != study.to_json():
+            store.set_header(replace(header, specification=study.to_json()))
+        yield store
+
+
+@contextmanager
+def extend_study(folder: Path, replicates: int | None = None) -> Iterator[StudyStore]:
+    """Open the folder of a study as its driver, with more replicates where these are given.
+
+    Raises
+    ------
+    FileError : fewer replicates than before; or see `open_store`.
+    """
+    study = read_study(folder)
+    if replicates is not None:
+        study = replace(study, replicates=replicates)
+    with open_study(folder, StudySource(study), resume=True) as store:
+        yield store
+
+
+def read_study(folder: Path) -> Study:
+    """Return the study of a folder."""
+    with read_store(folder) as store:
+        return load_specification(store)
+
+
+def load_specification(store: StudyStore) -> Study:
+    """Return the study of a store; settings that are new in this version have their defaults.
+
+    Raises
+    ------
+    FileError : another version made it, whose blocks or settings differ.
+    """
+    _refuse_versions(store)
+    try:
+        return Study.from_json(store.header.specification)
+    except ValueError:  # it has settings that this version does not know
+        made_by = store.header.versions.get(PROGRAM, "")
+        code, known = "store.other-numbers", loopcal.__version__
+        finding = report_finding(code, part=PROGRAM, found=made_by, known=known)
+        raise FileError(finding, store.path) from None
+
+
+def make_header(study: Study) -> StoreHeader:
+    """Return what the store of a study says about it."""
+    versions = {PROGRAM: loopcal.__version__, NUMERICS_PART: str(NUMERICS)}
+    return StoreHeader(study.to_json(), tuple(c.name for c in study.columns), versions)
+
+
+def _refuse_versions(store: StudyStore) -> None:
+    """Raise FileError where blocks of this version would have other numbers."""
+    found = store.header.versions.get(NUMERICS_PART, "")
+    if found != str(NUMERICS):
+        code = "store.other-numbers"
+        finding = report_finding(code, part=NUMERICS_PART, found=found, known=str(NUMERICS))
+        raise FileError(finding, store.path)
+
+
+def _make_folder(folder: Path, source: StudySource) -> None:
+    """Make the folder of a study, with an empty store."""
+    refuse_network(folder)
+    names = {STUDY_FILE, *(f"{NAME}{end}" for end in ("", "-journal", "-wal", "-shm"))}
+    names |= {Path(name).parts[0] for name, _ in _list_files(source)}
+    remove_leftovers(resolve_folder(folder), lambda left: _has_only(left, names))
+    _refuse_content(folder)
+    files = {name: read_bytes(path, "file", YAML_SIZE) for name, path in _list_files(source)}
+
+    def read_back(written: Path) -> None:
+        if read_study(written) != source.study:
+            raise ValueError("the study of the store differs")
+
+    with replace_folder(folder, read_back=read_back, check=_refuse_content) as temporary:
+        for name, content in files.items():
+            file = temporary / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+        make_store(temporary, make_header(source.study))
+
+
+def _refuse_content(folder: Path) -> None:
+    """Raise FileError where a folder contains something, or where its name is that of a file."""
+    target = resolve_folder(folder)
+    if target.exists() and not target.is_dir():
+        sentence = "this is a file, but a study is a folder; choose another name"
+        raise FileError(sentence, folder)
+    if target.is_dir() and any(target.iterdir()):
+        code = "store.in-use" if (target / NAME).is_file() else "store.folder-of-others"
+        raise FileError(report_finding(code), folder)
+
+
+def _has_only(folder: Path, names: AbstractSet[str]) -> bool:
+    """Return whether a folder contains nothing but these names."""
+    return folder.is_dir() and all(path.name in names for path in folder.iterdir())
+
+
+def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
+    """Yield the name in the folder, and the path, of the study file and of the robots and the poses
+    in files beside it.
+    """
+    if source.file is None:
+        return
+    yield STUDY_FILE, source.file
+    robots = (robot.source for robot in source.study.robots.values())
+    poses = (level.file for level in source.study.poses.values() if level.file is not None)
+    for name in dict.fromkeys((*robots, *poses)):
+        path = source.file.parent / name
+        is_inside = not Path(name).is_absolute() and ".." not in Path(name).parts
+        if is_inside and path.is_file() and name not in (STUDY_FILE, NAME):
+            yield name, path

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study file to begin with."""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib.resources import files
+from pathlib import Path
+
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import read_text, write_text
+from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots
+from loopcal.studies.files.study_file import load_study
+
+PLACE = "ROBOT"
+"""Stands for the robot in the template."""
+
+
+def write_template(path: Path, robot: str) -> None:
+    """Write a study file with a comment for each setting.
+
+    Parameters
+    ----------
+    robot : name of a shipped robot, or a robot file, which is named relative to the study file.
+
+    Raises
+    ------
+    FileError : there is no such robot, or the file cannot be written.
+    """
+    file, name = find_robot_file(robot), robot
+    if robot not in list_shipped_robots():
+        name = Path(os.path.relpath(file, path.parent)).as_posix()
+    text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
+    quoted = name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)
+    text = text.replace(f"[{PLACE}]", f"[{quoted}]")
+
+    def read_back(written: Path) -> None:
+        require_same("text", text, read_text(written, "study file"))
+        load_study(written)
+
+    write_text(path, text, read_back=read_back)

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All trials of a study as one table for other programs: CSV or Parquet, written cell by cell."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from loopcal.errors import DataError
+from loopcal.io.core.text_file import replace_file
+from loopcal.studies.execution.optional_packages import import_optional
+from loopcal.studies.files.store import StudyStore
+from loopcal.studies.results.study_result import iterate_trials
+from loopcal.studies.specification.cells import Cell, list_factors
+from loopcal.studies.specification.study import Study
+from loopcal.typing import FloatArray, Progress, report_no_progress
+
+TRIAL = "trial"
+"""Column of the number of the trial in its cell, from 0."""
+
+FORMATS = (".csv", ".parquet")
+"""Endings of the files."""
+
+
+def export_trials(
+    study: Study, store: StudyStore, path: Path, progress: Progress = report_no_progress
+) -> int:
+    """Write all stored trials as one table, and return their number.
+
+    Columns are all factors, the trial, and the scores in SI. A CSV file has their units in its
+    header; a Parquet file has them in the metadata of its columns.
+
+    Parameters
+    ----------
+    path : its ending decides the format. It is written whole or not at all.
+
+    Raises
+    ------
+    DataError : another ending. FileError : it cannot be written. StudyError : pyarrow is missing.
+    """
+    ending, count = path.suffix.lower(), 0
+    if ending not in FORMATS:
+        raise DataError(f"{path} must end in {' or '.join(FORMATS)}, which decides its format")
+    write, read = (_write_csv, _count_csv) if ending == ".csv" else (_write_parquet, _count_parquet)
+
+    def read_back(written: Path) -> None:
+        if read(written) != count:
+            raise ValueError(f"the file does not contain {count} trials")
+
+    with replace_file(path, read_back=read_back) as temporary, store.keep_state():
+        count = write(study, store, temporary, progress)
+    return count
+
+
+def _count_csv(path: Path) -> int:
+    """Return the number of rows below the header."""
+    with path.open(encoding="utf-8") as stream:
+        return sum(1 for _ in stream) - 1
+
+
+def _count_parquet(path: Path) -> int:
+    """Return the number of rows."""
+    parquet = import_optional("pyarrow.parquet", "tables")
+    return int(parquet.ParquetFile(path).metadata.num_rows)
+
+
+def _iterate_blocks(
+    study: Study, store: StudyStore, progress: Progress
+) -> Iterator[tuple[Cell, int, FloatArray]]:
+    """Yield cell, first trial and scores of all blocks."""
+    for cell in study.cells:
+        progress(cell.number, len(study.cells), "writing trials")
+        for first, scores in iterate_trials(study, store, cell):
+            yield cell, first, scores
+
+
+def _write_csv(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
+    names, count = list_factors(study), 0
+    units = [f" [{c.unit}]" if c.unit != "1" else "" for c in study.columns]
+    titles = [f"{c.name}{unit}" for c, unit in zip(study.columns, units, strict=True)]
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*names, TRIAL, *titles])
+        for cell, first, scores in _iterate_blocks(study, store, progress):
+            levels = [cell.levels[name] for name in names]
+            for i, row in enumerate(scores.tolist()):
+                numbers = [value if math.isfinite(value) else "" for value in row]
+                writer.writerow([*levels, first + i, *numbers])
+            count += len(scores)
+    return count
+
+
+def _write_parquet(study: Study, store: StudyStore, path: Path, progress: Progress) -> int:
+    arrow = import_optional("pyarrow", "tables")
+    parquet = import_optional("pyarrow.parquet", "tables")
+    names, count = list_factors(study), 0
+    word = arrow.dictionary(arrow.int32(), arrow.string())
+    schema = arrow.schema(
+        [
+            *(arrow.field(name, word) for name in names),
+            arrow.field(TRIAL, arrow.int64()),
+            *(
+                arrow.field(c.name, arrow.float64(), metadata={"unit": c.unit})
+                for c in study.columns
+            ),
+        ]
+    )
+    with parquet.ParquetWriter(path, schema) as writer:
+        for cell in study.cells:
+            progress(cell.number, len(study.cells), "writing trials")
+            tables = [
+                _make_table(arrow, schema, [cell.levels[name] for name in names], first, scores)
+                for first, scores in iterate_trials(study, store, cell)
+            ]
+            if tables:
+                table = arrow.concat_tables(tables).combine_chunks()
+                writer.write_table(table)
+                count += table.num_rows
+    return count
+
+
+def _make_table(arrow: Any, schema: Any, levels: list[str], first: int, scores: FloatArray) -> Any:
+    """Return the table of one block."""
+    rows = len(scores)
+    words = [
+        arrow.DictionaryArray.from_arrays(arrow.array([0] * rows, arrow.int32()), [level])
+        for level in levels
+    ]
+    numbers = [arrow.array(range(first, first + rows), arrow.int64())]
+    columns = [arrow.array(column) for column in scores.T.copy()]
+    return arrow.table([*words, *numbers, *columns], schema=schema)

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrate the trials of a block: all at once where the method allows it, else one by one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.apply.accuracy import combine_errors, expand_length, pose_uncertainty, transport
+from loopcal.diagnose import adjust_uncertainty
+from loopcal.diagnose.error_frames import FITTED, ReferencePoses, refer_errors
+from loopcal.diagnose.frame_motions import twist_weights
+from loopcal.engine import State
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import identify
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import IdentifiedTrials, identify_trials
+from loopcal.measure import Measurements, Trials
+from loopcal.mechanism import Status, differentiate_pose, forward, forward_trials
+from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.studies.simulation.preparation import PreparedCell
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.verdict import Verdict
+
+OUTCOMES: tuple[str, ...] = (
+    "study.converged",
+    "study.out-of-iterations",
+    "study.no-descent",
+    "study.start-not-reached",
+    "study.refused",
+    "study.held-out-not-reached",
+)
+"""Codes of the outcomes of a trial, by their number; new ones are added at the end."""
+
+_OF_STATUS = {
+    DescentStatus.CONVERGED: 0,
+    DescentStatus.OUT_OF_ITERATIONS: 1,
+    DescentStatus.NO_DESCENT: 2,
+    DescentStatus.BAD_START: 3,
+    DescentStatus.RUNNING: 1,
+    DescentStatus.NO_PROGRESS: 2,
+}
+REFUSED, NOT_REACHED = OUTCOMES.index("study.refused"), OUTCOMES.index("study.held-out-not-reached")
+
+POSE_TIME = 60.0
+"""Seconds from one pose to the next."""
+
+VERDICTS = (Verdict.CALIBRATED, Verdict.RESERVATIONS, Verdict.UNDECIDED, Verdict.NOT_CALIBRATED)
+"""Verdicts by their number."""
+
+LEVEL_95 = 1.959963984540054
+"""Half-width of the 95 % interval of a normal distribution, in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedTrials:
+    """The calibrations of t trials; NaN in those that have none.
+
+    Attributes
+    ----------
+    values : (t, p of the robot) [SI]. outcome : (t,) numbers of OUTCOMES.
+    T, reached : (t, h, 4, 4), (t,) calibrated machines at the readings of the held-out poses.
+    T_measured : (t, n, 4, 4) at those of the measured poses; n = 0 where no frame is fitted.
+    half_width : (t, p free) of 95 % intervals [SI]. expanded : (t, h, 2) position and rotation
+        errors that 95 % of the errors of held-out poses do not exceed [m], [rad].
+    rank, condition, iterations : (t,). noise_scale : (t,) residuals over stated noise.
+    verdict : (t,) numbers of VERDICTS.
+    """
+
+    values: FloatArray
+    outcome: IntArray
+    T: FloatArray
+    reached: BoolArray
+    T_measured: FloatArray
+    half_width: FloatArray
+    expanded: FloatArray
+    rank: FloatArray
+    condition: FloatArray
+    iterations: FloatArray
+    noise_scale: FloatArray
+    verdict: FloatArray
+
+
+def fit_trials(cell: PreparedCell, trials: Trials) -> FittedTrials:
+    """Calibrate all trials."""
+    options, scores = cell.fit_options, cell.scores
+    is_batch = options.loss is None and options.noise == "given"
+    if is_batch and not scores.verdict and scores.intervals == "stated":
+        return fit_together(cell, trials)
+    return fit_each(cell, trials)
+
+
+def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
+    """Calibrate all trials as one batch. The stated noise counts as known."""
+    fits = identify_trials(cell.robot, trials, options=cell.fit_options)
+    plain = fits.decomposition.plain()
+    state, measured = solve_cell_poses(cell, fits.values)
+    return FittedTrials(
+        values=fits.values,
+        outcome=np.array([_OF_STATUS[DescentStatus(int(status))] for status in fits.status]),
+        T=state.T,
+        reached=is_reached(state),
+        T_measured=measured.T,
+        half_width=LEVEL_95 * fits.standard_deviations(),
+        expanded=_expand_errors(cell, fits, state, measured),
+        rank=plain.rank.astype(float),
+        condition=plain.condition,
+        iterations=fits.iterations.astype(float),
+        noise_scale=compute_noise(plain.unexplained, plain.rows - plain.rank),
+        verdict=np.full(len(trials), np.nan),
+    )
+
+
+def compute_noise(chi_square: ArrayLike, degrees: ArrayLike) -> FloatArray:
+    """Return the residuals over the stated noise; NaN where no degree of freedom is left."""
+    left = np.asarray(degrees, dtype=float)
+    return np.sqrt(np.asarray(chi_square) / np.where(left > 0.0, left, np.nan))
+
+
+def solve_cell_poses(cell: PreparedCell, values: FloatArray) -> tuple[State, State]:
+    """Return the states of machines (t, p) at the readings of the held-out poses, and at those of
+    the measured poses, of which there are none where no frame is fitted.
+    """
+    held_out, commanded = cell.held_out, cell.reference
+    return (
+        forward_trials(cell.robot, values, held_out.q[None], held_out.state),
+        forward_trials(cell.robot, values, commanded.q[None], commanded.state),
+    )
+
+
+def is_reached(state: State) -> BoolArray:
+    """Return in which trials (t,) all poses are reached."""
+    return np.asarray((state.status == Status.CONVERGED).all(axis=1))
+
+
+def _expand_errors(
+    cell: PreparedCell, fits: IdentifiedTrials, state: State, measured: State
+) -> FloatArray:
+    """Return what 95 % of the errors of held-out poses do not exceed (t, h, 2) [m], [rad], as
+    `pose_uncertainty` does for one machine.
+
+    state, measured : of `solve_cell_poses`.
+    """
+    robot, free = cell.robot, fits.free_parameters
+    unit = free.tolerance * fits.decomposition.scale
+    slopes = differentiate_pose(robot, fits.values, cell.held_out.q[None], state)
+    D = slopes.parameters[..., free.places] * unit
+    size = np.linalg.norm(D * twist_weights(robot)[:, None], axis=(2, 3))
+    if cell.motions.shape[1]:
+        by_measured = differentiate_pose(robot, fits.values, cell.reference.q[None], measured)
+        reference = by_measured.parameters[..., free.places] * unit
+        D = np.stack(
+            [
+                _refer_to_fitted(cell, *of_trial)
+                for of_trial in zip(D, state.T, reference, measured.T, strict=True)
+            ]
+        )
+    t, n = state.T.shape[:2]
+    H = transport(robot, state.T.reshape(-1, 4, 4), "base", "tool").reshape(t, n, 6, 6)
+    directions, variance = _list_knowledge(fits)
+    others = (H @ (slopes.readings * robot.stated_sigma),) if robot.stated_sigma.any() else ()
+    covariance = combine_errors(robot, H @ D, directions, variance, size, others)
+    covariance[state.status != Status.CONVERGED] = np.nan
+    flat, is_known = covariance.reshape(-1, 6, 6), np.full(t * n, np.inf)
+    lengths = [expand_length(flat[:, part, part], is_known) for part in (slice(3, 6), slice(0, 3))]
+    return np.stack(lengths, axis=-1).reshape(t, n, 2)
+
+
+def _refer_to_fitted(
+    cell: PreparedCell, D: FloatArray, T: FloatArray, reference: FloatArray, measured: FloatArray
+) -> FloatArray:
+    """Return errors D (h, 6, p) of poses T (h, 4, 4) by the parameters, after the best rigid fit of
+    frames over measured poses (n, 4, 4) with errors `reference` (n, 6, p).
+    """
+    usable = np.isfinite(reference).all(axis=(1, 2))
+    poses = ReferencePoses(measured[usable], reference[usable], "measured")
+    return refer_errors(cell.robot, FITTED, poses, cell.motions).relate(D, T)
+
+
+def _list_knowledge(fits: IdentifiedTrials) -> tuple[FloatArray, FloatArray]:
+    """Return directions (t, p, p) and their variances (t, p), as in the posterior of each trial."""
+    parts = []
+    for i in range(len(fits.values)):
+        chosen = np.array([i])
+        prior = None if fits.prior_variance is None else fits.prior_variance[chosen]
+        parts.append(fits.decomposition.take(chosen).knowledge(fits.penalty[chosen], 1.0, prior))
+    return np.stack([part[0] for part in parts]), np.stack([part[1] for part in parts])
+
+
+def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:
+    """Calibrate the trials one by one, each with all that its calibration finds in the residuals.
+
+    A trial that is refused does not stop the others.
+    """
+    free, h, n = select_free_parameters(cell.robot), len(cell.held_out.q), len(cell.reference.q)
+    nothing = FittedTrials(
+        values=np.full(len(cell.robot.parameters), np.nan),
+        outcome=np.array(REFUSED),
+        T=np.full((h, 4, 4), np.nan),
+        reached=np.array(False),
+        T_measured=np.full((n, 4, 4), np.nan),
+        half_width=np.full(len(free), np.nan),
+        expanded=np.full((h, 2), np.nan),
+        **dict.fromkeys(
+            ("rank", "condition", "iterations", "noise_scale", "verdict"), np.array(np.nan)
+        ),
+    )
+    single = []
+    for i in range(len(trials)):
+        try:
+            single.append(_fit_one(cell, state_times(trials.trial(i))))
+        except (EstimationError, DataError):
+            single.append(nothing)
+    names = [entry.name for entry in fields(FittedTrials)]
+    return FittedTrials(**{name: np.stack([getattr(f, name) for f in single]) for name in names})
+
+
+def state_times(data: Measurements) -> Measurements:
+    """Return measurements with the time of each row, as instruments record it: the tests for slow
+    errors need it.
+    """
+    first = [rows.rows.reshape(len(rows), -1)[:, 0] for rows in data.observations]
+    observations = tuple(
+        replace(rows, context={"time": POSE_TIME * poses})
+        for rows, poses in zip(data.observations, first, strict=True)
+    )
+    return replace(data, observations=observations)
+
+
+def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
+    """Return the calibration of one trial, without the axis of trials."""
+    verdict = np.nan
+    if cell.scores.verdict:
+        options = CalibrationOptions(
+            fit=cell.fit_options,
+            limit_position=cell.scores.limit_position,
+            limit_angle=cell.scores.limit_angle,
+        )
+        report = calibrate(cell.robot, cell.hold_out(data), options)
+        fit, verdict = report.identification, float(VERDICTS.index(report.verdict))
+    else:
+        fit = identify(cell.robot, data, options=cell.fit_options)
+        if cell.scores.intervals == "adjusted":
+            fit = adjust_uncertainty(fit, data)
+    U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=cell.scores.frame)
+    state, measured = solve_cell_poses(cell, fit.robot.values[None])
+    test = fit.residual_test
+    return FittedTrials(
+        values=fit.robot.values,
+        outcome=np.array(_OF_STATUS[fit.status]),
+        T=state.T[0],
+        reached=is_reached(state)[0],
+        T_measured=measured.T[0],
+        half_width=fit.interval(),
+        expanded=np.stack([U.expanded_position, U.expanded_orientation], axis=-1),
+        rank=np.array(float(fit.rank)),
+        condition=np.array(fit.spectrum.condition),
+        iterations=np.array(float(fit.history.iterations)),
+        noise_scale=compute_noise(test.chi_square, test.degrees),
+        verdict=np.array(verdict),
+    )

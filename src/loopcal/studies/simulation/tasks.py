@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The unit of work of a study: a block of trials of one cell."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from typing import Any
+
+from loopcal.studies.simulation.block import compute_scores
+from loopcal.studies.simulation.poses import add_poses
+from loopcal.studies.specification.keys import compute_key, describe_block, format_json
+from loopcal.studies.specification.study import Study
+from loopcal.typing import FloatArray
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """A block to compute.
+
+    Attributes
+    ----------
+    key : hash of everything that determines its numbers. cell : number of its cell.
+    block : number of the block in its cell. content : all that `compute_block` needs, as JSON.
+    """
+
+    key: str
+    cell: int
+    block: int
+    content: str
+
+
+@dataclass(frozen=True, eq=False)
+class BlockResult:
+    """The scores of the trials of a block.
+
+    Attributes
+    ----------
+    key : of its task. values : (B, s), columns as `Study.columns`, SI. Column 0 is the outcome: 0
+        for a trial that converged, else the number of a code in OUTCOMES. The other numbers of a
+        failed trial are NaN as far as they do not exist.
+    """
+
+    key: str
+    values: FloatArray
+
+
+def compute_block(task: BlockTask) -> BlockResult:
+    """Simulate and calibrate the machines of a block, and return their scores.
+
+    It is a pure function of `task.content`: the same numbers to the last bit in every process, for
+    every number of threads and workers.
+
+    Raises
+    ------
+    LoopcalError : the cell cannot be simulated at all, such as a kind that the robot does not have.
+    """
+    content: Mapping[str, Any] = json.loads(task.content)
+    return BlockResult(task.key, compute_scores(content))
+
+
+def list_tasks(
+    study: Study,
+    cells: Sequence[int] | None = None,
+    finished: AbstractSet[str] = frozenset(),
+    blocks: Sequence[int] | None = None,
+) -> Iterator[BlockTask]:
+    """Yield the tasks of these blocks of these cells, of all by default, whose keys are not
+    finished.
+
+    The poses of a cell are drawn or planned when its first task is made.
+    """
+    for number in range(len(study.cells)) if cells is None else cells:
+        cell = study.cells[number]
+        poses: Mapping[str, object] | None = None
+        for block in range(study.blocks) if blocks is None else blocks:
+            content = describe_block(study, cell, block)
+            key = compute_key(content)
+            if key in finished:
+                continue
+            poses = add_poses(content) if poses is None else poses
+            yield BlockTask(key, number, block, format_json({**content, **poses}))
