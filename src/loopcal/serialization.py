@@ -62,6 +62,31 @@ def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ..
     raise TypeError(f"{'/'.join(path)}: {type(value).__name__} has no JSON form")
 
 
+def restore_numbers(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a JSON document with the numbers that are not finite, from its reasons `nulls`.
+
+    An infinite number becomes positive, because JSON does not state its sign.
+
+    Examples
+    --------
+    >>> restore_numbers({"sd": None, "nulls": {"sd": INFINITE}})
+    {'sd': inf}
+    """
+    nulls = document.get("nulls") or {}
+    return {k: _restore(v, nulls, k) for k, v in document.items() if k != "nulls"}
+
+
+def _restore(value: Any, nulls: Mapping[str, str], path: str) -> Any:
+    """Return a JSON value with its numbers that are not finite."""
+    if value is None and path in nulls:
+        return math.inf if nulls[path] == INFINITE else math.nan
+    if isinstance(value, dict):
+        return {key: _restore(v, nulls, f"{path}/{key}") for key, v in value.items()}
+    if isinstance(value, list):
+        return [_restore(v, nulls, f"{path}/{i}") for i, v in enumerate(value)]
+    return value
+
+
 def json_fields(value: Any) -> dict[str, Any]:
     """Return the attributes of a dataclass that JSON shows, by key, as they are.
 

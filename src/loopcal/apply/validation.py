@@ -224,12 +224,15 @@ class Validation:
             "frame": self.frame,
             "alignment": self.alignment,
             "kinds": [vars(kind) for kind in self.kinds],
+            "setup_count": self.setup_count,
+            "absorbed": self.absorbed,
+            "judged": self.judged,
         }
 
     def _without_blunders(self) -> dict[str, Any] | None:
         """Return the errors without blunders for JSON; None without any."""
         rest = self.without_blunders
-        names = ("poses", "before", "after", "noise_floor", "kinds")
+        names = ("poses", "before", "after", "noise_floor", "kinds", "judged")
         return None if rest is None else {name: getattr(rest, name) for name in names}
 
 

@@ -152,6 +152,7 @@ class PoseErrors:
                 "rows": errors.rows,
                 "targets": errors.targets,
                 "components": errors.measured,
+                "dimension": errors.dimension,
             }
             for name, errors in self.quantities.items()
         }

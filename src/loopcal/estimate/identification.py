@@ -68,7 +68,8 @@ from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
-from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
+from loopcal.estimate.residuals import KindResiduals
+from loopcal.estimate.result import History, Identification, Spectrum
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
@@ -391,6 +392,8 @@ def _label_residuals(
             raw=np.where(measured, r.raw[0], np.nan),
             whitened=r.whitened[0],
             context=columns,
+            dimensions=tuple(column.dimension for column in s.kind.noise_columns),
+            readings=data.readings[s.poses_by_link[:, 0]],
         )
         for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
     )

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +20,7 @@ from loopcal.estimate.methods.regularization import Regularization
 from loopcal.estimate.nuisance.estimate import NuisanceEstimate
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
+from loopcal.estimate.residuals import KindResiduals, store_residuals
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
@@ -28,30 +28,6 @@ from loopcal.typing import FloatArray
 
 LAST_DIGITS = 3
 """Digits of the values at which an iteration ended that did not converge."""
-
-
-@dataclass(frozen=True, eq=False)
-class KindResiduals:
-    """Residuals (predicted - measured) of the rows of one kind after the fit.
-
-    Attributes
-    ----------
-    kind : its name. components : names of the m residuals. poses : (r,) labels.
-    raw : (r, m) [SI]. whitened : (r, m), divided by sigma (zero where absent).
-    context : name -> (r,), time [s] and temperatures [degC] of the rows, to plot the residuals
-        against.
-    """
-
-    kind: str
-    components: tuple[str, ...]
-    poses: tuple[str, ...]
-    raw: FloatArray
-    whitened: FloatArray
-    context: Mapping[str, FloatArray] = field(default_factory=dict)
-
-    def __repr__(self) -> str:
-        """Return the kind and the size of the residuals."""
-        return f"<KindResiduals of {self.kind}: {len(self.raw)} rows of {len(self.components)}>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +339,7 @@ class Identification:
 
     def arrays(self) -> dict[str, FloatArray]:
         """Return the arrays of the run folder by name [SI]."""
-        result = {
+        return {
             "nominal": self.nominal,
             "estimate": self.estimate,
             "sd": self.standard_deviations,
@@ -379,12 +355,8 @@ class Identification:
             "local_root": np.nan_to_num(self.nuisance.root, posinf=0.0),
             **self.posterior.arrays(),
             **({} if self.poses is None else self.poses.arrays()),
+            **store_residuals(self.residuals),
         }
-        for i, r in enumerate(self.residuals):
-            result[f"residual_{i}_{r.kind}"] = r.raw
-            result[f"whitened_{i}_{r.kind}"] = r.whitened
-            result |= {f"{name}_{i}_{r.kind}": values for name, values in r.context.items()}
-        return result
 
 
 def _format_half_width(half: float) -> tuple[int, str]:

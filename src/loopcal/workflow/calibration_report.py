@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.apply import ErrorBudget, Validation
+from loopcal.apply.stored_validation import store_differences
 from loopcal.diagnose import (
     ConventionCheck,
     FitExamination,
@@ -27,7 +28,6 @@ from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import to_json
-from loopcal.typing import FloatArray
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
 from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
@@ -182,12 +182,18 @@ class CalibrationReport:
 
     __repr__ = __str__
 
-    def arrays(self) -> dict[str, FloatArray]:
-        """Return arrays to store: those of the fit, and `initial`, the values of all parameters
-        before the calibration [SI].
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return arrays to store [SI]: those of the fit, `initial`, the values of all parameters
+        before the calibration, `poses`, the labels of the fitted poses, and the differences at
+        held-out poses.
         """
-        fit = self.identification
-        return {**fit.arrays(), "initial": fit.initial.values}
+        fit, errors = self.identification, self.validation
+        return {
+            **fit.arrays(),
+            "initial": fit.initial.values,
+            "poses": np.array(self.split.fitted.labels, str),
+            **({} if errors is None else store_differences(errors)),
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON values by name, SI: dictionaries, lists, numbers and text.
@@ -209,6 +215,8 @@ class CalibrationReport:
         }
         return {
             "verdict": self.verdict,
+            "headline": self.headline,
+            "states_expected_error": self.states_expected_error,
             "findings": self.findings,
             "next_step": self.next_step,
             "passed": not self.failures,
