@@ -236,7 +236,11 @@ class _Server:
         return time.perf_counter() - begin
 
     def _run_copy(self, fault: Fault) -> None:
-        """Fork; the copy returns with its fault, the original when the copy has ended."""
+        """Fork; the copy returns with its fault, the original when the copy has ended.
+
+        The time of a fault begins when the copy is ready, however long a busy machine takes.
+        """
+        is_ready, say_ready = os.pipe()
         copied = os.fork()
         if copied == 0:
             self.is_copy, self.fault, self.lines = True, fault, 0
@@ -245,7 +249,11 @@ class _Server:
                 _slow_down()
             if not fault.how:
                 _at_exit_write(self)
+            os.write(say_ready, b"1")
             return
+        os.close(say_ready)
+        os.read(is_ready, 1)
+        os.close(is_ready)
         if fault.how and fault.is_slow:
             time.sleep(fault.moment)
             strike(copied, fault.how)
@@ -392,12 +400,13 @@ def list_failures(outcomes: dict[str, dict[str, int]]) -> list[str]:
 def collect() -> dict[str, Any]:
     """Return the counts of all cases."""
     kinds = [KILL, INTERRUPT, f"{KILL}, slow", f"{INTERRUPT}, slow"]
-    rows = []
+    rows, failures = [], []
     with tempfile.TemporaryDirectory() as place:
         inputs = Path(place)
         prepare_inputs(inputs)
         for name, case in CASES.items():
             outcomes = examine(case, inputs, MOMENTS, TIMES)
+            failures += [f"{name}: {words}" for words in list_failures(outcomes)]
             for kind in kinds:
                 counts = Counter(outcomes[kind])
                 failed = sum(
@@ -422,5 +431,6 @@ def collect() -> dict[str, Any]:
     return {
         "moments": MOMENTS,
         "times": TIMES,
+        "failures": failures,
         "tables": {"outcomes": {"columns": columns, "formats": ["", "", *["d"] * 6], "rows": rows}},
     }

@@ -21,6 +21,7 @@ import click
 from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.hints import find_hint, is_hint_useless
+from loopcal.cli.interrupts import repeat_lost_interrupts
 from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from loopcal.cli.time_limit import TimeLimitError
 from loopcal.errors import LoopcalError
@@ -150,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None
-    with record_outputs() as list_outputs:
+    with repeat_lost_interrupts(), record_outputs() as list_outputs:
         try:
             command = find_running_command(words)
             if command is not None and not _has_working_folder():

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ctrl-C where Python cannot raise it.
+
+Python raises an interrupt between two instructions. In a callback of a library, such as the one
+with which pydantic reads the name of a class, or in `__del__`, it can only print the exception and
+go on. The user would see a traceback, and the command would not stop.
+"""
+
+from __future__ import annotations
+
+import _thread
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from loopcal.cli.time_limit import TimeLimitError
+
+
+@contextmanager
+def repeat_lost_interrupts() -> Iterator[None]:
+    """Raise an interrupt that a callback lost again, a moment after the callback.
+
+    A time limit that was lost is not printed either; its timer raises it again.
+    """
+    report = sys.unraisablehook
+
+    def repeat_or_report(lost: sys.UnraisableHookArgs) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            _thread.start_new_thread(_interrupt, ())  # raised here, it is lost again
+        elif not issubclass(lost.exc_type, TimeLimitError):
+            report(lost)
+
+    sys.unraisablehook = repeat_or_report
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
+
+
+def _interrupt() -> None:
+    """Interrupt the main thread, also while it waits where the operating system has signals."""
+    main = threading.main_thread().ident
+    if main is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
