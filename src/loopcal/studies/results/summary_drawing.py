@@ -3,20 +3,31 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import DataError, suggest_names
-from loopcal.report.figures.style import COLORS, label_logarithmic, show_names, start_figure
+from loopcal.errors import DataError
+from loopcal.report.figures.style import (
+    GRID,
+    LABEL,
+    REFERENCE,
+    SMALL,
+    THIN,
+    add_legend,
+    finish_figure,
+    label_logarithmic,
+    start_figure,
+)
 from loopcal.report.pictures import render_figure
+from loopcal.studies.results.figure_layout import Layout, choose_layout, list_colors
 from loopcal.studies.results.study_result import find_columns
 from loopcal.studies.results.summary import CellSummary, Interval, StudySummary
-from loopcal.studies.results.summary_view import UNITS
-from loopcal.studies.specification.cells import list_factors, list_varied_factors
-from loopcal.studies.specification.level_chains import list_chains
+from loopcal.studies.results.summary_view import FRAMES, UNITS
+from loopcal.studies.specification.scores import ScoreColumn, check_question
 from loopcal.studies.specification.study import Study
 from loopcal.units import Unit
 
@@ -29,8 +40,10 @@ MOST_PANELS = 12
 STYLES = {"median": ("o-", "median"), "high": ("^:", "95 % of machines"), "mean": ("o-", "mean")}
 """Statistic -> marker and line, and its words."""
 
-OFFSET = 0.06
-"""Shift between two colors at levels without numbers, in steps between levels."""
+OFFSET, SPREAD = 0.16, 0.6
+"""Shift between two colors at levels without numbers, and that of all of them at most, in steps
+between levels.
+"""
 
 COVERAGE = 0.95
 """What shares of coverage should be."""
@@ -38,23 +51,32 @@ COVERAGE = 0.95
 WIDE = 5.0
 """Ratio of the ends of an axis from which it is logarithmic."""
 
-
-@dataclass(frozen=True)
-class Layout:
-    """Which factor is along the axis, has colors, and has panels; None and empty without them."""
-
-    axis: str
-    color: str | None
-    panels: tuple[str, ...]
+IN_FRAME = ("position", "orientation", "covered_position", "covered_orientation")
+"""Beginning of the names of scores that a frame of errors belongs to."""
 
 
 @dataclass(frozen=True)
-class Axis:
-    """Where levels are along the axis: level -> place, in the unit of the label or as a count."""
+class Drawing:
+    """A figure of one score.
 
-    places: Mapping[str, float]
-    label: str
-    is_numeric: bool
+    Attributes
+    ----------
+    layout : which factor is where. column : the score. unit : of its axis. colors : level -> color.
+    limits : of the score, which the questions of the study state [SI].
+    """
+
+    layout: Layout
+    column: ScoreColumn
+    unit: Unit
+    colors: Mapping[str, str]
+    limits: tuple[float, ...]
+
+    def find_interval(self, cell: CellSummary, kind: str) -> Interval | None:
+        """Return a statistic of a cell; None without one. Means are those of shares only."""
+        summary = cell.find_score(self.column.name)
+        if summary is None or (kind == "mean" and summary.median is not None):
+            return None
+        return getattr(summary, kind)
 
 
 def draw_score(
@@ -63,7 +85,8 @@ def draw_score(
     """Draw the medians and the 95 % quantiles (or the means of shares) of a score against a factor.
 
     Bars are 95 % intervals by the number of trials; an arrow is an end that the trials do not
-    bound. The second varied factor has colors, and all others have panels.
+    bound. The second varied factor has colors, and all others have panels. A line is the limit of a
+    question of the study.
 
     Parameters
     ----------
@@ -81,19 +104,23 @@ def draw_score(
             f"the figure of {score} would have {len(groups)} panels, but at most {MOST_PANELS} are "
             "drawn; draw it from summary.csv"
         )
-    unit = UNITS[study.columns[place].unit]
+    column = study.columns[place]
+    asked = [question for question in study.questions.values() if question.score == score]
+    limits = tuple(dict.fromkeys(check_question(study, question) for question in asked))
+    colors = list_colors(summary, layout)
+    drawing = Drawing(layout, column, UNITS[column.unit], colors, limits)
     columns = min(len(groups), 3)
     rows = -(-len(groups) // columns)
-    figure = start_figure(1.4 + 4.2 * columns, 0.9 + 3.4 * rows)
+    figure = start_figure(1.4 + 4.2 * columns, 1.2 + 3.4 * rows)
     every: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    colors, along = _list_colors(summary, layout), _place_levels(study, layout.axis)
     for axes, (title, cells) in zip(every.flat, groups.items(), strict=False):
-        _draw_panel(axes, cells, layout, along, score, unit, colors)
-        axes.set_title(title, fontsize=9)
+        _draw_panel(axes, cells, drawing)
+        axes.set_title(title, fontsize=LABEL)
     for axes in every.flat[len(groups) :]:
         axes.set_visible(False)
-    _label(figure, every, summary, layout, along, score, unit, colors)
-    return show_names(figure)
+    _scale_axes(every, summary, drawing)
+    add_legend(figure, _label(every, summary, drawing), 3 if columns == 1 else 5)
+    return finish_figure(figure, "\n".join(_list_titles(study, summary, drawing, columns)))
 
 
 def render_figures(
@@ -115,88 +142,40 @@ def render_figures(
     }
 
 
-def choose_layout(study: Study, factor: str | None = None) -> Layout:
-    """Return which factor goes where; the axis is `factor`."""
-    factors = list_factors(study)
-    if factor is not None and factor not in factors:
-        hint = suggest_names(factor, factors)
-        raise DataError(f"{factor!r} is not a factor{hint}; factors: {', '.join(factors)}")
-    varied = list_varied_factors(study)
-    lengths = {name: _count_ordered(study, name) for name in varied}
-    axis = factor or max(varied, key=lengths.__getitem__, default=factors[0])
-    others = [name for name in varied if name != axis]
-    # the factor with the most levels that have a color each, so that panels are few
-    usable = [name for name in others if _count_levels(study, name) <= len(COLORS)]
-    color = max(usable, key=lambda name: _count_levels(study, name), default=None)
-    return Layout(axis, color, tuple(name for name in others if name != color))
-
-
-def _count_ordered(study: Study, factor: str) -> int:
-    """Return the largest number of levels of a factor that have an order; 0 without any."""
-    return max(len(chain.levels) * bool(chain.quantity) for chain in list_chains(study, factor))
-
-
-def _count_levels(study: Study, factor: str) -> int:
-    return len({cell.levels[factor] for cell in study.cells})
-
-
 def _group(summary: StudySummary, layout: Layout) -> dict[str, list[CellSummary]]:
     """Return title of a panel -> its cells."""
     groups: dict[str, list[CellSummary]] = {}
     for cell in summary.cells:
-        title = ", ".join(f"{name} {cell.levels[name]}" for name in layout.panels)
+        levels = {name: layout.find_level(cell, name) for name in layout.panels}
+        title = ", ".join(layout.name_level(*item) for item in levels.items())
         groups.setdefault(title, []).append(cell)
     return groups
 
 
-def _list_colors(summary: StudySummary, layout: Layout) -> dict[str, str]:
-    """Return level -> color, the same in all panels."""
-    if layout.color is None:
-        return {"": COLORS[0]}
-    levels = dict.fromkeys(cell.levels[layout.color] for cell in summary.cells)
-    return dict(zip(levels, COLORS, strict=False))
-
-
-def _place_levels(study: Study, factor: str) -> Axis:
-    """Return where the levels of a factor are along the axis."""
-    chains = list_chains(study, factor)
-    if len(chains) == 1 and chains[0].quantity:
-        (chain,) = chains
-        unit = UNITS[chain.unit]
-        values = [float(value or 0.0) / unit.factor_to_si for value in chain.values]
-        symbol = "1" if chain.unit == "1" else unit.symbol
-        name = factor if chain.quantity in ("count", "factor") else f"{factor}: {chain.quantity}"
-        return Axis(dict(zip(chain.levels, values, strict=True)), f"{name} [{symbol}]", True)
-    levels = dict.fromkeys(level for chain in chains for level in chain.levels)
-    return Axis({level: float(i) for i, level in enumerate(levels)}, factor, False)
-
-
-def _draw_panel(
-    axes: Any,
-    cells: Sequence[CellSummary],
-    layout: Layout,
-    along: Axis,
-    score: str,
-    unit: Unit,
-    colors: Mapping[str, str],
-) -> None:
+def _draw_panel(axes: Any, cells: Sequence[CellSummary], drawing: Drawing) -> None:
     """Draw the cells of a panel: a line for each color and statistic."""
+    layout, colors = drawing.layout, drawing.colors
+    is_numeric = layout.along.is_numeric
+    offset = 0.0 if is_numeric else min(OFFSET, SPREAD / len(colors))
     for number, (name, color) in enumerate(colors.items()):
-        shift = 0.0 if along.is_numeric else (number - (len(colors) - 1) / 2.0) * OFFSET
-        chosen = [c for c in cells if layout.color is None or c.levels[layout.color] == name]
-        chosen.sort(key=lambda cell: along.places[cell.levels[layout.axis]])
+        shift = (number - (len(colors) - 1) / 2.0) * offset
+        chosen = [
+            cell
+            for cell in cells
+            if layout.color is None or layout.find_level(cell, layout.color) == name
+        ]
+        chosen.sort(key=layout.place)
         for kind, (style, _) in STYLES.items():
             points = [
-                (along.places[cell.levels[layout.axis]] + shift, interval)
+                (layout.place(cell) + shift, interval)
                 for cell in chosen
-                if (interval := _find_interval(cell, score, kind))
+                if (interval := drawing.find_interval(cell, kind))
             ]
             if points:
-                _draw_points(axes, points, unit, style if along.is_numeric else style[0], color)
-    if not along.is_numeric:
-        axes.set_xticks(list(along.places.values()), list(along.places))
-        axes.set_xlim(-0.5, len(along.places) - 0.5)
-    axes.grid(visible=True, lw=0.3)
+                _draw_points(axes, points, drawing.unit, style if is_numeric else style[0], color)
+    for limit in drawing.limits:
+        axes.axhline(limit / drawing.unit.factor_to_si, color=REFERENCE, lw=THIN, ls="--", zorder=1)
+    axes.grid(visible=True, lw=GRID)
 
 
 def _draw_points(
@@ -224,69 +203,73 @@ def _draw_points(
             )
 
 
-def _find_interval(cell: CellSummary, score: str, kind: str) -> Interval | None:
-    """Return a statistic of a cell; None without one. Means are those of shares only."""
-    summary = cell.find_score(score)
-    if summary is None or (kind == "mean" and summary.median is not None):
-        return None
-    return getattr(summary, kind)
-
-
-def _label(
-    figure: Figure,
-    every: Any,
-    summary: StudySummary,
-    layout: Layout,
-    along: Axis,
-    score: str,
-    unit: Unit,
-    colors: Mapping[str, str],
-) -> None:
-    """Write labels, the legend and the title, and choose the scales of the axes."""
-    from matplotlib.lines import Line2D
-
-    kinds = [
+def _list_kinds(summary: StudySummary, drawing: Drawing) -> list[str]:
+    """Return the statistics that some cell has."""
+    return [
         kind
         for kind in STYLES
-        if any(_find_interval(cell, score, kind) is not None for cell in summary.cells)
+        if any(drawing.find_interval(cell, kind) is not None for cell in summary.cells)
     ]
+
+
+def _scale_axes(every: Any, summary: StudySummary, drawing: Drawing) -> None:
+    """Choose the scales and the ticks of the axes."""
+    kinds, along = _list_kinds(summary, drawing), drawing.layout.along
     ends = [
         interval.value
         for kind in kinds
         for cell in summary.cells
-        if (interval := _find_interval(cell, score, kind)) is not None
+        if (interval := drawing.find_interval(cell, kind)) is not None
     ]
     if ends and min(ends) > 0.0 and max(ends) > WIDE * min(ends) and "mean" not in kinds:
         every[0, 0].set_yscale("log")
         label_logarithmic(every[0, 0].yaxis)
-    if "mean" in kinds:
-        for axes in every.flat:
-            axes.axhline(COVERAGE, color="0.5", lw=1.0, ls="--", zorder=1)
-    if along.is_numeric:
-        places = list(along.places.values())
-        if min(places) > 0.0 and max(places) > WIDE * min(places):
-            every[0, 0].set_xscale("log")
-        for axes in every.flat:
-            axes.set_xticks(places, [f"{place:g}" for place in places])
-            axes.minorticks_off()
+    ticks = along.list_ticks()
+    if along.is_numeric and min(ticks) > 0.0 and max(ticks) > WIDE * min(ticks):
+        every[0, 0].set_xscale("log")
+    for axes in every.flat:
+        if "mean" in kinds:
+            axes.axhline(COVERAGE, color=REFERENCE, lw=THIN, ls="--", zorder=1)
+        style = {"rotation": 30, "ha": "right"} if along.is_crowded else {}
+        axes.set_xticks(list(ticks), list(ticks.values()), fontsize=SMALL, **style)
+        axes.minorticks_off()
+        if not along.is_numeric:
+            axes.set_xlim(-0.5, len(ticks) - 0.5)
+
+
+def _label(every: Any, summary: StudySummary, drawing: Drawing) -> list[Any]:
+    """Write the labels of axes; return the entries of the legend."""
+    from matplotlib.lines import Line2D
+
+    layout, column, unit = drawing.layout, drawing.column, drawing.unit
     for axes in every[-1]:
-        axes.set_xlabel(along.label, fontsize=9)
+        axes.set_xlabel(layout.along.label, fontsize=LABEL)
     for axes in every[:, 0]:
-        axes.set_ylabel(f"{score.replace('_', ' ')} [{unit.symbol}]", fontsize=9)
+        axes.set_ylabel(f"{column.name.replace('_', ' ')} [{unit.symbol}]", fontsize=LABEL)
+        axes.tick_params(axis="y", labelsize=SMALL)
+    names = {} if layout.color is None else drawing.colors
     handles = [
-        Line2D([], [], color=color, lw=2.0, label=f"{layout.color} {level}")
-        for level, color in (colors.items() if layout.color else ())
+        Line2D([], [], color=color, lw=2.0, label=layout.name_level(layout.color or "", level))
+        for level, color in names.items()
     ]
     handles += [
         Line2D([], [], color="0.3", marker=style[0], ls=style[1:], ms=4.0, label=words)
         for kind, (style, words) in STYLES.items()
-        if kind in kinds
+        if kind in _list_kinds(summary, drawing)
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    if drawing.limits:
+        words = "limit of the question"
+        handles.append(Line2D([], [], color=REFERENCE, ls="--", lw=THIN, label=words))
+    return handles
+
+
+def _list_titles(study: Study, summary: StudySummary, drawing: Drawing, columns: int) -> list[str]:
+    """Return the lines above all panels: what is drawn, in which frame, of how many trials."""
+    column = drawing.column
     counts = [cell.trials - sum(cell.failed.values()) for cell in summary.cells]
     low, high = min(counts), max(counts)
     trials = f"{low}" if low == high else f"{low} to {high}"
-    figure.suptitle(
-        f"{summary.title}\nn = {trials} converged trials of each cell; bars are 95 % intervals",
-        fontsize=10,
-    )
+    lines = [summary.title, column.meaning[0].upper() + column.meaning[1:]]
+    if column.name.startswith(IN_FRAME):
+        lines += textwrap.wrap(FRAMES[study.scores.frame], 70 * columns)
+    return [*lines, f"n = {trials} converged trials of each cell; bars are 95 % intervals"]
