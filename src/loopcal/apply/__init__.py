@@ -7,6 +7,10 @@ from loopcal.apply.accuracy_simulation import AccuracySimulation as AccuracySimu
 from loopcal.apply.accuracy_simulation import simulate_accuracy as simulate_accuracy
 from loopcal.apply.compensation import Compensation as Compensation
 from loopcal.apply.compensation import compensate as compensate
+from loopcal.apply.conformity import Conformity as Conformity
+from loopcal.apply.conformity import Decision as Decision
+from loopcal.apply.conformity import judge_estimate as judge_estimate
+from loopcal.apply.conformity import judge_largest_error as judge_largest_error
 from loopcal.apply.error_budget import ErrorBudget as ErrorBudget
 from loopcal.apply.error_budget import ErrorSources as ErrorSources
 from loopcal.apply.error_budget import compute_error_budget as compute_error_budget

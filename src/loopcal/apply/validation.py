@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
 from loopcal.apply.held_out_blunders import find_blunders, report_blunders
 from loopcal.apply.validation_findings import (
     ErrorChange,
@@ -82,6 +83,8 @@ class Validation:
     judged : number of poses whose rows or redundant readings are compared.
     blunders : poses that neither the calibration nor the others explain. They are part of all
         statistics; `without_blunders` are the statistics without them, None where there are none.
+    conformity : by quantity with a limit, the largest true error and the probability that it keeps
+        the limit; none where no row measures the quantity, or nobody stated the noise.
     """
 
     poses: tuple[str, ...]
@@ -105,6 +108,7 @@ class Validation:
     judged: int = 0
     blunders: tuple[Blunder, ...] = ()
     without_blunders: Validation | None = None
+    conformity: Mapping[str, Conformity] = field(default_factory=dict)
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -215,6 +219,7 @@ class Validation:
             "failed": self.unreachable,
             "limit_position": self.limit_position,
             "limit_angle": self.limit_angle,
+            "conformity": dict(self.conformity),
             "passed": self.passed,
             "reasons": [str(finding) for finding in self.failures],
             "notes": [str(f) for f in self.findings if f.severity is not Severity.FAILURE],
@@ -290,11 +295,14 @@ def validate(
         wrong = np.array([label in named for label in data.labels])
         rest = _summarize(robot, compared.without(wrong), limits)
     left_out = ~compared.usable & compared.predictable
+    share = max(result.values_left, 0) / max(result.kinds[-1].count, 1)
+    conformity = judge_limits(compared.data.observations, result.after, limits, share)
     return replace(
         result,
         unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
         findings=(
             *check_limits(result.after, compared.rows, limits, result.units),
+            *report_conformity(conformity, limits, result.after, result.units),
             *report_blunders(blunders, result, rest),
             *report_moved_setup(robot, compared, kept),
             *report_left_out(data, compared),
@@ -303,6 +311,7 @@ def validate(
         ),
         blunders=blunders,
         without_blunders=rest,
+        conformity=conformity,
     )
 
 

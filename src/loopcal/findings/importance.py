@@ -26,6 +26,8 @@ IMPORTANCE = (
     "noise.residuals-too-large",
     "gates.limit-exceeded",
     "gates.limit-not-measured",
+    "conformity.fails",
+    "conformity.undecided",
     "outliers.some",
     "outliers.pose",
     "outliers.ambiguous",

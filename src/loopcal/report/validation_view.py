@@ -14,6 +14,9 @@ from loopcal.report.numbers import ROUNDING, format_number
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block, format_list
 
+CONFORMITY = "conformity."
+"""Beginning of the codes of statements on limits, which follow the tables."""
+
 SIMILAR = 5e-3
 """Relative difference up to which two errors are called equal."""
 
@@ -154,7 +157,7 @@ def view_errors(validation: Validation, what: str, with_before: bool = True) -> 
             blocks.append(build_error_summary(rest, caption, with_before))
         else:
             blocks += build_kind_summary(rest, caption, with_before)
-    return blocks
+    return [*blocks, *(str(f) for f in validation.findings if f.code.startswith(CONFORMITY))]
 
 
 def view_validation(validation: Validation, with_before: bool, verbose: bool) -> list[Block]:
@@ -167,7 +170,8 @@ def view_validation(validation: Validation, with_before: bool, verbose: bool) ->
     blocks = view_errors(validation, "measured", with_before)
     if with_before:
         blocks += describe_improvements(validation)
-    notes = [f for f in validation.findings if f.severity is not Severity.FAILURE]
+    others = (f for f in validation.findings if not f.code.startswith(CONFORMITY))
+    notes = [f for f in others if f.severity is not Severity.FAILURE]
     if notes:
         blocks += ["", *format_list([(f.severity.value, str(f)) for f in notes])]
     if verbose:

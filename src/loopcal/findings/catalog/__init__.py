@@ -33,7 +33,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "outliers": ("outliers",),
     "data": ("conventions", "data"),
     "mechanism": ("kinematics", "limits", "singularity", "mechanism"),
-    "apply": ("validation", "accuracy", "compensation"),
+    "apply": ("validation", "accuracy", "compensation", "conformity"),
     "sampling": ("sampling",),
     "studies": ("study",),
     "plan": ("plan",),

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conformity with a limit: the stated probability is that of the truth, and the rule follows it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal, norm
+
+from loopcal.apply import Decision, judge_estimate, judge_largest_error, validate
+from loopcal.apply.conformity import judge_limits
+from loopcal.errors import EstimationError
+from loopcal.estimate import identify
+from loopcal.findings import Severity
+from loopcal.io import load_robot
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import Component, Instrument, Sensor, sample_truth, simulate
+from loopcal.mechanism import Mechanism
+from loopcal.report.validation_view import view_validation
+from tests.estimate.problems import UM, noise
+
+
+def isotropic(sigma: float, count: int) -> np.ndarray:
+    """Return covariances (e, 3, 3) of equal noise."""
+    return np.tile(sigma**2 * np.eye(3), (count, 1, 1))
+
+
+def test_estimate_of_12_um_against_15_um_conforms_with_98_percent() -> None:
+    judged = judge_estimate(12 * UM, 1.5 * UM, 15 * UM)
+    assert judged.probability == pytest.approx(norm.cdf(2.0))
+    assert judged.expanded == pytest.approx(1.96 * 1.5 * UM, rel=1e-3)
+    assert judged.guard_band == pytest.approx(1.6449 * 1.5 * UM, rel=1e-3)  # JCGM 106, 8.3.2
+    assert judged.decision is Decision.CONFORMS
+
+
+def test_rule_accepts_up_to_the_acceptance_limit() -> None:
+    edge = judge_estimate(12 * UM, 1.5 * UM, 15 * UM).acceptance_limit
+    assert judge_estimate(0.999 * edge, 1.5 * UM, 15 * UM).decision is Decision.CONFORMS
+    assert judge_estimate(1.001 * edge, 1.5 * UM, 15 * UM).decision is Decision.UNDECIDED
+    assert judge_estimate(19 * UM, 1.5 * UM, 15 * UM).decision is Decision.FAILS
+    assert judge_estimate(12 * UM, 1.5 * UM, 15 * UM, level=0.99).decision is Decision.UNDECIDED
+
+
+def test_few_degrees_of_freedom_lower_the_probability() -> None:
+    known, estimated = (judge_estimate(12.0, 1.5, 15.0, degrees=n) for n in (np.inf, 3.0))
+    assert estimated.probability < known.probability
+    assert estimated.guard_band > known.guard_band
+
+
+def test_exact_values_conform_or_fail_with_certainty() -> None:
+    assert judge_estimate(15.0, 0.0, 15.0).probability == 1.0
+    errors = np.array([[3.0, 4.0, 0.0], [1.0, np.nan, np.nan]])
+    for limit, probability in ((5.001, 1.0), (4.999, 0.0)):
+        judged = judge_largest_error(errors, np.zeros((2, 3, 3)), limit)
+        assert judged.probability == probability
+        assert judged.estimate == pytest.approx(5.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.5, 1.0, float("nan")])
+def test_senseless_levels_are_refused(value) -> None:
+    with pytest.raises(EstimationError, match=r"above 0\.5 and below 1"):
+        judge_estimate(1.0, 1.0, 1.0, level=value)
+
+
+def test_senseless_estimates_are_refused() -> None:
+    with pytest.raises(EstimationError, match="finite numbers"):
+        judge_estimate(float("nan"), 1.0, 1.0)
+    with pytest.raises(EstimationError, match="no error is measured"):
+        judge_largest_error(np.full((1, 3), np.nan), np.zeros((1, 3, 3)), 1.0)
+
+
+def test_distribution_is_that_of_drawn_errors() -> None:
+    """Correlated noise of unequal components, against drawing tau and the errors."""
+    rng = np.random.default_rng(0)
+    errors, count = 2.0 * rng.normal(size=(6, 3)), 20_000
+    noise = np.array([[1.0, 0.5, 0.0], [0.5, 2.0, 0.0], [0.0, 0.0, 0.1]])
+    scales = np.exp(np.linspace(np.log(1e-3), np.log(40.0), 300))
+    log_weight = [
+        np.log(s) + multivariate_normal.logpdf(errors, cov=noise + s**2 * np.eye(3)).sum()
+        for s in scales
+    ]
+    weight = np.exp(log_weight - np.max(log_weight))
+    drawn = rng.choice(len(scales), count, p=weight / weight.sum())
+    largest = np.empty(count)
+    for k in np.unique(drawn):
+        V = np.linalg.inv(np.linalg.inv(noise) + np.eye(3) / scales[k] ** 2)
+        mean, chosen = errors @ np.linalg.inv(noise) @ V, drawn == k
+        shape = (int(chosen.sum()), 6)
+        t = mean + rng.multivariate_normal(np.zeros(3), V, shape)
+        largest[chosen] = np.sqrt((t**2).sum(axis=2)).max(axis=1)
+    judged = judge_largest_error(errors, np.tile(noise, (6, 1, 1)), 6.0)
+    assert judged.probability == pytest.approx((largest <= 6.0).mean(), abs=0.01)
+    expected = np.quantile(largest, [0.025, 0.5, 0.975, 0.95])
+    assert [judged.low, judged.estimate, judged.high, judged.bound] == pytest.approx(
+        expected, rel=0.015
+    )
+
+
+def test_groups_of_many_similar_errors_change_little(monkeypatch) -> None:
+    errors = 1.5 * np.random.default_rng(1).normal(size=(3000, 3))
+    grouped = judge_largest_error(errors, isotropic(1.0, 3000), 5.5)
+    monkeypatch.setattr("loopcal.apply.conformity.MOST", 3000)
+    single = judge_largest_error(errors, isotropic(1.0, 3000), 5.5)
+    assert grouped.probability == pytest.approx(single.probability, abs=2e-3)
+    assert grouped.bound == pytest.approx(single.bound, rel=1e-3)
+
+
+def test_components_that_are_not_measured_do_not_count() -> None:
+    errors = np.array([[1.0, np.nan, np.nan], [-2.0, np.nan, np.nan], [0.5, np.nan, np.nan]])
+    full = judge_largest_error(errors, isotropic(0.3, 3), 2.2)
+    one = judge_largest_error(errors[:, :1], isotropic(0.3, 3)[:, :1, :1], 2.2)
+    assert full.probability == pytest.approx(one.probability, rel=1e-9)
+
+
+def measure_positions(machine: Mechanism, points: np.ndarray, sigma: float, seed: int):
+    """Measure x, y and z of commanded points with this noise [m]."""
+    instrument = Instrument((Sensor(Component(("x", "y", "z")), noise(sigma, sigma, sigma)),))
+    return simulate(machine, points, instrument, seed, controller=machine.nominal)
+
+
+@pytest.fixture(scope="module")
+def statements() -> np.ndarray:
+    """Stated probability, and whether the truth conforms, for limits near the measured error.
+
+    Each machine has errors within its tolerances, and is calibrated and validated by measurements
+    with noise; half of the calibrations leave errors of the arms in the machine. The true error is
+    the one of the same poses without the noise of the validation.
+    """
+    nominal, rows = load_robot("linear-delta"), []
+    names = [n for n in nominal.parameters.names if not n.endswith((".length", "1.stop"))]
+    rigid = replace(nominal, parameters=nominal.parameters.with_free(names))
+    machines = sample_truth(nominal, 28, seed=5)
+    for i, values in enumerate(machines):
+        rng = np.random.default_rng(i)
+        truth = nominal.with_values(nominal.values + 0.1 * (values - nominal.values))
+        points = rng.uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.05], (24, 3))
+        sigma = 10 ** rng.uniform(0.3, 1.7) * UM
+        fit = identify(
+            (nominal, rigid)[i % 2], measure_positions(truth, points[:16], sigma, seed=i)
+        )
+        measured = measure_positions(truth, points[16:], sigma, seed=1000 + i)
+        exact = measure_positions(truth, points[16:], 1e-6 * sigma, seed=i)
+        result, true = validate(fit, measured), validate(fit, exact).after.position.max()
+        for share in (0.4, 0.6, 0.8, 1.0, 1.3):
+            limit = share * result.after.position.max()
+            judged = judge_limits(measured.observations, result.after, {"position": limit})
+            rows.append((judged["position"].probability, true <= limit))
+    return np.array(rows)
+
+
+def test_stated_probabilities_are_the_shares_that_conform(statements) -> None:
+    probability, conforms = statements.T
+    assert len(probability) == 140
+    confident = probability >= 0.9
+    assert confident.sum() > 30
+    assert conforms[confident].mean() >= 0.93
+    doubtful = (probability > 0.05) & (probability < 0.9)
+    assert conforms[doubtful].mean() == pytest.approx(probability[doubtful].mean(), abs=0.2)
+    assert conforms[probability < 0.05].mean() < 0.08
+
+
+@pytest.fixture(scope="module")
+def held_out():
+    """Return a fit of the linear delta and held-out rows with noise of 20 um."""
+    robot = load_robot("linear-delta")
+    points = np.random.default_rng(0).uniform(-0.06, 0.06, (28, 3)) * [1.0, 1.0, 0.5]
+    data = measure_positions(robot, points, 20 * UM, seed=0)
+    return identify(robot, data.take(np.arange(28) < 18)), data.take(np.arange(28) >= 18)
+
+
+def test_validation_states_conformity_on_the_page_and_in_the_result(held_out) -> None:
+    result = validate(*held_out, limit_position=0.2e-3)
+    text = str(view_validation(result, True, False))
+    assert "Largest position error of 10, without the noise of the measurement: 0.0" in text
+    assert "mm (95 %) against the limit 0.2 mm: conforms with more than 99.9 % probability" in text
+    stored = json.loads(to_json(result.to_dict()))["conformity"]["position"]
+    assert stored["decision"] == "conforms"
+    assert stored["acceptance_limit"] < stored["limit"] == 0.2e-3
+    assert "orientation" not in result.conformity
+
+
+def test_limit_that_noise_leaves_open_is_a_warning(held_out) -> None:
+    largest = validate(*held_out, limit_position=1.0).conformity["position"]
+    limit = 0.5 * (largest.estimate + largest.bound)
+    result = validate(*held_out, limit_position=limit)
+    (found,) = (f for f in result.findings if f.code.startswith("conformity."))
+    assert (found.code, found.severity) == ("conformity.undecided", Severity.WARNING)
+    assert "neither conformity nor nonconformity is shown" in str(found)
+
+
+def test_noise_that_nobody_stated_gives_no_probability(held_out) -> None:
+    fit, data = held_out
+    assumed = tuple(replace(o, is_noise_assumed=True) for o in data.observations)
+    result = validate(fit, replace(data, observations=assumed), limit_position=1e-3)
+    assert not result.conformity
+    assert any(f.code == "conformity.noise-not-stated" for f in result.findings)
+
+
+def test_setup_fitted_to_the_same_rows_leaves_less_noise_to_subtract(held_out) -> None:
+    _, data = held_out
+    errors = validate(*held_out).after
+    full, part = (
+        judge_limits(data.observations, errors, {"position": 1e-3}, share)["position"]
+        for share in (1.0, 0.5)
+    )
+    assert part.estimate > full.estimate
