@@ -12,10 +12,14 @@ import _thread
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from loopcal.cli.time_limit import TimeLimitError
+
+DELAY = 0.01
+"""From a lost interrupt to the next one [s], so that the callback has ended and a wait has begun."""
 
 
 @contextmanager
@@ -41,6 +45,7 @@ def repeat_lost_interrupts() -> Iterator[None]:
 
 def _interrupt() -> None:
     """Interrupt the main thread, also while it waits where the operating system has signals."""
+    time.sleep(DELAY)
     main = threading.main_thread().ident
     if main is not None and hasattr(signal, "pthread_kill"):
         signal.pthread_kill(main, signal.SIGINT)
