@@ -22,7 +22,7 @@ def make_cluster(workers: int) -> Any:
     import distributed
 
     cluster: Any = distributed.LocalCluster  # its annotations leave out what is documented
-    return cluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+    return cluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from loopcal.studies.files.store import NAME, open_store
 from loopcal.studies.files.study_folder import StudySource, extend_study, open_study, read_study
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.running import read_source, run_study
+from loopcal.studies.simulation.tasks import BlockTask, PosesTask
 from tests.findings.expectations import expect_refusal, list_codes
 from tests.studies.small_study import CELLS, write_study
 
@@ -158,26 +160,43 @@ def test_shares_are_disjoint_and_their_folders_join_to_the_whole(
         merge_studies([folders[0], tmp_path / "other"], tmp_path / "third")
 
 
+@dataclass
 class GivesUp:
-    """Workers that give up every block of number 1 (a stand-in for blocks that need too much
-    memory; `test_execution` has processes that are really killed).
+    """Workers that give up some tasks (a stand-in for tasks that need too much memory;
+    `test_execution` has processes that are really killed).
     """
+
+    is_given_up: Callable[[BlockTask | PosesTask], bool]
 
     def map_blocks(self, function, tasks):
         for task in tasks:
-            result = None if task.block == 1 else function(task)
-            yield Answer(task, result, 0.1, 5 if task.block == 1 else 0)
+            is_lost = self.is_given_up(task)
+            yield Answer(task, None if is_lost else function(task), 0.1, 5 if is_lost else 0)
 
 
-def test_blocks_that_are_given_up_are_reported_and_computed_the_next_time(tmp_path) -> None:
+def is_second_block(task: BlockTask | PosesTask) -> bool:
+    return isinstance(task, BlockTask) and task.block == 1
+
+
+def is_poses_of_twelve(task: BlockTask | PosesTask) -> bool:
+    return isinstance(task, PosesTask) and '"count":12' in task.content
+
+
+@pytest.mark.parametrize(
+    ("is_given_up", "missing", "losses", "named"),
+    [(is_second_block, 4, 20, "cell 0, block 1"), (is_poses_of_twelve, 8, 10, "cell 2, poses")],
+)
+def test_tasks_that_are_given_up_are_reported_and_computed_the_next_time(
+    tmp_path, is_given_up, missing, losses, named
+) -> None:
     source = read_source(write_study(tmp_path))
-    report = run_study(source, tmp_path / "study", GivesUp())
-    assert (report.computed, len(report.given_up), report.losses) == (12, 4, 20)
+    report = run_study(source, tmp_path / "study", GivesUp(is_given_up))
+    assert (report.computed, report.losses) == (16 - missing, losses)
     assert not report.is_complete
     assert list_codes(report.findings) == {"workers.lost", "workers.blocks-given-up"}
-    assert "cell 0, block 1" in str(report.findings[1])
+    assert named in str(report.findings[1])
     again = run_study(source, tmp_path / "study", Serial(), resume=True)
-    assert (again.computed, again.is_complete) == (4, True)
+    assert (again.computed, again.is_complete) == (missing, True)
 
 
 def test_two_processes_give_the_same_blocks_and_little_overhead(undisturbed, tmp_path) -> None:

@@ -198,7 +198,8 @@ def test_dask_without_scheduler_or_workers_is_refused() -> None:
 
 def test_scheduler_that_ends_is_reported() -> None:
     cluster = make_cluster(1)
-    answers = Dask(cluster.scheduler_address).map_blocks(draw_numbers, list_tasks(500, pause=0.05))
+    workers = Dask(cluster.scheduler_address, patience=2.0)  # also to wait for it to come back
+    answers = workers.map_blocks(draw_numbers, list_tasks(500, pause=0.05))
     next(answers)
     cluster.close()
     with expect_refusal("workers.cluster-lost", StudyError):

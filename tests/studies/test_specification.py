@@ -205,14 +205,12 @@ def test_a_key_does_not_change_with_anything_else():
     assert list_keys(replace(study, robots=sourced)) == keys
 
 
-def test_tasks_leave_out_what_is_finished():
+def test_tasks_are_those_of_the_chosen_cells_and_blocks():
     study = make_study(replicates=18, poses={"12": PosesLevel(12), "15": PosesLevel(15)})
     tasks = list(list_tasks(study))
     assert [(task.cell, task.block) for task in tasks] == [(c, b) for c in (0, 1) for b in range(3)]
     assert [task.key for task in tasks] == list_keys(study)
-    finished = frozenset(task.key for task in tasks[:4])
-    assert [task.key for task in list_tasks(study, finished=finished)] == list_keys(study)[4:]
-    assert {task.cell for task in list_tasks(study, [1])} == {1}
+    assert list(list_tasks(study, [1], [2, 0])) == [tasks[5], tasks[3]]
 
 
 def test_the_content_of_a_task_is_all_that_a_block_needs():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -12,8 +13,11 @@ from loopcal.findings import Finding, report_finding
 from loopcal.studies.execution import Executor
 from loopcal.studies.execution.interface import MOST_LOSSES
 from loopcal.studies.files.store import StudyStore
-from loopcal.studies.simulation.tasks import BlockTask, compute_block, list_tasks
+from loopcal.studies.schedule import Blocks, MissingBlock, Schedule
+from loopcal.studies.simulation.poses import CellPoses
+from loopcal.studies.simulation.tasks import BlockResult, PosesTask, compute_task
 from loopcal.studies.specification.cells import Cell
+from loopcal.studies.specification.keys import compute_key, describe_block
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
 
@@ -56,7 +60,8 @@ class RunReport:
     Attributes
     ----------
     total : blocks of the study, or of the share that was asked for. before : of these, stored when
-        it began. computed : stored by it. given_up : blocks that stopped every worker, by name.
+        it began. computed : stored by it.
+    given_up : blocks that stopped every worker, and cells whose poses did, by name.
     trials : that it stored. losses : workers that were lost, as far as is known.
     seconds : from start to end. worker_seconds : of computation, the sum over all workers.
     """
@@ -115,17 +120,23 @@ def run_blocks(
     computed = trials = losses = 0
     seconds, given_up = 0.0, []
     progress(before, total, "computing blocks")
-    tasks = _list_missing(study, store, share)
-    with closing(executor.map_blocks(compute_block, tasks)) as answers:  # type: ignore[type-var]
+    schedule = Schedule(_list_missing(study, store, share))
+    with closing(executor.map_blocks(compute_task, schedule)) as answers:
         for answer in answers:
-            task, losses = answer.task, losses + answer.losses
-            if answer.result is None:
+            task, result = answer.task, answer.result
+            losses, seconds = losses + answer.losses, seconds + answer.seconds
+            if isinstance(task, PosesTask):
+                if isinstance(result, CellPoses):
+                    schedule.add_poses(task, result)
+                else:
+                    given_up += [f"cell {cell}, poses" for cell in schedule.give_up(task)]
+                continue
+            if not isinstance(result, BlockResult):
                 given_up.append(f"cell {task.cell}, block {task.block}")
                 continue
-            levels, values = study.cells[task.cell].levels, answer.result.values
+            levels, values = study.cells[task.cell].levels, result.values
             if store.add_block(task.key, levels, task.block, values, answer.seconds):
                 computed, trials = computed + 1, trials + len(values)
-            seconds += answer.seconds
             progress(before + computed, total, "computing blocks")
     wall = time.perf_counter() - begin
     return RunReport(total, before, computed, trials, tuple(given_up), losses, wall, seconds)
@@ -142,10 +153,18 @@ def count_stored(study: Study, store: StudyStore, share: Share = WHOLE) -> int:
     return sum(store.count_blocks(cell.levels, blocks) for cell in share.select_cells(study))
 
 
-def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[BlockTask]:
-    """Yield the tasks whose blocks are not stored, one cell after the other."""
+def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blocks]:
+    """Yield, for one cell after the other, its blocks that are not stored."""
     blocks = share.select_blocks(study)
     for cell in share.select_cells(study):
-        if store.count_blocks(cell.levels, blocks) == len(blocks):
-            continue
-        yield from list_tasks(study, [cell.number], store.list_keys(cell.levels), blocks=blocks)
+        if store.count_blocks(cell.levels, blocks) < len(blocks):
+            yield _list_blocks(study, cell, blocks, store.list_keys(cell.levels))
+
+
+def _list_blocks(study: Study, cell: Cell, blocks: range, stored: AbstractSet[str]) -> Blocks:
+    """Yield the blocks of a cell whose keys are not stored."""
+    for block in blocks:
+        content = describe_block(study, cell, block)
+        key = compute_key(content)
+        if key not in stored:
+            yield MissingBlock(key, cell.number, content)

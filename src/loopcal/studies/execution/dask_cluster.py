@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,6 +20,9 @@ QUEUED = 2
 PATIENCE = 60.0
 """Seconds to wait for the scheduler, and for the first worker."""
 
+PERIOD = 1.0
+"""Seconds after which workers are counted again."""
+
 
 @dataclass(frozen=True)
 class Dask:
@@ -33,7 +37,7 @@ class Dask:
     patience: float = PATIENCE
 
     def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T]
+        self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks on the cluster; see `Executor.map_blocks`.
 
@@ -41,7 +45,7 @@ class Dask:
         """
         distributed = import_optional("distributed", "dask")
         with _connect(self.address, self.patience) as client:
-            queue = TaskQueue(tasks)
+            queue, slots = TaskQueue(tasks), _Slots(client, self.address)
             in_flight: dict[Any, T] = {}
             finished = distributed.as_completed(loop=client.loop)
 
@@ -55,7 +59,7 @@ class Dask:
                 finished.add(future)
                 return True
 
-            while len(in_flight) < _count_slots(client) and submit():
+            while len(in_flight) < slots.count() and submit():
                 pass
             for future in finished:
                 task = in_flight.pop(future)
@@ -64,19 +68,43 @@ class Dask:
                 except distributed.KilledWorker:
                     answer = None if queue.give_back(task) else queue.answer(task, None)
                 except (distributed.client.FutureCancelledError, distributed.comm.CommClosedError):
-                    finding = report_finding("workers.cluster-lost", address=self.address)
-                    raise StudyError(finding) from None
+                    raise _report_lost(self.address) from None
                 del future  # the scheduler forgets the result
-                while len(in_flight) < _count_slots(client) and submit():
-                    pass
                 if answer is not None:
                     yield answer
+                while len(in_flight) < slots.count() and submit():
+                    pass
 
 
-def _count_slots(client: Any) -> int:
-    """Return how many tasks may be in flight now; workers may come and go."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
-    return QUEUED * max(sum(worker["nthreads"] for worker in workers), 1)
+class _Slots:
+    """How many tasks may be in flight; workers may come and go.
+
+    Parameters
+    ----------
+    client : asked once in `PERIOD`, as the answer grows with the number of workers.
+    """
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address = client, address
+        self._count, self._end = 0, 0.0
+
+    def count(self) -> int:
+        """Return the number; raise StudyError where the scheduler is lost."""
+        if self._client.status != "running":
+            raise _report_lost(self._address)
+        now = time.monotonic()
+        if now > self._end:
+            try:
+                threads = sum(self._client.nthreads().values())
+            except OSError:
+                raise _report_lost(self._address) from None
+            self._count, self._end = QUEUED * max(threads, 1), now + PERIOD
+        return self._count
+
+
+def _report_lost(address: str) -> StudyError:
+    """Return the error of a scheduler that has ended."""
+    return StudyError(report_finding("workers.cluster-lost", address=address))
 
 
 @contextmanager

@@ -48,7 +48,7 @@ class Executor(Protocol):
     """Workers that compute tasks. Each kind of them is one class with this method."""
 
     def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T]
+        self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks and yield their answers as they finish, in any order.
 
@@ -58,7 +58,9 @@ class Executor(Protocol):
 
         Parameters
         ----------
-        function : pure, and importable by the workers: f(task) -> result. tasks : see `Task`.
+        function : pure, and importable by the workers: f(task) -> result.
+        tasks : see `Task`. None instead of a task says that the next one depends on an answer that
+            was not yielded yet; workers that are free wait for it.
 
         Raises
         ------
@@ -80,17 +82,27 @@ class TaskQueue(Generic[T]):
 
     Parameters
     ----------
-    tasks : taken one by one, when a worker is free.
+    tasks : taken one by one, when a worker is free; see `Executor.map_blocks`.
+
+    Attributes
+    ----------
+    is_exhausted : whether `tasks` has no further one.
     """
 
-    def __init__(self, tasks: Iterable[T]) -> None:
+    def __init__(self, tasks: Iterable[T | None]) -> None:
         self._tasks = iter(tasks)
         self._returned: deque[T] = deque()
         self._losses: dict[str, int] = {}
+        self.is_exhausted = False
 
     def take(self) -> T | None:
-        """Return the next task; None where there is none."""
-        task = next(self._tasks, None)
+        """Return the next task; None where there is none, or none before the next answer."""
+        task = None
+        if not self.is_exhausted:
+            try:
+                task = next(self._tasks)
+            except StopIteration:
+                self.is_exhausted = True
         if task is None and self._returned:
             task = self._returned.popleft()
         return task

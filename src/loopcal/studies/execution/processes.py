@@ -44,7 +44,7 @@ class Processes:
     workers: int
 
     def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T]
+        self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks by processes; see `Executor.map_blocks`."""
         pool = _Pool(function, TaskQueue(tasks), self.workers)
@@ -76,9 +76,11 @@ class _Pool(Generic[T, R]):
         """Yield answers until no task is left."""
         from multiprocessing.connection import wait
 
-        first = [task for _ in range(self._size) if (task := self._queue.take()) is not None]
-        for task in first:
-            self._start(task)
+        for _ in range(self._size):
+            task = self._queue.take()
+            if task is None and self._queue.is_exhausted:
+                break
+            self._start(task)  # also without a task, as starting takes time
         while self._workers:
             for connection in wait(list(self._workers)):
                 worker = self._workers[connection]  # pyright: ignore[reportArgumentType]
@@ -89,17 +91,30 @@ class _Pool(Generic[T, R]):
                     continue
                 if not worker.is_ready:
                     worker.is_ready, self._failed_starts = True, 0
-                    self._send(worker)
+                    if worker.task is not None:
+                        self._send(worker, worker.task)
                     continue
-                task = worker.task
+                task, worker.task = worker.task, None
                 assert task is not None
                 if isinstance(message, BaseException):
                     raise message
-                worker.task = self._queue.take()
-                self._send(worker)
                 yield self._queue.answer(task, *message)
+            self._give_tasks()
 
-    def _start(self, task: T) -> None:
+    def _give_tasks(self) -> None:
+        """Give every free worker a task, replace lost ones, and end those that are not needed."""
+        for worker in [w for w in self._workers.values() if w.is_ready and w.task is None]:
+            task = self._queue.take()
+            if task is not None:
+                self._send(worker, task)
+            elif self._queue.is_exhausted:
+                self._forget(worker)
+        while len(self._workers) < self._size and (task := self._queue.take()) is not None:
+            self._start(task)
+        workers = self._workers.values()
+        assert not workers or any(w.task is not None or not w.is_ready for w in workers)
+
+    def _start(self, task: T | None) -> None:
         """Start a worker for a task, which it receives when it is ready."""
         from multiprocessing import get_context
 
@@ -111,31 +126,24 @@ class _Pool(Generic[T, R]):
         theirs.close()  # so that our end notices when the process ends
         self._workers[ours] = _Worker(process, ours, task=task)
 
-    def _send(self, worker: _Worker[T]) -> None:
-        """Send a worker its task, or end it where none is left."""
-        if worker.task is None:
-            self._forget(worker)
-            return
+    def _send(self, worker: _Worker[T], task: T) -> None:
+        """Send a worker its task."""
+        worker.task = task
         with suppress(OSError):  # it has ended, which the next message shows
-            worker.connection.send(worker.task)
+            worker.connection.send(task)
 
     def _replace(self, worker: _Worker[T]) -> Iterator[Answer[T, R]]:
-        """Start a worker in place of one that has ended, and yield a task that is given up."""
+        """Forget a worker that has ended, and yield its task where that is given up."""
         self._forget(worker)
         task = worker.task
-        assert task is not None
         if not worker.is_ready:
             self._failed_starts += 1
             if self._failed_starts >= MOST_FAILED_STARTS:
                 code = worker.process.exitcode
                 raise StudyError(report_finding("workers.not-started", exit=code))
             self._start(task)
-            return
-        if not self._queue.give_back(task):
+        elif task is not None and not self._queue.give_back(task):
             yield self._queue.answer(task, None)
-        following = self._queue.take()
-        if following is not None:
-            self._start(following)
 
     def _forget(self, worker: _Worker[T]) -> None:
         """Close the pipe of a worker, which ends it."""

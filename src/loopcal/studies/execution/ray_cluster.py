@@ -33,7 +33,7 @@ class Ray:
     processors: int | None = None
 
     def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T]
+        self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks on the cluster; see `Executor.map_blocks`.
 

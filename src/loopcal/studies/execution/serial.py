@@ -14,9 +14,10 @@ class Serial:
     """No workers: this process computes."""
 
     def map_blocks(
-        self, function: Callable[[T], R], tasks: Iterable[T]
+        self, function: Callable[[T], R], tasks: Iterable[T | None]
     ) -> Generator[Answer[T, R], None, None]:
         """Compute tasks in their order; see `Executor.map_blocks`."""
         for task in tasks:
+            assert task is not None  # all answers have been yielded
             result, seconds = compute_timed(function, task)
             yield Answer(task, result, seconds)

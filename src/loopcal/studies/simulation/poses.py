@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured and held-out poses of a cell, which the driver computes once and adds to its tasks."""
+"""Measured and held-out poses of a cell, which are computed once and are part of its tasks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from loopcal.measure import Instrument
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.mechanism import sample_workspace
 from loopcal.planning import PlanOptions, plan
 from loopcal.studies.simulation.instruments import make_instrument
 from loopcal.studies.simulation.machines import build_robot_of, change_tolerances
@@ -21,34 +21,63 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Scores,
 )
-from loopcal.typing import FloatArray
+
+TOLERANCES = ("tolerance_factor", "tolerances")
+"""Settings of errors that change the tolerances, and with them planned poses."""
 
 
-def add_poses(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the controlled coordinates [m, rad] of the measured and held-out poses of a block,
-    from its description.
+@dataclass(frozen=True, eq=False)
+class CellPoses:
+    """The poses of all blocks of a cell, and of all cells that have the same ones.
+
+    Attributes
+    ----------
+    measured, held_out : controlled coordinates [m, rad], a list for each pose.
     """
-    errors = read_record(ErrorsLevel, content["errors"])
-    robot = change_tolerances(build_robot_of(content["robot"]), errors)
+
+    measured: list[list[float]]
+    held_out: list[list[float]]
+
+
+def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return everything that determines the poses of a block, from its description.
+
+    Drawn poses depend on the machine only. Planned ones also depend on what is measured, and on the
+    tolerances.
+    """
     level = read_record(PosesLevel, content["poses"])
-    instrument = make_instrument(
-        read_record(InstrumentLevel, content["instrument"]),
-        read_record(NoiseLevel, content["noise"]),
-    )
-    scores = read_record(Scores, content["scores"])
-    seed = content["seed"]
-    measured = choose_poses(robot, instrument, level, seed if level.seed is None else level.seed)
-    held_out = sample_workspace(robot.nominal, scores.held_out, seed + 1).coordinates
-    return {"measured": measured.tolist(), "held_out": held_out.tolist()}
+    description = {key: content[key] for key in ("robot", "poses", "seed")}
+    description["held_out"] = read_record(Scores, content["scores"]).held_out
+    if is_planned(level):
+        errors = content["errors"]
+        tolerances = {key: errors[key] for key in TOLERANCES if key in errors}
+        description |= {key: content[key] for key in ("instrument", "noise")}
+        description["errors"] = tolerances
+    return description
 
 
-def choose_poses(
-    robot: Mechanism, instrument: Instrument, level: PosesLevel, seed: int
-) -> FloatArray:
-    """Return coordinates (n, c) of poses: given ones, drawn from the workspace, or planned."""
+def compute_poses(description: Mapping[str, Any]) -> CellPoses:
+    """Return the poses of a description: given ones, drawn from the workspace, or planned."""
+    level, seed = read_record(PosesLevel, description["poses"]), description["seed"]
+    robot = build_robot_of(description["robot"])
+    held_out = sample_workspace(robot.nominal, description["held_out"], seed + 1).coordinates
+    seed = seed if level.seed is None else level.seed
     if level.coordinates:
-        return np.array(level.coordinates)
-    if level.choice == "random":
-        return sample_workspace(robot.nominal, level.count, seed).coordinates
-    options = PlanOptions(n_poses=level.count, hold_out=0, seed=seed)
-    return plan(robot.nominal, instrument, options=options).poses.coordinates
+        measured = np.array(level.coordinates)
+    elif not is_planned(level):
+        measured = sample_workspace(robot.nominal, level.count, seed).coordinates
+    else:
+        errors = read_record(ErrorsLevel, description["errors"])
+        instrument = make_instrument(
+            read_record(InstrumentLevel, description["instrument"]),
+            read_record(NoiseLevel, description["noise"]),
+        )
+        options = PlanOptions(n_poses=level.count, hold_out=0, seed=seed)
+        chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)
+        measured = chosen.poses.coordinates
+    return CellPoses(measured.tolist(), held_out.tolist())
+
+
+def is_planned(level: PosesLevel) -> bool:
+    """Return whether the poses of a level are planned, which takes as long as many trials."""
+    return level.choice == "planned" and not level.coordinates

@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit of work of a study: a block of trials of one cell."""
+"""The work of a study, for any worker: the poses of a cell, and blocks of its trials."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Any
 
 from loopcal.studies.simulation.block import compute_scores
-from loopcal.studies.simulation.poses import add_poses
+from loopcal.studies.simulation.poses import CellPoses, compute_poses, describe_poses
 from loopcal.studies.specification.keys import compute_key, describe_block, format_json
 from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray
+
+
+@dataclass(frozen=True)
+class PosesTask:
+    """Poses to draw or to plan. `content` : what determines them, as JSON. `key` : its hash."""
+
+    key: str
+    content: str
 
 
 @dataclass(frozen=True)
@@ -61,24 +68,42 @@ def compute_block(task: BlockTask) -> BlockResult:
     return BlockResult(task.key, compute_scores(content))
 
 
-def list_tasks(
-    study: Study,
-    cells: Sequence[int] | None = None,
-    finished: AbstractSet[str] = frozenset(),
-    blocks: Sequence[int] | None = None,
-) -> Iterator[BlockTask]:
-    """Yield the tasks of these blocks of these cells, of all by default, whose keys are not
-    finished.
+def compute_task(task: BlockTask | PosesTask) -> BlockResult | CellPoses:
+    """Compute a block or poses; a pure function of the task.
 
-    The poses of a cell are drawn or planned when its first task is made.
+    Raises
+    ------
+    LoopcalError : as `compute_block`.
+    """
+    if isinstance(task, PosesTask):
+        return compute_poses(json.loads(task.content))
+    return compute_block(task)
+
+
+def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
+    """Return the task of the poses of a block, from its description."""
+    description = describe_poses(content)
+    return PosesTask(compute_key(description), format_json(description))
+
+
+def make_block_task(key: str, cell: int, content: Mapping[str, Any], poses: CellPoses) -> BlockTask:
+    """Return the task of a block, from its description and its poses."""
+    complete = {**content, "measured": poses.measured, "held_out": poses.held_out}
+    return BlockTask(key, cell, content["block"], format_json(complete))
+
+
+def list_tasks(
+    study: Study, cells: Sequence[int] | None = None, blocks: Sequence[int] | None = None
+) -> Iterator[BlockTask]:
+    """Yield the tasks of these blocks of these cells, of all by default.
+
+    The poses of a cell are drawn or planned when its first task is made. The driver of a study
+    leaves them to workers instead, see `loopcal.studies.schedule`.
     """
     for number in range(len(study.cells)) if cells is None else cells:
         cell = study.cells[number]
-        poses: Mapping[str, object] | None = None
+        poses: CellPoses | None = None
         for block in range(study.blocks) if blocks is None else blocks:
             content = describe_block(study, cell, block)
-            key = compute_key(content)
-            if key in finished:
-                continue
-            poses = add_poses(content) if poses is None else poses
-            yield BlockTask(key, number, block, format_json({**content, **poses}))
+            poses = compute_poses(describe_poses(content)) if poses is None else poses
+            yield make_block_task(compute_key(content), number, content, poses)
