@@ -93,7 +93,7 @@ class TaskQueue(Generic[T]):
         self._tasks = iter(tasks)
         self._returned: deque[T] = deque()
         self._losses: dict[str, int] = {}
-        self.is_exhausted = False
+        self.is_exhausted: bool = False
 
     def take(self) -> T | None:
         """Return the next task; None where there is none, or none before the next answer."""
