@@ -10,10 +10,11 @@ from scipy import stats
 from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from, recalibrate
 from loopcal.estimate.inference.posterior import posterior_from_arrays
 from loopcal.estimate.inference.prior import with_shown_noise
-from loopcal.estimate.recalibration import CHANGE_LEVEL, Change, _average_tail
+from loopcal.estimate.recalibration import CHANGE_LEVEL, Change
 from loopcal.io import load_robot
 from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate
 from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.numerics.chi_square import compute_averaged_tail
 from tests.estimate.problems import UM, noise
 
 DELTA = load_robot("linear-delta")
@@ -110,11 +111,11 @@ def test_the_shown_noise_replaces_that_of_a_wrong_sigma() -> None:
 def test_probability_with_estimated_noise_is_the_f_distribution_for_one_source() -> None:
     for ratio in (0.5, 1.0, 2.0, 3.0):
         for nu in (6.0, 30.0):
-            p_value = _average_tail(7.0 * ratio, 7.0, [(7.0, nu)])
+            p_value = compute_averaged_tail(7.0 * ratio, 7.0, [(7.0, nu)])
             assert p_value == pytest.approx(stats.f.sf(ratio, 7.0, nu), rel=0.02, abs=1e-4)
-        known = _average_tail(7.0 * ratio, 7.0, [(3.0, np.inf), (4.0, np.inf)])
+        known = compute_averaged_tail(7.0 * ratio, 7.0, [(3.0, np.inf), (4.0, np.inf)])
         assert known == pytest.approx(stats.chi2.sf(7.0 * ratio, 7.0), rel=1e-12)
-    two = _average_tail(14.0, 7.0, [(3.0, 8.0), (4.0, np.inf)])
+    two = compute_averaged_tail(14.0, 7.0, [(3.0, 8.0), (4.0, np.inf)])
     assert stats.chi2.sf(14.0, 7.0) < two < stats.f.sf(2.0, 7.0, 8.0)
 
 

@@ -15,6 +15,10 @@ from loopcal.apply.error_budget import ErrorBudget as ErrorBudget
 from loopcal.apply.error_budget import ErrorSources as ErrorSources
 from loopcal.apply.error_budget import compute_error_budget as compute_error_budget
 from loopcal.apply.reused_rows import report_reused_rows as report_reused_rows
+from loopcal.apply.run_comparison import PairComparison as PairComparison
+from loopcal.apply.run_comparison import RunComparison as RunComparison
+from loopcal.apply.run_comparison import StoredRun as StoredRun
+from loopcal.apply.run_comparison import compare_runs as compare_runs
 from loopcal.apply.validation import Validation as Validation
 from loopcal.apply.validation import validate as validate
 from loopcal.apply.workspace_accuracy import AccuracyMap as AccuracyMap

@@ -212,7 +212,7 @@ def compare_with_values(
     """
     table = fit.robot.parameters
     if isinstance(values, Mechanism):
-        _refuse_other_dimensions(fit.robot, values)
+        refuse_other_dimensions(fit.robot, values)
         values = dict(zip(table.names, map(float, values.values), strict=True))
     for name, value in values.items():
         if name not in table.names:
@@ -243,10 +243,22 @@ def _refuse_other_fixed_values(fit: Identification, values: Mapping[str, float])
             raise EstimationError(report_finding("comparison.fixed-differs", **data))
 
 
-def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
+def refuse_other_dimensions(
+    robot: Mechanism, stored: Mechanism, names: tuple[str, str] | None = None
+) -> None:
     """Refuse a machine that has other poses with the same values of all parameters: those of the
     robot or, where it reaches no pose with them, the stored ones.
+
+    Parameters
+    ----------
+    names : of both in messages; default: those of the robots.
+
+    Raises
+    ------
+    EstimationError : other parameters, `comparison.other-dimensions` or
+        `comparison.nothing-reached`.
     """
+    called, given = names or (robot.name, stored.name)
     if stored.parameters.names != robot.parameters.names:
         raise EstimationError(
             f"{stored.name!r} does not have the parameters of {robot.name!r}; give a robot file of "
@@ -260,7 +272,7 @@ def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
             break
     else:
         code = "comparison.nothing-reached"
-        raise EstimationError(report_finding(code, stored=stored.name, robot=robot.name))
+        raise EstimationError(report_finding(code, stored=given, robot=called))
     mine, theirs = (state.T[0][is_reached] for state in states)
     apart = np.linalg.norm(mine[:, :3, 3] - theirs[:, :3, 3], axis=1).max()
     if apart <= EQUAL * robot.size:
@@ -270,8 +282,8 @@ def _refuse_other_dimensions(robot: Mechanism, stored: Mechanism) -> None:
     raise EstimationError(
         report_finding(
             "comparison.other-dimensions",
-            stored=stored.name,
-            robot=robot.name,
+            stored=given,
+            robot=called,
             apart=robot.to_quantity(float(apart), Dimension.LENGTH),
             rotation=float(np.rad2deg(np.linalg.norm(log_so3(rotation)))),
         )

@@ -28,6 +28,7 @@ from loopcal.estimate.fit_input import (
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
+from loopcal.estimate.inference.data_information import collect_information
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import (
     VarianceSources,
@@ -138,7 +139,10 @@ def identify(
         findings.append(open_poses.report("fit.poses-open-at-start"))
     rows = collect_used_rows(robot, data, options.prior)
     shown = find_shown_noise(fit.decomposition, result.residual_test)
-    posterior = replace(result.posterior, fitted_rows=rows, shown_noise=shown)
+    information = collect_information(free, fit.decomposition, result.residual_test)
+    posterior = replace(
+        result.posterior, fitted_rows=rows, shown_noise=shown, information=information
+    )
     return replace(result, posterior=posterior, findings=tuple(findings))
 
 

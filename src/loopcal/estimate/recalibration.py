@@ -13,7 +13,7 @@ of that noise. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -32,7 +32,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
-from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.numerics.chi_square import compute_averaged_tail
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 MOST_TRIED = 60
@@ -45,9 +45,6 @@ TOO_WELL = 1e-3
 """Probability of a chi-square as small as that of new data which contain rows of the earlier
 calibration in a form that `loopcal.measure.FittedRows` does not recognize.
 """
-
-NODES = 101
-"""Values of the true noise of each calibration over which a probability is averaged."""
 
 EXPLAINED = 0.5
 """A single parameter explains a change if freeing it leaves less than this share of chi-square."""
@@ -177,7 +174,7 @@ def assess_change(
     by_noise, known = _divide_by_source(prior, names, kept, freed)
     by_new = max(degrees - by_noise - known, 0.0)
     sources = ((by_noise, prior.noise_degrees), (known, np.inf), (by_new, noise_degrees))
-    p_value = _average_tail(gain, degrees, sources)
+    p_value = compute_averaged_tail(gain, degrees, sources)
     moved = p_value < CHANGE_LEVEL
     numbers = {"chi_square": gain, "degrees": degrees, "p_value": p_value, "level": CHANGE_LEVEL}
     code, single = "prior.machine-unchanged", {}
@@ -225,31 +222,6 @@ def _divide_by_source(
     part = np.maximum(part - _compute_leverage(prior.rows, kept), 0.0)
     share = np.ones(len(part)) if prior.noise_share is None else prior.noise_share
     return float(share @ part), float((1.0 - share) @ part)
-
-
-def _average_tail(
-    chi_square: float, degrees: float, sources: Sequence[tuple[float, float]]
-) -> float:
-    """Return the probability of a larger chi-square where noise was estimated: the mean over the
-    true noise, given the estimated one (Behrens and Fisher; with one source the F distribution).
-
-    The true variance of a source is nu / chi-square(nu) times the estimated one.
-
-    Parameters
-    ----------
-    sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
-        of freedom nu of its variance.
-    """
-    from scipy.special import chdtri
-
-    total = sum(part for part, _ in sources)
-
-    probability = (np.arange(NODES) + 0.5) / NODES
-    true = np.zeros(1)
-    for part, nu in sources:
-        times = np.ones(1) if np.isinf(nu) else nu / chdtri(nu, probability)
-        true = (true[:, None] + part / total * times).ravel()
-    return float(compute_chi_square_tail(degrees, chi_square / true).mean())
 
 
 def _compute_leverage(rows: FloatArray, fit: Identification) -> FloatArray:

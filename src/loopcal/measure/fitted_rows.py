@@ -66,6 +66,31 @@ class FittedRows:
         """Return the rows by name, `fitted_<i>_<kind>`, to be stored."""
         return {f"{PREFIX}_{i}_{kind}": rows for i, (kind, rows) in enumerate(self.groups)}
 
+    def count_shared(
+        self, other: FittedRows, readings: int, noise: Mapping[str, FloatArray]
+    ) -> int:
+        """Return how many of these rows are among those of another calibration.
+
+        Parameters
+        ----------
+        readings : number of actuators. noise : of each kind the standard deviation (m,) of its
+            measured values, as far as it is known [SI].
+        """
+        count = 0
+        for kind, content in self.groups:
+            width = 0 if kind == ActuatorReadings.name else readings
+            sd = np.zeros(content.shape[1])
+            if kind in noise and len(noise[kind]) == len(sd) - width:
+                sd[width:] = noise[kind]
+            poses = np.arange(len(content))[:, None]
+            rows = ComparedRows(kind, width, content, np.broadcast_to(sd, content.shape), poses)
+            shared = np.zeros(len(content), dtype=bool)
+            for name, fitted in other.groups:
+                is_same_form = name == kind and fitted.shape[1] == content.shape[1]
+                shared |= find_agreeing(rows, fitted, is_same_form)
+            count += int(shared.sum())
+        return count
+
     def find_in(self, data: Measurements) -> ReusedRows:
         """Return which rows of other measurements are among these; rows of weight 0 do not count.
 

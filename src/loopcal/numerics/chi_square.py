@@ -4,10 +4,15 @@
 scipy.special is imported when a function is called, so that `import loopcal` does not pay for it.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.typing import FloatArray
+
+NODES = 101
+"""Values of the true noise of each source over which a probability is averaged."""
 
 
 def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatArray:
@@ -75,3 +80,27 @@ def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLi
     known = compute_chi_square_quantile(degrees, probability) / np.asarray(degrees)
     estimated = fdtri(degrees, np.where(is_known, 1.0, left), 1.0 - np.asarray(probability))
     return np.where(is_known, known, estimated)
+
+
+def compute_averaged_tail(
+    chi_square: float, degrees: float, sources: Sequence[tuple[float, float]]
+) -> float:
+    """Return the probability of a larger chi-square where noise was estimated: the mean over the
+    true noise, given the estimated one (Behrens and Fisher; with one source the F distribution).
+
+    The true variance of a source is nu / chi-square(nu) times the estimated one.
+
+    Parameters
+    ----------
+    sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
+        of freedom nu of its variance.
+    """
+    from scipy.special import chdtri
+
+    total = sum(part for part, _ in sources)
+    probability = (np.arange(NODES) + 0.5) / NODES
+    true = np.zeros(1)
+    for part, nu in sources:
+        times = np.ones(1) if np.isinf(nu) else nu / chdtri(nu, probability)
+        true = (true[:, None] + part / total * times).ravel()
+    return float(compute_chi_square_tail(degrees, chi_square / true).mean())

@@ -24,6 +24,7 @@ from loopcal.estimate.inference.covariance_parts import (
     parts_from_arrays,
     store_parts,
 )
+from loopcal.estimate.inference.data_information import DataInformation, information_from_arrays
 from loopcal.estimate.inference.measured_frames import MeasuredFrames, frames_from_arrays
 from loopcal.estimate.inference.model_discrepancy import (
     DISCREPANCY,
@@ -63,6 +64,8 @@ class Posterior:
     discrepancy : slow errors of the poses that no geometry explains; None where none were found.
         Their effect on the parameters is one of the parts.
     shown_noise : the noise that the residuals alone show; None where it is not known.
+    information : what the data say without tolerances, to compare calibrations; None where it is
+        not known.
     """
 
     robot: Mechanism
@@ -76,6 +79,7 @@ class Posterior:
     fitted_rows: FittedRows | None = None
     discrepancy: ModelDiscrepancy | None = None
     shown_noise: ShownNoise | None = None
+    information: DataInformation | None = None
 
     def __repr__(self) -> str:
         """Return the robot's name and the numbers of parameters and of determined directions."""
@@ -133,7 +137,13 @@ class Posterior:
             for name, attribute in STORED.items()
         }
         own |= store_parts(self.parts, len(self.unit))
-        for value in (self.frames, self.fitted_rows, self.discrepancy, self.shown_noise):
+        for value in (
+            self.frames,
+            self.fitted_rows,
+            self.discrepancy,
+            self.shown_noise,
+            self.information,
+        ):
             own |= {} if value is None else value.arrays()
         return own
 
@@ -234,6 +244,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         fitted_rows_from_arrays(arrays),
         discrepancy_from_arrays(arrays),
         shown_noise_from_arrays(arrays),
+        information_from_arrays(arrays),
     )
 
 

@@ -29,6 +29,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "fit": ("fit", "prior", "poses", "setup"),
     "residuals": ("noise", "residuals"),
     "comparison": ("comparison",),
+    "run_comparison": ("runs",),
     "identifiability": ("identifiability", "model"),
     "outliers": ("outliers",),
     "data": ("conventions", "data"),

@@ -104,12 +104,17 @@ DISCREPANCY: Mapping[str, ArrayRule] = {
     "discrepancy_amplitude": ArrayRule("6", NOT_NEGATIVE),
 }
 NOISE: Mapping[str, ArrayRule] = {"posterior_shown_noise": ArrayRule("3", NUMBERS)}
+INFORMATION: Mapping[str, ArrayRule] = {
+    "information_rows": ArrayRule("directions p"),
+    "information_deviations": ArrayRule("directions"),
+    "information_noise": ArrayRule("2", NUMBERS),
+}
 FITTED = ArrayRule("rows values", NUMBERS)
 """Rules of arrays by name. Runs of format 1 may lack LATER; of the other groups, a run holds all
 arrays or none. `fitted_<number>_<kind>` are the fitted rows, one array for each kind.
 """
 
-RULES = {**FIT, **LATER, **FRAMES, **DISCREPANCY, **NOISE}
+RULES = {**FIT, **LATER, **FRAMES, **DISCREPANCY, **NOISE, **INFORMATION}
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
 
 
@@ -143,7 +148,7 @@ def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> 
     arrays : name -> array. is_complete : whether LATER are needed, as from format 2 on.
     """
     needed = [*FIT, *(LATER if is_complete else ())]
-    for group in (FRAMES, DISCREPANCY, NOISE):
+    for group in (FRAMES, DISCREPANCY, NOISE, INFORMATION):
         needed += group if any(name in arrays for name in group) else ()
     if missing := [name for name in needed if name not in arrays]:
         return f"the array {missing[0]!r} is missing"

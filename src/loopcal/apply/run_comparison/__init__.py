@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several calibrations side by side: sessions, robots or methods."""
+
+from loopcal.apply.run_comparison.comparison import RunComparison as RunComparison
+from loopcal.apply.run_comparison.comparison import compare_runs as compare_runs
+from loopcal.apply.run_comparison.pair_comparison import PairComparison as PairComparison
+from loopcal.apply.run_comparison.stored_run import StoredRun as StoredRun
