@@ -128,6 +128,7 @@ def test_a_value_out_of_range_is_refused_with_what_is_allowed(call, words, fit, 
 
 
 UNCHECKED = {
+    "compare_runs(runs)",  # checked by the function: whatever has the attributes of a run
     *(f"{name}(method)" for name in ("choose_model", "cross_validate", "identify")),
     *(f"{name}(method)" for name in ("identify_trials", "simulate_accuracy")),
     *(f"{name}(path)" for name in ("load_measurements", "load_run", "load_stored_values")),

@@ -47,6 +47,21 @@ def escape(text: str, allowed: str = "") -> str:
     return _NOT_PLAIN.sub(lambda m: m[0] if m[0] in allowed else _escape_one(m[0]), text)
 
 
+def escape_formula(text: str) -> str:
+    """Return an escaped cell that no spreadsheet takes for a formula; numbers stay numbers.
+
+    Examples
+    --------
+    >>> escape_formula("=1+1"), escape_formula("-0.5")
+    ("'=1+1", '-0.5')
+    """
+    try:
+        float(text)
+    except ValueError:
+        return ("'" if text[:1] in tuple("=+-@\t\r") else "") + escape(text)
+    return text
+
+
 def escape_json(text: str) -> str:
     r"""Return JSON text with the same content, in which strings are plain, by JSON's escapes.
 

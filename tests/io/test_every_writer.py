@@ -71,6 +71,7 @@ COMMANDS = {
         "bootstrap run --count 5 -o F.csv",
         "sample run --count 100 -o F.csv",
     ),
+    "io/runs/comparison_file.py:save_comparison": ("compare run second -o F.csv",),
     "io/runs/compensation_file.py:save_compensation": ("compensate run targets.csv -o F.csv",),
     "cli/commands/exchange_commands.py:export": (
         "export delta.yaml -o F.cfg",
@@ -185,6 +186,8 @@ def inputs(tmp_path_factory, root) -> Path:
         for command in (
             "simulate five-bar --draw 10 --kind position --draw-errors -o data.csv",
             "calibrate five-bar data.csv -o run",
+            "simulate five-bar --draw 10 --kind position --draw-errors -o more.csv --seed 2",
+            "calibrate five-bar more.csv -o second",
             "simulate linear-delta --draw-errors --draw 2 -o d.csv --truth delta.yaml",
             "import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml",
             "import robot.urdf --closures loops.yaml -o tripod.yaml",

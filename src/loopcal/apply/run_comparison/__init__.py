@@ -2,6 +2,8 @@
 """Several calibrations side by side: sessions, robots or methods."""
 
 from loopcal.apply.run_comparison.comparison import RunComparison as RunComparison
+from loopcal.apply.run_comparison.comparison import RunSummary as RunSummary
 from loopcal.apply.run_comparison.comparison import compare_runs as compare_runs
+from loopcal.apply.run_comparison.held_out_errors import QuantityErrors as QuantityErrors
 from loopcal.apply.run_comparison.pair_comparison import PairComparison as PairComparison
 from loopcal.apply.run_comparison.stored_run import StoredRun as StoredRun

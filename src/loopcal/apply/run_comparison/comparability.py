@@ -63,7 +63,7 @@ def refuse_incomparable(
         if one != other:
             data = {"what": what, "mine": one, "theirs": other}
             raise DataError(report_finding("runs.other-mechanism", **words, **data))
-    free = [tuple(row["name"] for row in run.result["fit"]["parameters"]) for run in (first, second)]
+    free = [list_free(run) for run in (first, second)]
     if not is_same_data and (name := _find_lonely(*free)):
         place = names[0] if name in free[0] else names[1]
         raise DataError(report_finding("runs.other-free", **words, name=name, place=place))
@@ -86,21 +86,23 @@ def _find_lonely(one: Sequence[str], other: Sequence[str]) -> str:
     return different[0] if different else ""
 
 
+def list_free(run: StoredRun) -> tuple[str, ...]:
+    """Return the names of the parameters that a run identified."""
+    return tuple(row["name"] for row in run.result["fit"]["parameters"])
+
+
 def _list_structure(one: Mechanism, other: Mechanism) -> list[tuple[str, str, str]]:
     """Return what must be equal, in words, and its text in both robots."""
+    table = other.parameters
+    theirs = [table.dimensions[table.index(name)] for name in one.parameters.names]
+    pairs = zip(one.parameters.names, one.parameters.dimensions, theirs, strict=True)
     return [
-        (
-            "actuators",
-            *(", ".join(f"{a.name} ({a.dimension.value})" for a in r.actuators) for r in (one, other)),
-        ),
+        ("actuators", _name_actuators(one), _name_actuators(other)),
         ("controlled coordinates", ", ".join(one.controlled), ", ".join(other.controlled)),
-        *(
-            (f"physical dimensions of {name}", mine.value, theirs.value)
-            for name, mine, theirs in zip(
-                one.parameters.names,
-                one.parameters.dimensions,
-                (other.parameters.dimensions[other.parameters.index(n)] for n in one.parameters.names),
-                strict=True,
-            )
-        ),
+        *((f"physical dimensions of {n}", a.value, b.value) for n, a, b in pairs),
     ]
+
+
+def _name_actuators(robot: Mechanism) -> str:
+    """Return the actuators with their physical dimensions."""
+    return ", ".join(f"{a.name} ({a.dimension.value})" for a in robot.actuators)

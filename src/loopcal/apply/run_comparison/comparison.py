@@ -7,13 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from loopcal.apply.run_comparison.comparability import check_runs, refuse_incomparable
+from loopcal.apply.run_comparison.comparability import check_runs, list_free, refuse_incomparable
 from loopcal.apply.run_comparison.held_out_errors import RunErrors, collect_errors
-from loopcal.apply.run_comparison.pair_comparison import (
-    PairComparison,
-    compare_pair,
-    relate_data,
-)
+from loopcal.apply.run_comparison.pair_comparison import PairComparison, compare_pair, relate_data
 from loopcal.apply.run_comparison.stored_run import StoredRun
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
@@ -132,14 +128,12 @@ def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) ->
     findings += notes
     if not poses and all(one.own for one in errors):
         findings.append(report_finding("runs.no-common-poses"))
-    parameters = tuple(dict.fromkeys(n for run in runs for n in _list_free(run)))
+    parameters = tuple(dict.fromkeys(n for run in runs for n in list_free(run)))
     table = first.robot.parameters
     dimensions = [table.dimensions[table.index(name)] for name in parameters]
     units = tuple(find_unit(first.robot.get_unit(d).symbol) for d in dimensions)
     summaries = tuple(_summarize(name, run) for name, run in zip(names, runs, strict=True))
-    return RunComparison(
-        summaries, parameters, units, tuple(pairs), errors, poses, tuple(findings)
-    )
+    return RunComparison(summaries, parameters, units, tuple(pairs), errors, poses, tuple(findings))
 
 
 def _name_runs(runs: Sequence[StoredRun]) -> tuple[str, ...]:
@@ -149,10 +143,6 @@ def _name_runs(runs: Sequence[StoredRun]) -> tuple[str, ...]:
         str(run.path) if names.count(name) > 1 else name
         for name, run in zip(names, runs, strict=True)
     )
-
-
-def _list_free(run: StoredRun) -> tuple[str, ...]:
-    return tuple(row["name"] for row in run.result["fit"]["parameters"])
 
 
 def _summarize(name: str, run: StoredRun) -> RunSummary:

@@ -29,6 +29,9 @@ from loopcal.typing import BoolArray, FloatArray
 CHANGE_LEVEL = 0.05
 """Probability that any of the compared machines is declared changed although none is."""
 
+CAUSE_LEVEL = 0.01
+"""Probability of rejecting the true cause of a change."""
+
 TOO_WELL = 1e-3
 """Probability of a chi-square as small as that of runs which share rows in another form."""
 
@@ -113,7 +116,9 @@ def relate_data(first: StoredRun, second: StoredRun) -> DataRelation:
         return DataRelation("unknown")
     noise = {**find_row_noise(first), **find_row_noise(second)}
     readings = len(first.robot.actuators)
-    shared = min(mine.count_shared(theirs, readings, noise), theirs.count_shared(mine, readings, noise))
+    shared = min(
+        one.count_shared(other, readings, noise) for one, other in ((mine, theirs), (theirs, mine))
+    )
     total = max(len(mine), len(theirs))
     kind = "independent" if not shared else "same" if shared == total else "shared"
     return DataRelation(kind, shared, total)
@@ -135,7 +140,8 @@ def compare_pair(
         return _leave_open(first, names, relation, finding)
     if relation.kind == "shared":
         data = {"shared": relation.shared, "total": relation.total}
-        return _leave_open(first, names, relation, report_finding("runs.rows-shared", **words, **data))
+        finding = report_finding("runs.rows-shared", **words, **data)
+        return _leave_open(first, names, relation, finding)
     for name, run in zip(names, (first, second), strict=True):
         if reason := _find_obstacle(run):
             finding = report_finding("runs.not-tested", **words, run=name, reason=reason)
@@ -163,7 +169,7 @@ def _test(
     cause_shift, cause_sd = nothing, nothing
     numbers = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
     if moved:
-        cause = explain_change(changes, CHANGE_LEVEL)
+        cause = explain_change(changes, CAUSE_LEVEL)
         if cause.parameters:
             cause_shift, cause_sd = estimate_cause(changes, cause)
         more = _word_cause(earlier, cause, cause_shift, cause_sd)

@@ -53,9 +53,7 @@ def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
     kinds: dict[str, list[tuple[tuple[str, ...], list[int]]]] = {
         "parameter": [((name,), [i]) for i, name in enumerate(changes.names)],
         "limb": [((limb,), places) for limb, places in limbs.items()],
-        "limbs": [
-            ((one, two), [*limbs[one], *limbs[two]]) for one, two in combinations(limbs, 2)
-        ],
+        "limbs": [((one, two), [*limbs[one], *limbs[two]]) for one, two in combinations(limbs, 2)],
     }
     for kind, causes in kinds.items():
         cause = _choose(changes, kind, causes, level)
@@ -103,9 +101,7 @@ def _choose(
     return ChangeCause(kind, names, parameters, tuple(others), left, degrees)
 
 
-def estimate_cause(
-    changes: ParameterChanges, cause: ChangeCause
-) -> tuple[np.ndarray, np.ndarray]:
+def estimate_cause(changes: ParameterChanges, cause: ChangeCause) -> tuple[np.ndarray, np.ndarray]:
     """Return the change (k,) and its standard deviation (k,) [SI] of the parameters of a cause if
     nothing else has changed; NaN where the data do not determine it.
     """
@@ -115,6 +111,6 @@ def estimate_cause(
         changes.unit[places],
         changes.slope[:, places],
         changes.value,
-        changes.sources,
+        changes.errors,
     )
     return alone.estimate_shifts()

@@ -17,6 +17,7 @@ covariance of u.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,13 +26,24 @@ from loopcal.estimate.inference.data_information import DataInformation
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.numerics.chi_square import compute_averaged_tail, compute_f_tail
 from loopcal.numerics.decomposition import NULL_COMPONENT, are_nonzero
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 PARALLEL = 1e-2
 """Sine of the angle up to which null directions of two linearizations are the same direction."""
 
 INDEPENDENT = 1e-9
 """Share of the largest singular value above which a column of both data sets is independent."""
+
+
+OF_NOISE = 2
+"""Parts of the errors that are the noise of the two calibrations."""
+
+
+class ErrorPart(NamedTuple):
+    """A part of the noise of values, root root' (k, k), and its degrees of freedom."""
+
+    root: FloatArray
+    degrees: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +54,14 @@ class ParameterChanges:
     ----------
     names : (p,) of the parameters. unit : (p,) tolerances, which make columns comparable [SI].
     slope : (k, p) [1 / SI]. value : (k,) [1].
-    sources : how much of the k degrees of freedom each source of errors causes, and the degrees of
-        freedom of its variance.
+    errors : the independent parts of the noise; the sum of root root' is the unit matrix (k, k).
     """
 
     names: tuple[str, ...]
     unit: FloatArray
     slope: FloatArray
     value: FloatArray
-    sources: tuple[tuple[float, float], ...]
+    errors: tuple[ErrorPart, ...]
 
     def __repr__(self) -> str:
         """Return the numbers of directions and parameters."""
@@ -67,10 +78,16 @@ class ParameterChanges:
         return float(self.value @ self.value)
 
     @property
-    def noise_degrees(self) -> float:
-        """Effective degrees of freedom of the noise (Welch-Satterthwaite)."""
-        total = np.array(sum(part for part, _ in self.sources))
-        return float(combine_degrees(total, ((np.array(part), nu) for part, nu in self.sources)))
+    def sources(self) -> tuple[tuple[float, float], ...]:
+        """How much of the k degrees of freedom the noise of each calibration causes, and the
+        degrees of freedom of its variance; then the same of all other errors together.
+        """
+        parts = [(float((part.root**2).sum()), part.degrees) for part in self.errors]
+        if len(parts) <= OF_NOISE:
+            return tuple(parts)
+        total = sum(share for share, _ in parts[OF_NOISE:])
+        squares = ((np.array(share), degrees) for share, degrees in parts[OF_NOISE:])
+        return (*parts[:OF_NOISE], (total, float(combine_degrees(np.array(total), squares))))
 
     def compute_p_value(self, chi_square: float, degrees: int) -> float:
         """Return the probability of a larger chi-square if nothing has changed; NaN without a
@@ -84,22 +101,31 @@ class ParameterChanges:
         """Return the change (p,) of each parameter and its standard deviation (p,) [SI], while all
         others may have changed as well; NaN where the data do not determine it.
         """
-        u, s, vt = np.linalg.svd(self.slope * self.unit, full_matrices=False)
-        is_used = are_nonzero(s, INDEPENDENT)
-        coordinates = (u.T @ self.value)[is_used] / s[is_used]
-        basis = vt[is_used].T
-        sd = np.sqrt(((basis / s[is_used]) ** 2).sum(axis=1))
-        is_open = 1.0 - (basis**2).sum(axis=1) > NULL_COMPONENT
-        shift = np.where(is_open, np.nan, basis @ coordinates)
-        return self.unit * shift, self.unit * np.where(is_open, np.nan, sd)
+        gain, is_open = self._invert()
+        shift = np.where(is_open, np.nan, gain @ self.value)
+        sd = np.where(is_open, np.nan, np.linalg.norm(gain, axis=1))
+        return self.unit * shift, self.unit * sd
 
     def test_shifts(self) -> FloatArray:
         """Return for each parameter (p,) the probability of a larger shift if nothing changed."""
-        shift, sd = self.estimate_shifts()
-        square = (shift / sd) ** 2
-        return np.where(np.isnan(square), np.nan, compute_f_tail(1.0, self.noise_degrees, square))
+        gain, is_open = self._invert()
+        variance = (gain**2).sum(axis=1)
+        squares = ((((gain @ e.root) ** 2).sum(axis=1), e.degrees) for e in self.errors)
+        degrees = combine_degrees(variance, squares)
+        square = (gain @ self.value) ** 2 / np.where(is_open, 1.0, variance)
+        return np.where(is_open, np.nan, compute_f_tail(1.0, degrees, square))
 
-    def project_out(self, places: FloatArray | list[int]) -> tuple[float, int]:
+    def _invert(self) -> tuple[FloatArray, BoolArray]:
+        """Return the matrix (p, k) that gives the shifts in tolerances of values, and which
+        parameters (p,) it does not determine.
+        """
+        u, s, vt = np.linalg.svd(self.slope * self.unit, full_matrices=False)
+        is_used = are_nonzero(s, INDEPENDENT)
+        basis = vt[is_used].T
+        is_open = 1.0 - (basis**2).sum(axis=1) > NULL_COMPONENT
+        return (basis / s[is_used]) @ u[:, is_used].T, is_open
+
+    def project_out(self, places: list[int]) -> tuple[float, int]:
         """Return the chi-square that is left where some parameters may have changed, and its
         degrees of freedom.
         """
@@ -172,22 +198,25 @@ def _whiten(
     information: tuple[DataInformation, DataInformation],
 ) -> ParameterChanges:
     """Divide rows by the root of their covariance, which errors beside the noise increase."""
-    extra, degrees = np.zeros((len(value), len(value))), np.inf
-    squares = []
+    errors = [ErrorPart(part, own.degrees) for part, own in zip(parts, information, strict=True)]
     for posterior, part, own in zip((first, second), parts, information, strict=True):
         rows = part @ own.rows / np.sqrt(own.variance)
-        for added in _list_added_parts(posterior):
-            effect = rows @ added.root
-            extra += effect @ effect.T
-            squares.append((np.array((effect**2).sum()), added.degrees))
-    root = np.linalg.cholesky(np.eye(len(value)) + extra)
-    by_noise = [float((np.linalg.solve(root, part) ** 2).sum()) for part in parts]
-    sources = [(share, i.degrees) for share, i in zip(by_noise, information, strict=True)]
-    if squares:
-        degrees = float(combine_degrees(np.array(np.trace(extra)), squares))
-        sources.append((max(len(value) - sum(by_noise), 0.0), degrees))
-    slope, value = np.linalg.solve(root, slope), np.linalg.solve(root, value)
-    return ParameterChanges(first.names, first.unit, slope, value, tuple(sources))
+        errors += [
+            ErrorPart(rows @ added.root, added.degrees) for added in _list_added_parts(posterior)
+        ]
+    covariance = np.sum([error.root @ error.root.T for error in errors], axis=0)
+    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+
+    def divide(values: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.solve(root, values), dtype=np.float64)
+
+    return ParameterChanges(
+        first.names,
+        first.unit,
+        divide(slope),
+        divide(value[:, None])[:, 0],
+        tuple(ErrorPart(divide(error.root), error.degrees) for error in errors),
+    )
 
 
 def _list_added_parts(posterior: Posterior) -> list[CovariancePart]:

@@ -52,17 +52,24 @@ class DataInformation:
 def collect_information(
     free: FreeParameters, decomposition: Decomposition, test: ResidualTest
 ) -> DataInformation:
-    """Return what the rows of trial 0 of a decomposition, which follow no penalty, say."""
-    d = decomposition.plain()
-    is_used = d.used[0]
-    unit = free.tolerance * d.scale
-    rows = d.singular_values[0][is_used, None] * d.inverse[0][is_used] / unit
+    """Return what the rows of a fit (t = 1), which follow no penalty, say of the parameters."""
     shown = find_shown_noise(decomposition, test)
     variance = test.sigma_scale**2 if test.intervals else np.nan
     degrees = test.noise_degrees
     if shown is not None and shown.is_known:
         variance, degrees = shown.variance, shown.degrees
-    return DataInformation(rows, d.projections[0][is_used], variance, float(degrees))
+    return fold_information(free, decomposition, variance, float(degrees))
+
+
+def fold_information(
+    free: FreeParameters, decomposition: Decomposition, variance: float, degrees: float
+) -> DataInformation:
+    """Return what the rows of trial 0 of a decomposition say, for this noise of a row."""
+    d = decomposition.plain()
+    is_used = d.used[0]
+    unit = free.tolerance * d.scale
+    rows = d.singular_values[0][is_used, None] * d.inverse[0][is_used] / unit
+    return DataInformation(rows, d.projections[0][is_used], variance, degrees)
 
 
 def information_from_arrays(arrays: Mapping[str, np.ndarray]) -> DataInformation | None:

@@ -3,7 +3,8 @@
 
 Sizes are numbers, or letters that stand for the same number in every array: p identified and a all
 parameters of the robot, u setup parameters, i instruments, s sources and c columns of the parts of
-the covariance, k centers and m = 6 k coefficients of a model discrepancy. Residuals and histories
+the covariance, d directions that the data determine, k centers and m = 6 k coefficients of a model
+discrepancy. Residuals and histories
 are for people and other programs, and are not checked.
 """
 
@@ -105,8 +106,8 @@ DISCREPANCY: Mapping[str, ArrayRule] = {
 }
 NOISE: Mapping[str, ArrayRule] = {"posterior_shown_noise": ArrayRule("3", NUMBERS)}
 INFORMATION: Mapping[str, ArrayRule] = {
-    "information_rows": ArrayRule("directions p"),
-    "information_deviations": ArrayRule("directions"),
+    "information_rows": ArrayRule("d p"),
+    "information_deviations": ArrayRule("d"),
     "information_noise": ArrayRule("2", NUMBERS),
 }
 FITTED = ArrayRule("rows values", NUMBERS)

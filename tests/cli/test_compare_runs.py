@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""loopcal compare: sessions, machines and methods side by side, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+
+DRAW = "--draw 16 --kind position --sigma-position 10um"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Path:
+    """Return a folder with runs of one machine, of the same machine moved, and of other methods."""
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        call(f"simulate linear-delta {DRAW} --draw-errors --truth truth.yaml -o may.csv --seed 4")
+        machine = lc.load_robot("truth.yaml")
+        change = 60e-6 * (np.array(machine.parameters.names) == "tower2.stop")
+        lc.save_robot(machine.with_values(machine.values + change), "moved.yaml")
+        for name, machine, seed in (
+            ("june", "truth", 5),
+            ("july", "moved", 6),
+            ("new", "truth", 7),
+        ):
+            call(f"simulate {machine}.yaml {DRAW} -o {name}.csv --seed {seed}")
+        for name in ("may", "june", "july"):
+            call(f"calibrate linear-delta {name}.csv -o {name} --hold-out 0.25")
+        call("calibrate linear-delta may.csv -o plain --hold-out 0.25 --method ls")
+        call("calibrate linear-delta june.csv -o joint --prior may")
+    return folder
+
+
+def call(words: str) -> None:
+    assert main(words.split()) == 0, words
+
+
+@pytest.fixture
+def compare(runs, monkeypatch, capsys):
+    """Compare runs; return exit code, output and errors, each as one line of words."""
+    monkeypatch.chdir(runs)
+    capsys.readouterr()
+
+    def compare(words: str) -> tuple[int, str, str]:
+        code = main(["compare", *words.split()])
+        captured = capsys.readouterr()
+        return code, " ".join(captured.out.split()), " ".join(captured.err.split())
+
+    return compare
+
+
+def test_sessions_of_one_machine_and_of_a_moved_one(compare) -> None:
+    code, out, err = compare("may june july")
+    assert (code, err) == (0, "")
+    assert "The machines of may and june do not differ beyond the noise" in out
+    assert "The machine of july differs from that of may" in out
+    assert "A change of tower2.stop alone explains it: +0.0" in out
+    assert "No held-out pose is common to all runs" in out
+    comparison = lc.compare_runs([lc.load_run(name) for name in ("may", "june", "july")])
+    assert comparison.moved is True
+    assert [pair.moved for pair in comparison.pairs] == [False, True]
+    second = comparison.pairs[1]
+    assert (second.cause.kind, second.cause.names) == ("parameter", ("tower2.stop",))
+    assert abs(second.cause_shift[0] - 60e-6) < 4.0 * second.cause_sd[0]
+    assert second.significant[second.names.index("tower2.stop")]
+    assert "july differs" in str(comparison)
+
+
+def test_methods_of_the_same_rows_are_not_tested(compare) -> None:
+    code, out, _ = compare("may plain")
+    assert code == 0
+    assert "may and plain were fitted to the same rows (12 rows)" in out
+    assert "differs from" not in out
+    assert "Errors after calibration at 4 poses that are common to all runs" in out
+    assert "Shifts from" not in out
+
+
+def test_a_run_that_is_the_prior_of_another_shares_its_rows(compare) -> None:
+    code, out, _ = compare("may joint")
+    assert code == 0
+    assert "have 12 of 28 fitted rows in common" in out
+
+
+def test_errors_at_other_measurements(compare) -> None:
+    code, out, err = compare("may july --data new.csv")
+    assert (code, err) == (0, "")
+    assert "Errors after calibration at 16 poses that are common to all runs" in out
+    code, _, err = compare("may june --data may.csv")
+    assert code == 1
+    assert "not an independent validation" in err
+
+
+def test_json_and_csv(compare, tmp_path, runs) -> None:
+    code, out, _ = compare("may july --json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["moved"] is True
+    assert document["pairs"][0]["cause"]["names"] == ["tower2.stop"]
+    path = tmp_path / "table.csv"
+    code, out, _ = compare(f"may july -o {path}")
+    assert out.endswith(f"Written to {path}")
+    rows = list(csv.DictReader(path.open()))
+    assert len(rows) == 2 * 9
+    (moved,) = [r for r in rows if r["run"] == "july" and r["parameter"] == "tower2.stop"]
+    assert moved["significant"] == "yes"
+    assert moved["unit"] == "mm"
+    assert float(moved["estimate"]) == pytest.approx(
+        lc.load_run(runs / "july").robot.values[6] * 1e3, abs=1e-6
+    )
+    assert compare(f"may july -o {path}")[0] == 1
+
+
+def test_a_hostile_name_is_text(compare, runs, tmp_path) -> None:
+    shutil.copytree(runs / "june", runs / "=1+1", dirs_exist_ok=True)
+    path = tmp_path / "table.csv"
+    assert compare(f"may =1+1 -o {path}")[0] == 0
+    assert not any(line.startswith("=") for line in path.read_text().splitlines())
+
+
+def test_what_is_no_comparison_is_refused(compare, runs) -> None:
+    assert "1 run given" in compare("may")[2]
+    assert "is given twice" in compare("may ./may")[2]
+    assert compare("may linear-delta")[0] == 1
+    with pytest.raises(lc.ArgumentTypeError, match="give a list of runs"):
+        lc.compare_runs(["may", "june"])  # type: ignore[list-item]
+
+
+def rewrite_robot(runs: Path, name: str, old: str, new: str) -> None:
+    """Calibrate the data of june with a changed robot file, as the run `name`."""
+    text = (runs / "truth.yaml").read_text().partition("identified:")[0]
+    assert old in text
+    (runs / f"{name}.yaml").write_text(text.replace(old, new))
+    words = f"calibrate {name}.yaml june.csv -o {name} --force --allow-implausible"
+    assert main(words.split()) in (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        ("fixed", "stroke:", "fixed: [arm3.length]\nstroke:", "arm3.length is free in may only"),
+        ("turned", "angles: [210, 330, 90]", "angles: [211, 331, 91]", "tower3.angle is fixed at"),
+    ],
+)
+def test_runs_that_mean_something_else_are_refused(compare, runs, name, old, new, words) -> None:
+    rewrite_robot(runs, name, old, new)
+    code, _, err = compare(f"may {name}")
+    assert code == 1
+    assert words in err
+
+
+def test_another_mechanism_is_refused(compare, runs) -> None:
+    call("simulate five-bar --draw 16 --kind position --draw-errors -o bars.csv --force")
+    call("calibrate five-bar bars.csv -o bars --force")
+    code, _, err = compare("may bars")
+    assert code == 1
+    assert "may and bars are calibrations of different mechanisms" in err
+
+
+def test_a_run_of_an_older_version_is_shown_without_a_test(runs) -> None:
+    first, second = (lc.load_run(runs / name) for name in ("may", "july"))
+    arrays = {k: v for k, v in second.arrays.items() if not k.startswith("information")}
+    older = lc.Run(second.path, second.result, second.robot, second.initial_robot, arrays=arrays)
+    comparison = lc.compare_runs([first, older])
+    assert comparison.moved is None
+    assert "older version" in str(comparison.findings[0])
+    assert np.isnan(comparison.pairs[0].p_value)
+
+
+def test_the_page_shows_what_its_commands_print(root, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (root / "docs" / "comparing-runs.md").read_text("utf-8")
+    commands = page.partition("```sh\n")[2].partition("```")[0].splitlines()
+    for command in commands:
+        capsys.readouterr()
+        assert main(command.split()[1:]) == 0, command
+    printed = capsys.readouterr().out
+    shown = page.partition("```text\n")[2].partition("```")[0]
+    assert shown.split("\n...\n")[0] in printed
+    for part in shown.split("\n...\n"):
+        assert part.strip("\n") in printed

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Changes of a machine between two calibrations: the false-alarm rate, and what is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from loopcal.diagnose.machine_changes import (
+    ParameterChanges,
+    compare_information,
+    estimate_cause,
+    explain_change,
+)
+from loopcal.estimate import MAP, LeastSquares, Posterior, Ridge, identify, identify_trials
+from loopcal.estimate.inference.covariance_parts import CovariancePart
+from loopcal.estimate.inference.data_information import fold_information
+from loopcal.estimate.inference.posterior import compute_posterior, posterior_from_arrays
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Instrument,
+    Measurements,
+    Position,
+    Sensor,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
+from loopcal.mechanism import Mechanism, sample_workspace
+from tests.estimate.problems import UM, noise
+
+ROBOTS = {name: load_robot(name) for name in ("linear-delta", "five-bar")}
+SIGMA = 10 * UM
+
+
+def measure(
+    robot: Mechanism, machine: Mechanism, seed: int, poses: int = 12, unknown=(), ratio: float = 1.0
+) -> Measurements:
+    """Return positions whose noise is `ratio` times the stated sigma."""
+    coordinates = sample_workspace(robot, poses, seed).coordinates
+    sensor = Sensor(Position(unknown=unknown), noise(*[ratio * SIGMA] * 3))
+    data = simulate(machine, coordinates, Instrument((sensor,)), seed)
+    rows = data.observations[0]
+    return replace(data, observations=(replace(rows, covariance=rows.covariance / ratio**2),))
+
+
+def compare(
+    robot: Mechanism, machines, seeds, method=None, poses=12, unknown=(), ratio=1.0
+) -> ParameterChanges:
+    """Calibrate two machines, and compare what their data say."""
+    posteriors = [
+        identify(robot, measure(robot, machine, seed, poses, unknown, ratio), method).posterior
+        for machine, seed in zip(machines, seeds, strict=True)
+    ]
+    return compare_information(*posteriors)
+
+
+def draw_machine(robot: Mechanism, seed: int) -> Mechanism:
+    return robot.with_values(sample_truth(robot, 1, seed)[0])
+
+
+def identify_batch(robot: Mechanism, truths: np.ndarray, seed: int, poses: int) -> list[Posterior]:
+    """Return the posteriors of many machines, with the noise that their residuals show."""
+    coordinates = sample_workspace(robot, poses, seed).coordinates
+    instrument = Instrument((Sensor(Position(), noise(*[SIGMA] * 3)),))
+    trials = simulate_trials(robot, truths, coordinates, instrument, seed)
+    fits = identify_trials(robot, trials, MAP())
+    assert fits.converged.all()
+    free, posteriors = fits.free_parameters, []
+    for i in range(len(truths)):
+        d = fits.decomposition.take(np.array([i]))
+        machine = robot.with_values(fits.values[i])
+        one = compute_posterior(machine, free.places, free.tolerance, d, fits.penalty[[i]])
+        degrees = float((d.rows - d.rank)[0])
+        information = fold_information(free, d, float(d.unexplained[0]) / degrees, degrees)
+        posteriors.append(replace(one, information=information))
+    return posteriors
+
+
+def judge_batch(robot: Mechanism, count: int, poses: int) -> np.ndarray:
+    """Return the p-values of pairs of calibrations of random machines that have not changed."""
+    truths = sample_truth(robot, count, 1)
+    pairs = zip(*(identify_batch(robot, truths, seed, poses) for seed in (2, 3)), strict=True)
+    compared = [compare_information(*pair) for pair in pairs]
+    return np.array([c.compute_p_value(c.chi_square, c.degrees) for c in compared])
+
+
+def judge_unmoved(name: str, count: int, **options) -> np.ndarray:
+    """Return the same p-values where each machine is calibrated at poses of its own."""
+    robot = ROBOTS[name]
+    p_values = []
+    for seed in range(count):
+        truth = draw_machine(robot, seed)
+        changes = compare(robot, (truth, truth), (1000 + seed, 5000 + seed), **options)
+        p_values.append(changes.compute_p_value(changes.chi_square, changes.degrees))
+    return np.array(p_values)
+
+
+def assert_uniform(p_values: np.ndarray) -> None:
+    """5 % false alarms, and p-values that are as frequent everywhere."""
+    count = len(p_values)
+    assert (p_values < 0.05).sum() <= stats.binom.ppf(0.999, count, 0.05)
+    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("name", "count"), [("linear-delta", 60), ("five-bar", 40)])
+def test_unmoved_machines_are_declared_changed_at_the_stated_rate(name, count) -> None:
+    """100 pairs, whose tolerances pull both estimates to the same nominal values."""
+    assert_uniform(judge_batch(ROBOTS[name], count, 10))
+
+
+def test_a_frame_that_differs_between_sessions_is_no_change() -> None:
+    p_values = judge_unmoved("five-bar", 8, unknown=("frame",))
+    assert_uniform(p_values)
+
+
+def test_a_wrong_sigma_does_not_change_the_rate() -> None:
+    """A sigma that is three times too small would move every machine."""
+    assert_uniform(judge_unmoved("linear-delta", 8, ratio=3.0))
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+@pytest.mark.parametrize("unknown", [(), ("frame",)])
+def test_false_alarm_rate_of_many_machines(name, unknown) -> None:
+    p_values = judge_unmoved(name, 400, unknown=unknown, poses=15)
+    rate = (p_values < 0.05).mean()
+    assert abs(rate - 0.05) < 3.3 * np.sqrt(0.05 * 0.95 / 400)
+    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
+
+
+def move(machine: Mechanism, **changes: float) -> Mechanism:
+    """Return a machine whose parameters have changed [SI]; `__` stands for a point."""
+    values = machine.values.copy()
+    for name, change in changes.items():
+        values[machine.parameters.index(name.replace("__", "."))] += change
+    return machine.with_values(values)
+
+
+def test_the_moved_parameter_is_named_with_its_change() -> None:
+    robot = ROBOTS["linear-delta"]
+    named = []
+    for seed in range(8):
+        truth = draw_machine(robot, seed)
+        moved = move(truth, tower2__stop=40 * UM)
+        changes = compare(robot, (truth, moved), (seed, 100 + seed))
+        assert changes.compute_p_value(changes.chi_square, changes.degrees) < 1e-3
+        cause = explain_change(changes, 0.01)
+        named.append((cause.kind, cause.names))
+        if named[-1] == ("parameter", ("tower2.stop",)):
+            shift, sd = estimate_cause(changes, cause)
+            assert abs(shift[0] - 40 * UM) < 4.0 * sd[0]
+    assert named.count(("parameter", ("tower2.stop",))) >= 7
+
+
+def test_a_moved_limb_and_two_moved_limbs_are_named() -> None:
+    """Several parameters of limb 2; then also one of limb 3."""
+    robot = ROBOTS["five-bar"]
+    truth = draw_machine(robot, 3)
+    free = [p.name for p in robot.parameters.entries if p.free]
+    limbs = sorted({name.split(".")[0] for name in free if "." in name})
+    of_first = [name for name in free if name.startswith(f"{limbs[0]}.")][:3]
+    sizes = (300 * UM, -200 * UM, 250 * UM)
+    changed = {n.replace(".", "__"): c for n, c in zip(of_first, sizes, strict=False)}
+    changes = compare(robot, (truth, move(truth, **changed)), (3, 103), poses=30)
+    cause = explain_change(changes, 0.01)
+    assert cause.kind in ("limb", "parameter")
+    every = {cause.names, *cause.alternatives}
+    assert any(name.split(".")[0] == limbs[0] for names in every for name in names)
+
+
+def test_the_shift_of_each_parameter_has_the_stated_spread() -> None:
+    robot = ROBOTS["linear-delta"]
+    truths = sample_truth(robot, 40, 5)
+    pairs = zip(*(identify_batch(robot, truths, seed, 10) for seed in (6, 7)), strict=True)
+    compared = [compare_information(*pair) for pair in pairs]
+    ratios = np.array([np.divide(*c.estimate_shifts()) for c in compared])
+    assert np.sqrt(np.mean(ratios**2)) == pytest.approx(1.0, abs=0.12)
+    p_values = np.concatenate([c.test_shifts() for c in compared])
+    assert (p_values < 0.05).mean() == pytest.approx(0.05, abs=0.035)
+
+
+def test_a_method_does_not_change_what_data_say() -> None:
+    """Ridge with a strong penalty pulls estimates to nominal; the comparison is the same."""
+    robot = ROBOTS["linear-delta"]
+    truth = draw_machine(robot, 5)
+    plain = compare(robot, (truth, truth), (5, 105), LeastSquares())
+    ridge = compare(robot, (truth, truth), (5, 105), Ridge(30.0))
+    assert ridge.degrees == plain.degrees == 9
+    assert ridge.chi_square == pytest.approx(plain.chi_square, rel=0.05)
+
+
+def test_information_survives_a_run_folder() -> None:
+    robot = ROBOTS["linear-delta"]
+    truth = draw_machine(robot, 6)
+    fits = [identify(robot, measure(robot, truth, seed)) for seed in (6, 106)]
+    stored = [posterior_from_arrays(fit.robot, fit.arrays()) for fit in fits]
+    direct = compare_information(*(fit.posterior for fit in fits))
+    read = compare_information(*stored)
+    assert read.chi_square == pytest.approx(direct.chi_square, rel=1e-12)
+    assert direct.sources == read.sources
+
+
+def test_added_errors_widen_the_comparison() -> None:
+    """A covariance that another diagnosis adds enters both the spread and the probability."""
+    robot = ROBOTS["linear-delta"]
+    truth = draw_machine(robot, 7)
+    fits = [identify(robot, measure(robot, truth, seed)) for seed in (7, 107)]
+    plain = compare_information(*(fit.posterior for fit in fits))
+    root = np.zeros((len(fits[0].names), 1))
+    root[fits[0].names.index("tower2.stop")] = 100 * UM
+    part = CovariancePart("residuals.drift", root, 5.0)
+    wide = replace(fits[0].posterior, parts=(*fits[0].posterior.parts, part))
+    changes = compare_information(wide, fits[1].posterior)
+    place = fits[0].names.index("tower2.stop")
+    sd = changes.estimate_shifts()[1][place]
+    expected = np.hypot(plain.estimate_shifts()[1][place], 100 * UM)
+    assert sd == pytest.approx(expected, rel=1e-6)
+    alone = changes.test_shifts()[place]
+    shift = changes.estimate_shifts()[0][place]
+    assert alone == pytest.approx(2.0 * stats.t.sf(abs(shift) / sd, 5.0), rel=0.1)
+    assert len(changes.sources) == 3
+    assert sum(share for share, _ in changes.sources) == pytest.approx(changes.degrees)
