@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from loopcal.apply.run_comparison.stored_run import StoredRun
 from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
@@ -54,14 +55,14 @@ def refuse_incomparable(
     ------
     DataError : `runs.other-...`; EstimationError : `comparison.other-dimensions`.
     """
-    words = dict(zip(("first", "second"), names, strict=True))
+    words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
     mine, theirs = first.robot, second.robot
     if name := _find_lonely(mine.parameters.names, theirs.parameters.names):
         place = names[0] if name in mine.parameters.names else names[1]
         raise DataError(report_finding("runs.other-parameters", **words, name=name, place=place))
     for what, one, other in _list_structure(mine, theirs):
         if one != other:
-            data = {"what": what, "mine": one, "theirs": other}
+            data: dict[str, Any] = {"what": what, "mine": one, "theirs": other}
             raise DataError(report_finding("runs.other-mechanism", **words, **data))
     free = [list_free(run) for run in (first, second)]
     if not is_same_data and (name := _find_lonely(*free)):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -134,12 +134,12 @@ def compare_pair(
     names : of both runs. relation : of their data. tests : number of runs that are compared with
         the first one.
     """
-    words = dict(zip(("first", "second"), names, strict=True))
+    words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
     if relation.kind == "same":
         finding = report_finding("runs.same-data", **words, shared=relation.shared)
         return _leave_open(first, names, relation, finding)
     if relation.kind == "shared":
-        data = {"shared": relation.shared, "total": relation.total}
+        data: dict[str, Any] = {"shared": relation.shared, "total": relation.total}
         finding = report_finding("runs.rows-shared", **words, **data)
         return _leave_open(first, names, relation, finding)
     for name, run in zip(names, (first, second), strict=True):
@@ -167,7 +167,7 @@ def _test(
     moved = p_value < level
     cause, nothing = ChangeCause("none"), np.zeros(0)
     cause_shift, cause_sd = nothing, nothing
-    numbers = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
+    numbers: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
     if moved:
         cause = explain_change(changes, CAUSE_LEVEL)
         if cause.parameters:
@@ -176,11 +176,11 @@ def _test(
         judged = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL, **more}
         finding = report_finding("runs.machine-changed", **words, **judged)
     elif p_value > 1.0 - TOO_WELL:
-        data = {**numbers, "probability": 1.0 - p_value}
-        finding = report_finding("runs.agree-too-well", **words, **data)
+        judged = {**numbers, "probability": 1.0 - p_value}
+        finding = report_finding("runs.agree-too-well", **words, **judged)
     else:
-        data = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL}
-        finding = report_finding("runs.machine-unchanged", **words, **data)
+        judged = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL}
+        finding = report_finding("runs.machine-unchanged", **words, **judged)
     shift, sd = changes.estimate_shifts()
     single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shift).sum()))
     return PairComparison(
@@ -205,7 +205,7 @@ def _test(
 
 def _word_cause(
     earlier: Posterior, cause: ChangeCause, shift: FloatArray, sd: FloatArray
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Return what a finding states of a cause."""
     change = ""
     if cause.kind == "parameter":

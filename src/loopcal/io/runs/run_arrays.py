@@ -4,8 +4,7 @@
 Sizes are numbers, or letters that stand for the same number in every array: p identified and a all
 parameters of the robot, u setup parameters, i instruments, s sources and c columns of the parts of
 the covariance, d directions that the data determine, k centers and m = 6 k coefficients of a model
-discrepancy. Residuals and histories
-are for people and other programs, and are not checked.
+discrepancy. Residuals and histories are for people and other programs, and are not checked.
 """
 
 from __future__ import annotations
