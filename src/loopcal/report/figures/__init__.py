@@ -4,7 +4,16 @@
 `loopcal.report.pictures` makes files of them.
 """
 
+from loopcal.report.figures.accuracy_figure import draw_accuracy_map as draw_accuracy_map
+from loopcal.report.figures.convergence_figure import draw_convergence as draw_convergence
+from loopcal.report.figures.identifiability_figure import (
+    draw_identifiability as draw_identifiability,
+)
+from loopcal.report.figures.parameter_figures import draw_correlation as draw_correlation
+from loopcal.report.figures.parameter_figures import draw_parameters as draw_parameters
 from loopcal.report.figures.plan_figures import draw_curve as draw_curve
 from loopcal.report.figures.plan_figures import draw_plan as draw_plan
 from loopcal.report.figures.regularization_figure import draw_regularization as draw_regularization
+from loopcal.report.figures.residual_figure import draw_residuals as draw_residuals
 from loopcal.report.figures.robot_figure import draw_robot as draw_robot
+from loopcal.report.figures.validation_figure import draw_validation as draw_validation

@@ -11,10 +11,15 @@ PIXELS = 96
 """Pixels of an inch on a page."""
 
 
-class NotebookFigure(Figure):
+class _NotebookFigure(Figure):
     """A figure that is shown as a picture where it is the result of a cell."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
         """Return the picture, and its size on the page [pixels]."""
         width, height = (round(PIXELS * float(inches)) for inches in self.get_size_inches())
         return render_figure(self, ".png"), {"width": width, "height": height}
+
+
+def make_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of this size [inch]."""
+    return _NotebookFigure(figsize=(width, height), layout="constrained")

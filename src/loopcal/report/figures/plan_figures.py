@@ -10,65 +10,161 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.mechanism import POSITION, Mechanism
+from loopcal.planning import SurfacePlan
 from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import DIMENSIONS
-from loopcal.planning.result import Plan
+from loopcal.planning.result import Plan, PlannedPoses
 from loopcal.planning.sample_size import ErrorCurve
-from loopcal.report.figures.style import COLORS, label_logarithmic, show_names, start_figure
+from loopcal.report.figures.style import (
+    COLORS,
+    DOT,
+    PALE,
+    REFERENCE,
+    SMALL,
+    THIN,
+    add_legend,
+    finish_figure,
+    label_axes,
+    label_logarithmic,
+    start_figure,
+)
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 """Colors of calibration poses, of validation poses, and of the bound."""
 
+MOST_NUMBERS, IN_LINE = 80, 6
+"""Poses up to which each one has its number, and numbers in one line beside poses that overlap."""
 
-def draw_plan(plan: Plan) -> Figure:
-    """Draw the poses of a plan in pairs of controlled coordinates, with the path between them."""
-    from matplotlib.ticker import MaxNLocator
+DISK, CLOSE = 9.5, 0.02
+"""Size of the disk of a pose [pt], and distance of two overlapping ones as a share of an axis."""
 
-    names = plan.robot.controlled
-    columns = [
-        plan.poses.coordinates[:, i] / _unit(plan.robot, name).factor_to_si
-        for i, name in enumerate(names)
-    ]
+
+def draw_plan(plan: Plan | SurfacePlan) -> Figure:
+    """Draw the poses of a plan in pairs of controlled coordinates, numbered in the order of
+    visiting, with the path between them.
+
+    The path is straight in the coordinates and begins at home; where it goes via home before a
+    pose, it is dashed.
+    """
+    names, poses = plan.robot.controlled, plan.poses
+    scale = np.array([_unit(plan.robot, name).factor_to_si for name in names])
+    stops = np.concatenate([locate_home(plan.robot)[None], poses.coordinates]) / scale
     pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + (
         [(len(names) - 1, None)] if len(names) % 2 else []
     )
-    figure = start_figure(4.2 * len(pairs), 4.4)
-    home = locate_home(plan.robot)
-    start = [home[i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
-    step = np.arange(1, len(plan.poses.labels) + 1)
+    figure = start_figure(max(4.9 * len(pairs), 6.0), 5.4)
     for place, (i, j) in enumerate(pairs, 1):
-        axes: Any = figure.add_subplot(1, len(pairs), place)
-        x, y = (columns[i], columns[j]) if j is not None else (step, columns[i])
-        first = (start[i], start[j]) if j is not None else (0.0, start[i])
-        axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="path")
-        axes.plot(*first, "k+", ms=8.0, label="home", zorder=3)
-        for chosen, color, label in (
-            (~plan.poses.held_out, CALIBRATION, "calibration"),
-            (plan.poses.held_out, VALIDATION, "validation"),
-        ):
-            axes.plot(x[chosen], y[chosen], "o", color=color, ms=4.5, label=label, zorder=2)
-        axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
+        axes = figure.add_subplot(1, len(pairs), place)
+        step = np.arange(len(stops), dtype=float)
+        x, y = (stops[:, i], stops[:, j]) if j is not None else (step, stops[:, i])
+        _draw_path(axes, x, y, poses.via_home)
+        _draw_poses(axes, x, y, poses.held_out)
         if j is None:
+            from matplotlib.ticker import MaxNLocator
+
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_ylabel(_label(plan.robot, names[i if j is None else j]))
-        axes.grid(visible=True, lw=0.3)
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=4,
-        frameon=False,
-        fontsize=8,
+        label_axes(
+            axes,
+            _label(plan.robot, names[i]) if j is not None else "step [1], home is 0",
+            _label(plan.robot, names[i if j is None else j]),
+        )
+    add_legend(figure, _list_handles(poses))
+    n_held_out = int(poses.held_out.sum())
+    return finish_figure(
+        figure,
+        f"{plan.robot.name}: n = {len(poses) - n_held_out} poses for calibration, {n_held_out} for "
+        "validation, numbered in their order",
     )
-    n_held_out = int(plan.poses.held_out.sum())
-    figure.suptitle(
-        f"{plan.robot.name}: n = {plan.n_poses} poses for calibration, {n_held_out} for validation",
-        fontsize=10,
+
+
+def _draw_path(axes: Axes, x: FloatArray, y: FloatArray, via_home: BoolArray) -> None:
+    """Draw the path from home through all poses, with an arrow in the middle of each part."""
+    for k in range(1, len(x)):
+        parts = [(k - 1, 0, "--"), (0, k, "--")] if via_home[k - 1] else [(k - 1, k, "-")]
+        for start, end, line in parts:
+            ends = x[[start, end]], y[[start, end]]
+            axes.plot(*ends, color=PALE, lw=THIN, ls=line, zorder=1)
+            middle = ends[0].mean(), ends[1].mean()
+            before = 0.52 * ends[0][0] + 0.48 * ends[0][1], 0.52 * ends[1][0] + 0.48 * ends[1][1]
+            if np.ptp(ends[0]) > 0.0 or np.ptp(ends[1]) > 0.0:
+                arrow = {"arrowstyle": "-|>", "color": REFERENCE, "lw": 0.0, "mutation_scale": 7.0}
+                axes.annotate("", middle, before, arrowprops=arrow, zorder=1)
+
+
+def _draw_poses(axes: Axes, x: FloatArray, y: FloatArray, held_out: BoolArray) -> None:
+    """Draw home, and the poses as disks that contain their numbers where these can be read."""
+    axes.plot(x[0], y[0], "k+", ms=9.0, mew=1.4, zorder=3)
+    is_numbered = len(held_out) <= MOST_NUMBERS
+    size = DISK if is_numbered else DOT
+    for chosen, color, marker in ((~held_out, CALIBRATION, "o"), (held_out, VALIDATION, "s")):
+        axes.plot(x[1:][chosen], y[1:][chosen], marker, color=color, ms=size, zorder=2)
+    if is_numbered:
+        for members in _find_clusters(x[1:], y[1:]):
+            _write_numbers(axes, x[1:], y[1:], members)
+
+
+def _find_clusters(x: FloatArray, y: FloatArray) -> list[list[int]]:
+    """Return the poses in groups that are so close in this view that their disks overlap."""
+    scaled = np.stack([x, y], axis=1)
+    scaled = scaled / np.maximum(np.ptp(scaled, axis=0), 1e-300)
+    clusters: list[list[int]] = []
+    for k, point in enumerate(scaled):
+        for members in clusters:
+            if np.linalg.norm(scaled[members[0]] - point) < CLOSE:
+                members.append(k)
+                break
+        else:
+            clusters.append([k])
+    return clusters
+
+
+def _write_numbers(axes: Axes, x: FloatArray, y: FloatArray, members: list[int]) -> None:
+    """Write the number of a pose in its disk; those of poses that overlap beside them."""
+    k = members[0]
+    if len(members) == 1:
+        style: dict[str, Any] = {"ha": "center", "va": "center", "color": "white", "weight": "bold"}
+        axes.annotate(str(k + 1), (x[k], y[k]), fontsize=6, zorder=4, **style)
+        return
+    side = -1 if x[k] > x.mean() else 1
+    height = -1 if y[k] > y.mean() else 1
+    lines = [
+        ", ".join(str(number + 1) for number in members[first : first + IN_LINE])
+        for first in range(0, len(members), IN_LINE)
+    ]
+    axes.annotate(
+        "\n".join(lines),
+        (x[k], y[k]),
+        xytext=(7 * side, 7 * height),
+        textcoords="offset points",
+        ha="left" if side > 0 else "right",
+        va="bottom" if height > 0 else "top",
+        fontsize=6.5,
+        zorder=5,
+        bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
     )
-    return show_names(figure)
+
+
+def _list_handles(poses: PlannedPoses) -> list[Any]:
+    """Return what the legend contains."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=CALIBRATION, marker="o", ls="none", label="calibration"),
+        Line2D([], [], color="black", marker="+", ls="none", label="home"),
+        Line2D([], [], color=PALE, lw=THIN, label="path"),
+    ]
+    if poses.held_out.any():
+        validation = Line2D([], [], color=VALIDATION, marker="s", ls="none", label="validation")
+        handles.insert(1, validation)
+    if poses.via_home.any():
+        handles.append(Line2D([], [], color=PALE, lw=THIN, ls="--", label="path via home"))
+    return handles
 
 
 def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
@@ -95,16 +191,12 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     axes.set_yscale("log")
     label_logarithmic(axes.xaxis)
     label_logarithmic(axes.yaxis)
-    axes.set_xlabel(f"{curve.counted} for calibration [1]")
     words = f"expected {curve.target} error (rms)"
     words += ", rotations times robot size" if curve.target == "pose" else ""
-    axes.set_ylabel(f"{words} [{unit.symbol}]", fontsize=9)
-    axes.grid(visible=True, lw=0.3)
-    axes.legend(frameon=False, fontsize=8)
-    axes.set_title(
-        f"{robot.name}: n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}", fontsize=10
-    )
-    return show_names(figure)
+    label_axes(axes, f"{curve.counted} for calibration [1]", f"{words} [{unit.symbol}]")
+    axes.legend(frameon=False, fontsize=SMALL)
+    n = f"n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}"
+    return finish_figure(figure, f"{robot.name}: {n}")
 
 
 def _unit(robot: Mechanism, name: str) -> Unit:

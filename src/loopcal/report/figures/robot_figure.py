@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
-from loopcal.report.figures.style import COLORS, show_names, start_figure
+from loopcal.report.figures.style import (
+    COLORS,
+    LABEL,
+    SMALL,
+    add_legend,
+    finish_figure,
+    label_axes,
+    start_figure,
+)
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -26,6 +34,10 @@ AXIS, GUIDE = 0.06, 0.12
 """Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
 as a share of the robot's size.
 """
+
+
+PLANAR = {"x", "y", "rz"}
+"""Freedoms of a platform that moves in the x-y plane."""
 
 
 @dataclass(frozen=True)
@@ -51,23 +63,27 @@ def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0)
     everything = np.concatenate([s.points for s in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
 
-    figure = start_figure(11.5, 6.0)
-    figure.get_layout_engine().set(wspace=0.06)
-    space: Any = figure.add_subplot(1, 2, 1, projection="3d")
-    above = figure.add_subplot(1, 2, 2)
+    is_flat = is_planar(robot)
+    figure = start_figure(7.0 if is_flat else 11.8, 6.4 if is_flat else 6.0)
+    space: Any = None if is_flat else figure.add_subplot(1, 2, 1, projection="3d")
+    above: Any = figure.add_subplot() if is_flat else figure.add_subplot(1, 2, 2)
     for stroke in strokes:
-        space.plot(*stroke.points.T, **stroke.style)
         above.plot(*stroke.points.T[:2], **stroke.style)
+        if space is not None:
+            space.plot(*stroke.points.T, **stroke.style)
     limbs = strokes[: len(robot.assembly.limbs)]
     middle = np.mean([stroke.points[0] for stroke in limbs], axis=0)
     for stroke, limb in zip(limbs, robot.assembly.limbs, strict=True):
         _label(space, above, stroke, limb.name, middle)
     _finish(space, above, low, high, length.symbol)
     where = "at home" if solution is None else f"at row {row}"
-    figure.suptitle(_caption(robot, where, length.symbol), fontsize=10)
-    handles = _legend(robot)
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-    return show_names(figure)
+    add_legend(figure, _legend(robot))
+    return finish_figure(figure, _caption(robot, where, length.symbol))
+
+
+def is_planar(robot: Mechanism) -> bool:
+    """Return whether the platform moves in the x-y plane only: one view shows everything."""
+    return set(robot.freedoms) <= PLANAR
 
 
 def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:
@@ -165,27 +181,27 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) 
         color=limb.style["color"],
         bbox=back,
     )
-    space.text(*foot, f"  {name}", fontsize=8, color=limb.style["color"], zorder=9)
+    if space is not None:
+        space.text(*foot, f"  {name}", fontsize=SMALL, color=limb.style["color"], zorder=9)
 
 
 def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str) -> None:
     """Set equal scales, and units on all axes."""
+    above.set_aspect("equal", adjustable="datalim")
+    above.margins(0.15 if space is None else 0.1)
+    if space is None:
+        label_axes(above, f"x [{symbol}]", f"y [{symbol}]")
+        return
+    label_axes(above, f"x [{symbol}]", f"y [{symbol}]", "from above")
     middle, reach = (low + high) / 2, np.maximum(high - low, 0.15 * (high - low).max()) * 0.55
     for axis, m, r in zip("xyz", middle, reach, strict=True):
         getattr(space, f"set_{axis}lim")(m - r, m + r)
-        getattr(space, f"set_{axis}label")(f"{axis} [{symbol}]", fontsize=8)
+        getattr(space, f"set_{axis}label")(f"{axis} [{symbol}]", fontsize=LABEL)
     space.set_box_aspect(reach, zoom=0.9)
     space.view_init(elev=22, azim=-58)
     space.tick_params(labelsize=7)
     space.locator_params(nbins=5)
-    above.set_aspect("equal", adjustable="datalim")
-    above.margins(0.1)
-    above.set_xlabel(f"x [{symbol}]", fontsize=8)
-    above.set_ylabel(f"y [{symbol}]", fontsize=8)
-    above.tick_params(labelsize=7)
-    above.grid(visible=True, lw=0.3)
-    space.set_title("perspective", fontsize=9)
-    above.set_title("from above", fontsize=9)
+    space.set_title("perspective", fontsize=LABEL)
 
 
 def _caption(robot: Mechanism, where: str, symbol: str) -> str:
@@ -211,7 +227,11 @@ def _legend(robot: Mechanism) -> list[Any]:
     marker = "s" if "P" in driven else "o" if driven else "D"
     has_rods = any(limb.ending == "distance" for limb in limbs)
     rows: list[tuple[str, bool, dict[str, Any]]] = [
-        ("axis of a revolute joint", "R" in kinds, {"color": "black", "lw": 1.2}),
+        (
+            "axis of a revolute joint",
+            "R" in kinds and not is_planar(robot),
+            {"color": "black", "lw": 1.2},
+        ),
         ("guide of a sliding joint", "P" in kinds, {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}),
         ("rod", has_rods, {"color": "0.4", "lw": 1.6}),
         ("driven, filled", True, _dot(marker, "0.4", "0.4")),

@@ -8,6 +8,7 @@ markers, lines or labels differ, too.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
+"""Of series in turn."""
+
+MARKERS = "os^DvP<>"
 """Of series in turn."""
 
 DIVERGING, SEQUENTIAL = "RdBu_r", "viridis"
@@ -32,6 +36,15 @@ DOT = 3.5
 TITLE, LABEL, SMALL = 10, 9, 8
 """Sizes of the title of a figure, of axes, and of ticks and legends [pt]."""
 
+MOST_LABELS, LONGEST = 45, 24
+"""Number of labels of poses that fit below an axis, and characters of a label."""
+
+CHARACTERS, HANDLE = 13.0, 7
+"""Small characters of one inch, and those that the handle and the gaps of a legend take."""
+
+FEW_TICKS = (1.0, 2.0, 5.0)
+"""Numbers on a short logarithmic axis, times powers of ten."""
+
 TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 """Numbers on a logarithmic axis, times powers of ten."""
 
@@ -43,9 +56,9 @@ of ten only; a shorter one has even steps.
 
 def start_figure(width: float, height: float) -> Figure:
     """Return an empty figure of this size [inch], which notebooks show without pyplot."""
-    from loopcal.report.figures.notebook_figure import NotebookFigure
+    from loopcal.report.figures.notebook_figure import make_figure
 
-    return NotebookFigure(figsize=(width, height), layout="constrained")
+    return make_figure(width, height)
 
 
 def label_axes(axes: Axes, x: str, y: str, title: str = "", grid: bool = True) -> None:
@@ -66,24 +79,53 @@ def finish_figure(figure: Figure, title: str) -> Figure:
     return show_names(figure)
 
 
-def add_legend(figure: Figure, handles: list[Any], columns: int = 4) -> None:
-    """Write a legend below all axes, where no data are."""
+def add_legend(figure: Figure, handles: list[Any]) -> None:
+    """Write a legend below all axes, where no data are, with as many columns as fit."""
     if handles:
+        longest = max(len(str(handle.get_label())) for handle in handles) + HANDLE
+        columns = int(figure.get_size_inches()[0] * CHARACTERS / longest)
         figure.legend(
             handles=handles,
             loc="outside lower center",
-            ncols=min(columns, len(handles)),
+            ncols=min(max(columns, 1), len(handles)),
             frameon=False,
             fontsize=SMALL,
         )
 
 
-def label_logarithmic(axis: Any) -> None:
-    """Write plain numbers at a logarithmic axis of matplotlib."""
+def label_poses(axes: Axes, labels: Sequence[str]) -> None:
+    """Write labels of poses at x = 1, 2, ..; numbers where there are too many to read."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_xlim(0.3, len(labels) + 0.7)
+    if len(labels) <= MOST_LABELS:
+        is_long = max(map(len, labels), default=0) > 3
+        axes.set_xticks(
+            range(1, len(labels) + 1),
+            [shorten(label) for label in labels],
+            rotation=45 if is_long else 0,
+            ha="right" if is_long else "center",
+        )
+        axes.set_xlabel("pose", fontsize=LABEL)
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(12, integer=True))
+        axes.set_xlabel("number of the pose, in order of measurement [1]", fontsize=LABEL)
+
+
+def shorten(name: str, length: int = LONGEST) -> str:
+    """Return a name of at most so many characters; three dots stand for its middle."""
+    if len(name) <= length:
+        return name
+    half = (length - 1) // 2
+    return f"{name[:half]}…{name[-half:]}"
+
+
+def label_logarithmic(axis: Any, numbers: Sequence[float] = TICKS) -> None:
+    """Write plain numbers at a logarithmic axis of matplotlib: these times powers of ten."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     low, high = axis.get_view_interval()
-    subs = TICKS if high < VERY_WIDE * low else (1.0,)
+    subs = tuple(numbers) if high < VERY_WIDE * low else (1.0,)
     axis.set_major_locator(LogLocator(subs=subs) if high > WIDE * low else MaxNLocator(6))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
