@@ -49,7 +49,10 @@ def test_figure_of_a_fit_has_units_and_no_warnings(draw, name, request) -> None:
 
 @pytest.mark.parametrize("draw", OF_FITS, ids=lambda draw: draw.__name__)
 def test_figure_has_the_same_bytes_each_time(draw, five_bar) -> None:
-    assert render_figure(draw(five_bar.fit), ".svg") == render_figure(draw(five_bar.fit), ".svg")
+    figure = draw(five_bar.fit)
+    content = render_figure(figure, ".svg")
+    assert content == render_figure(draw(five_bar.fit), ".svg")
+    assert figure.get_layout_engine() is not None
 
 
 def test_residuals_by_pose_are_those_of_the_fit_in_the_unit_of_the_file(five_bar) -> None:
@@ -98,7 +101,11 @@ def test_missing_components_and_rows_of_weight_zero_are_not_drawn(five_bar) -> N
     whitened[1] = 0.0
     changed = replace(five_bar.fit, residuals=(replace(rows, raw=raw, whitened=whitened),))
     n = len(raw)
-    assert [len(series.raw) for series in list_series(changed)] == [n - 2, n - 1, n - 1]
+    assert [len(series.raw) for series in list_series(changed.robot, changed.residuals)] == [
+        n - 2,
+        n - 1,
+        n - 1,
+    ]
     check(figures.draw_residuals(changed))
 
 

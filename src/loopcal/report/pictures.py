@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".svg", ".pdf")
 DPI = 150
 """Resolution of a PNG picture."""
+
+PLACES = 4
+"""Decimals of the position of axes, as a share of the figure."""
 
 SALT = "loopcal"
 """Identifiers in an SVG are random without a salt."""
@@ -53,12 +57,34 @@ def check_picture(path: Path) -> None:
         raise FileError("this picture is not a complete PDF file", path)
 
 
+@contextmanager
+def _fixed_layout(figure: Figure) -> Iterator[None]:
+    """Arrange the axes of a figure, and keep them in place at rounded positions.
+
+    The solver of the layout adds numbers in another order each time. The digits of an SVG file
+    show that.
+    """
+    engine = figure.get_layout_engine()
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    is_arranged = [(axes, axes.get_in_layout()) for axes in figure.axes]
+    for axes in figure.axes:
+        x, y, width, height = (round(v, PLACES) for v in axes.get_position(original=True).bounds)
+        axes.set_position((x, y, width, height))
+    try:
+        yield
+    finally:
+        for axes, is_in_layout in is_arranged:
+            axes.set_in_layout(is_in_layout)
+        figure.set_layout_engine(engine)
+
+
 def render_figure(figure: Figure, ending: str) -> bytes:
     """Return a figure as a file with this ending, one of `FORMATS`."""
     from matplotlib import rc_context
 
     stream = BytesIO()
-    with rc_context({"svg.hashsalt": SALT}):
+    with rc_context({"svg.hashsalt": SALT}), _fixed_layout(figure):
         figure.savefig(stream, format=ending[1:], dpi=DPI, metadata=METADATA[ending])
     return stream.getvalue()
 

@@ -14,6 +14,7 @@ from loopcal.report.figures.parameter_figures import draw_parameters as draw_par
 from loopcal.report.figures.plan_figures import draw_curve as draw_curve
 from loopcal.report.figures.plan_figures import draw_plan as draw_plan
 from loopcal.report.figures.regularization_figure import draw_regularization as draw_regularization
+from loopcal.report.figures.residual_figure import draw_residual_rows as draw_residual_rows
 from loopcal.report.figures.residual_figure import draw_residuals as draw_residuals
 from loopcal.report.figures.robot_figure import draw_robot as draw_robot
 from loopcal.report.figures.validation_figure import draw_validation as draw_validation

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from loopcal.estimate import Identification
+from loopcal.estimate.residuals import KindResiduals
+from loopcal.mechanism import Mechanism
 from loopcal.report.figures.residual_series import (
     ResidualSeries,
     describe_residual_frame,
@@ -54,13 +57,24 @@ COLUMNS = 3
 
 
 def draw_residuals(fit: Identification) -> Figure:
-    """Draw the residuals of a fit: in units by pose, then over sigma by component, as histogram and
-    normal plot, and against each actuator reading, time and temperature that was recorded.
+    """Draw the residuals of a fit, see `draw_residual_rows`."""
+    return draw_residual_rows(fit.robot, fit.residuals, fit.nuisance.names)
+
+
+def draw_residual_rows(
+    robot: Mechanism, residuals: Sequence[KindResiduals], setup: Sequence[str] = ()
+) -> Figure:
+    """Draw residuals in units by pose, then over sigma by component, as histogram and normal plot,
+    and against each actuator reading, time and temperature that was recorded.
 
     Residuals of actuator readings are in the first two only: the estimated poses take up a part of
     them, so that they are smaller than their sigma.
+
+    Parameters
+    ----------
+    residuals : of a fit or of a run folder. setup : names of the fitted setup parameters.
     """
-    series = [s for s in list_series(fit) if len(s.raw)]
+    series = [s for s in list_series(robot, residuals) if len(s.raw)]
     quantities = list_quantities(series)
     groups = _group_by_unit(series)
     rows = -(-len(quantities) // COLUMNS)
@@ -69,7 +83,7 @@ def draw_residuals(fit: Identification) -> Figure:
     grid = figure.add_gridspec(len(heights), 2 * COLUMNS, height_ratios=heights)
     styles = _choose_styles(series)
     for i, group in enumerate(groups):
-        _draw_by_pose(figure.add_subplot(grid[i, :]), fit, group, styles)
+        _draw_by_pose(figure.add_subplot(grid[i, :]), robot, list_poses(residuals), group, styles)
     n = len(groups)
     _draw_components(figure.add_subplot(grid[n, :2]), series, styles)
     measured = [s for s in series if not s.is_reading]
@@ -79,10 +93,10 @@ def draw_residuals(fit: Identification) -> Figure:
     for i, name in enumerate(quantities):
         row, column = divmod(i, COLUMNS)
         place = grid[n + 1 + row, 2 * column : 2 * column + 2]
-        _draw_against(figure.add_subplot(place), fit, measured, styles, name)
+        _draw_against(figure.add_subplot(place), robot, measured, styles, name)
     add_legend(figure, _list_handles(series, styles))
-    count = f"{sum(len(s.raw) for s in series)} residuals of {len(list_poses(fit))} poses"
-    return finish_figure(figure, f"{fit.robot.name}: {count}; {describe_residual_frame(fit)}")
+    count = f"{sum(len(s.raw) for s in series)} residuals of {len(list_poses(residuals))} poses"
+    return finish_figure(figure, f"{robot.name}: {count}; {describe_residual_frame(setup)}")
 
 
 def _group_by_unit(series: list[ResidualSeries]) -> list[list[ResidualSeries]]:
@@ -110,11 +124,14 @@ def _choose_styles(series: list[ResidualSeries]) -> dict[str, dict[str, Any]]:
 
 
 def _draw_by_pose(
-    axes: Axes, fit: Identification, group: list[ResidualSeries], styles: dict[str, dict[str, Any]]
+    axes: Axes,
+    robot: Mechanism,
+    poses: Sequence[str],
+    group: list[ResidualSeries],
+    styles: dict[str, dict[str, Any]],
 ) -> None:
     """Draw the residuals of one kind in units; components are side by side at their pose."""
-    unit = fit.robot.get_unit(group[0].dimension)
-    poses = list_poses(fit)
+    unit = robot.get_unit(group[0].dimension)
     steps = np.linspace(-0.25, 0.25, len(group) + 2)[1:-1] if len(poses) <= 60 else [0.0] * 99
     for s, step in zip(group, steps, strict=False):
         axes.plot(
@@ -192,13 +209,13 @@ def _draw_normal_plot(axes: Axes, whitened: np.ndarray) -> None:
 
 def _draw_against(
     axes: Axes,
-    fit: Identification,
+    robot: Mechanism,
     series: list[ResidualSeries],
     styles: dict[str, dict[str, Any]],
     name: str,
 ) -> None:
     """Draw the residuals over sigma against a recorded quantity."""
-    factor, symbol = find_quantity_unit(fit, name)
+    factor, symbol = find_quantity_unit(robot, name)
     for s in series:
         if name in s.quantities:
             axes.plot(

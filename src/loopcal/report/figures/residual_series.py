@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.apply.validation_findings import owner_of
-from loopcal.estimate import Identification
+from loopcal.estimate.residuals import KindResiduals
 from loopcal.findings.wording import list_names
 from loopcal.measure.kinds.joints.actuator_readings import ActuatorReadings
+from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit
 
@@ -50,22 +51,23 @@ class ResidualSeries:
         return self.kind if self.component in {"", self.kind} else f"{self.kind} {self.component}"
 
 
-def list_poses(fit: Identification) -> tuple[str, ...]:
+def list_poses(residuals: Sequence[KindResiduals]) -> tuple[str, ...]:
     """Return the labels of all poses with residuals, in order of measurement."""
-    return tuple(dict.fromkeys(label for rows in fit.residuals for label in rows.poses))
+    return tuple(dict.fromkeys(label for rows in residuals for label in rows.poses))
 
 
-def list_series(fit: Identification) -> list[ResidualSeries]:
-    """Return the residuals of a fit by kind and component."""
-    place = {label: i for i, label in enumerate(list_poses(fit), 1)}
-    return [series for i in range(len(fit.residuals)) for series in _split(fit, i, place)]
+def list_series(robot: Mechanism, residuals: Sequence[KindResiduals]) -> list[ResidualSeries]:
+    """Return residuals by kind and component."""
+    place = {label: i for i, label in enumerate(list_poses(residuals), 1)}
+    return [series for rows in residuals for series in _split(robot, rows, place)]
 
 
-def _split(fit: Identification, i: int, place: dict[str, int]) -> Iterator[ResidualSeries]:
+def _split(
+    robot: Mechanism, rows: KindResiduals, place: dict[str, int]
+) -> Iterator[ResidualSeries]:
     """Yield the components of one kind."""
-    rows = fit.residuals[i]
     poses = np.array([place[label] for label in rows.poses], dtype=np.intp)
-    actuators = [f"{READING_PREFIX}{actuator.name}" for actuator in fit.robot.actuators]
+    actuators = [f"{READING_PREFIX}{actuator.name}" for actuator in robot.actuators]
     quantities = {**dict(zip(actuators, rows.readings.T, strict=False)), **rows.context}
     for j, component in enumerate(rows.components):
         used = _are_used(rows.raw[:, j], rows.whitened[:, j])
@@ -97,18 +99,23 @@ def list_quantities(series: list[ResidualSeries]) -> list[str]:
     return varying
 
 
-def find_quantity_unit(fit: Identification, name: str) -> tuple[float, str]:
+def find_quantity_unit(robot: Mechanism, name: str) -> tuple[float, str]:
     """Return the factor to SI and the symbol of a quantity that residuals are drawn against."""
     if name.startswith(READING_PREFIX):
         wanted = name.removeprefix(READING_PREFIX)
-        (actuator,) = (a for a in fit.robot.actuators if a.name == wanted)
-        unit: Unit = fit.robot.get_unit(actuator.dimension)
+        (actuator,) = (a for a in robot.actuators if a.name == wanted)
+        unit: Unit = robot.get_unit(actuator.dimension)
         return unit.factor_to_si, unit.symbol
     return 1.0, "s" if name == TIME else "degC"
 
 
-def describe_residual_frame(fit: Identification) -> str:
-    """Return in words what residuals are differences of, and after the fit of which frames."""
-    owners = tuple(dict.fromkeys(owner_of(name) for name in fit.nuisance.names))
+def describe_residual_frame(setup: Sequence[str]) -> str:
+    """Return in words what residuals are differences of, and after the fit of which frames.
+
+    Parameters
+    ----------
+    setup : names of the fitted setup parameters, such as `tracker.x`.
+    """
+    owners = tuple(dict.fromkeys(owner_of(name) for name in setup))
     fitted = f"after the best fit of {list_names(owners, 4)}" if owners else "in the stated frames"
     return f"predicted - measured, {fitted}"
