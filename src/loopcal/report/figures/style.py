@@ -42,6 +42,9 @@ MOST_LABELS, LONGEST = 45, 24
 CHARACTERS, HANDLE = 13.0, 7
 """Small characters of one inch, and those that the handle and the gaps of a legend take."""
 
+MOST_COLUMNS = 8
+"""Columns of a legend."""
+
 FEW_TICKS = (1.0, 2.0, 5.0)
 """Numbers on a short logarithmic axis, times powers of ten."""
 
@@ -79,15 +82,15 @@ def finish_figure(figure: Figure, title: str) -> Figure:
     return show_names(figure)
 
 
-def add_legend(figure: Figure, handles: list[Any]) -> None:
-    """Write a legend below all axes, where no data are, with as many columns as fit."""
+def add_legend(figure: Figure, handles: list[Any], most: int = MOST_COLUMNS) -> None:
+    """Write a legend below all axes, where no data are: as many columns as fit, at most `most`."""
     if handles:
         longest = max(len(str(handle.get_label())) for handle in handles) + HANDLE
         columns = int(figure.get_size_inches()[0] * CHARACTERS / longest)
         figure.legend(
             handles=handles,
             loc="outside lower center",
-            ncols=min(max(columns, 1), len(handles)),
+            ncols=min(max(columns, 1), most, len(handles)),
             frameon=False,
             fontsize=SMALL,
         )
