@@ -125,10 +125,13 @@ def _look_up(name: str, data: Mapping[str, Any]) -> Any:
     """Return the value of a field: data, a phrase, or the text of another finding."""
     if not name.endswith("()"):
         return _PYTHON.get_field(name, (), data)[0]
-    from loopcal.findings.catalog import find_entry, phrases
+    from loopcal.findings.catalog import conformity_phrases, find_entry, phrases
 
     name = name.removesuffix("()")
-    return find_entry(name).word(data) if "." in name else getattr(phrases, name)(data)
+    if "." in name:
+        return find_entry(name).word(data)
+    module = phrases if hasattr(phrases, name) else conformity_phrases
+    return getattr(module, name)(data)
 
 
 def _word_parts(value: Any, spec: str, data: Mapping[str, Any]) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phrases of statements on limits; `loopcal.findings.catalog.phrases` exports them."""
+"""Phrases of statements on limits, as those of `loopcal.findings.catalog.phrases`."""
 
 from __future__ import annotations
 

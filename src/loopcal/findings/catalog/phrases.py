@@ -10,10 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopcal.findings.catalog import find_entry
-from loopcal.findings.catalog.conformity_phrases import (
-    conformity_probability as conformity_probability,
-)
-from loopcal.findings.catalog.conformity_phrases import largest_error as largest_error
 from loopcal.findings.wording import fill_template, list_names
 
 Data = Mapping[str, Any]
