@@ -97,6 +97,7 @@ if TYPE_CHECKING:
     from loopcal.measure import Gaussian as Gaussian
     from loopcal.measure import Inclination as Inclination
     from loopcal.measure import Instrument as Instrument
+    from loopcal.measure import InstrumentRecord as InstrumentRecord
     from loopcal.measure import JointSensor as JointSensor
     from loopcal.measure import Line as Line
     from loopcal.measure import Locked as Locked
@@ -188,8 +189,9 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.measure": """
             Autocollimation Bearing Component Direction Distance Gaussian Inclination Instrument
-            JointSensor KINDS Line Locked Measurements Observations Plane Pose Position Sensor
-            Separation Sphere StatedValue Trials Uniform sample_truth simulate simulate_trials
+            InstrumentRecord JointSensor KINDS Line Locked Measurements Observations Plane Pose
+            Position Sensor Separation Sphere StatedValue Trials Uniform sample_truth simulate
+            simulate_trials
         """,
         "loopcal.mechanism": """
             Jacobian Mechanism Solution Status find_assembly_modes find_working_modes forward

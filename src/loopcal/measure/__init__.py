@@ -64,3 +64,6 @@ from loopcal.measure.simulation import replace_measured_values as replace_measur
 from loopcal.measure.simulation import sample_truth as sample_truth
 from loopcal.measure.simulation import simulate as simulate
 from loopcal.measure.simulation import simulate_trials as simulate_trials
+from loopcal.measure.traceability import InstrumentRecord as InstrumentRecord
+from loopcal.measure.traceability import check_instruments as check_instruments
+from loopcal.measure.traceability import list_instruments as list_instruments

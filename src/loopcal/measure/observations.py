@@ -13,6 +13,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type, set_fields
 from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.kinds.shared_errors import measure_progress
+from loopcal.measure.traceability import InstrumentRecord
 from loopcal.measure.whitening import compute_whitener
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
@@ -55,6 +56,8 @@ class Observations:
     is_noise_assumed : bool, optional
         Whether nobody stated the covariance: a program that wrote the rows assumed it. It then
         decides no quality gate.
+    instrument : InstrumentRecord, optional
+        What measured the rows, and how that is traceable; for certificates.
 
     Attributes
     ----------
@@ -82,6 +85,7 @@ class Observations:
     progress: FloatArray = field(default_factory=lambda: np.empty(0))
     source: str = ""
     is_noise_assumed: bool = False
+    instrument: InstrumentRecord | None = None
     present: BoolArray = field(init=False)
     whitener: FloatArray = field(init=False)
 

@@ -33,7 +33,7 @@ from loopcal.estimate.inference.prior import refuse_reused_rows
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.importance import sort_by_importance
-from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.measure import Measurements, check_instruments, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
@@ -214,6 +214,7 @@ def _report(
         *impossible,
         *(_report_validation(errors, held_out is not None) if fit.converged else ()),
         *_report_repeats(split),
+        *_check_instruments(split),
         *_report_freedoms(fit),
         start.finding,
         *(() if examination is None else examination.findings),
@@ -319,6 +320,12 @@ def _report_repeats(split: DataSplit) -> list[Finding]:
     """Return which held-out poses repeat fitted ones, where poses were chosen by name."""
     names = tuple(f"pose {label}" for label in split.list_repeats())
     return [report_finding("workflow.held-out-repeats", names=names)] if names else []
+
+
+def _check_instruments(split: DataSplit) -> list[Finding]:
+    """Return the instruments that were not validly calibrated when they measured."""
+    held_out = () if split.held_out is None else split.held_out.observations
+    return check_instruments((*split.fitted.observations, *held_out))
 
 
 def _report_freedoms(fit: Identification) -> list[Finding]:

@@ -25,7 +25,7 @@ from loopcal.diagnose import (
 )
 from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
-from loopcal.measure import Measurements
+from loopcal.measure import InstrumentRecord, Measurements, list_instruments
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import to_json
 from loopcal.workflow.calibration_options import CalibrationOptions
@@ -141,6 +141,12 @@ class CalibrationReport:
         return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
 
     @property
+    def instruments(self) -> tuple[InstrumentRecord, ...]:
+        """The stated instruments of all measurements, each once."""
+        held_out = () if self.split.held_out is None else self.split.held_out.observations
+        return list_instruments((*self.split.fitted.observations, *held_out))
+
+    @property
     def top_findings(self) -> tuple[Finding, ...]:
         """The two or three most important findings; all failures among them."""
         return self.findings[: max(TOP, len(self.failures))]
@@ -224,6 +230,7 @@ class CalibrationReport:
             "fit": self.identification,
             "start": self.start,
             "split": self.split.to_dict(),
+            "instruments": self.instruments,
             "validation": self.validation,
             **{name: part for name, part in optional.items() if part is not None},
             "options": self.provenance.options,

@@ -247,6 +247,7 @@ def validate(
     from loopcal.apply import report_reused_rows
     from loopcal.apply import validate as validate_robot
     from loopcal.io.runs.run_folder import load_run_or_robot
+    from loopcal.measure import check_instruments
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
@@ -255,6 +256,8 @@ def validate(
         reused = report_reused_rows(calibrated.fitted_rows, measurements)
         if reused is not None:
             terminal.print_note(str(reused))
+    for finding in check_instruments(measurements.observations):
+        terminal.print_note(str(finding))
     validation = validate_robot(
         calibrated.robot,
         measurements,

@@ -22,6 +22,7 @@ from loopcal.io.data.columns import (
     name_measured,
     refuse_unknown_columns,
 )
+from loopcal.io.data.instrument_settings import read_instrument
 from loopcal.io.data.kind_settings import (
     list_kind_settings,
     read_kind,
@@ -35,12 +36,13 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import EXAMPLES, SMALLEST_SD
 
 if TYPE_CHECKING:
-    from loopcal.measure import Kind, Observations
+    from loopcal.measure import InstrumentRecord, Kind, Observations
 
 SETTINGS: Mapping[str, str] = {
     "format": "1",
     "robot": "name of the robot; a different name than that of the robot in use is reported",
-    "instrument": "name of the instrument; for information",
+    "instrument": "name of the instrument, or its facts for traceability; see "
+    "[instruments](#instruments-and-their-traceability)",
     "controller": "robot file of the geometry that converts commanded coordinates to readings; "
     "the nominal robot by default",
     "kind": "the kind of all rows, followed by its own settings and noise",
@@ -58,7 +60,7 @@ SETTINGS: Mapping[str, str] = {
     "the robot file by default",
     "poses": "another file, in the same folder, with the readings of the poses",
 }
-KIND_SETTINGS = ("noise", "noise_source", *SHARED_ERRORS)
+KIND_SETTINGS = ("noise", "noise_source", "instrument", *SHARED_ERRORS)
 """Settings beside those of the kind itself."""
 
 POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
@@ -70,7 +72,8 @@ class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 
     `is_noise_assumed` where the settings say that nobody stated the noise. `shared_errors` are
-    standard deviations of biases and drifts, see `read_shared_errors`.
+    standard deviations of biases and drifts, see `read_shared_errors`. `instrument` is what measured
+    them.
     """
 
     kind: Kind
@@ -79,6 +82,7 @@ class KindRows:
     location: Location
     is_noise_assumed: bool = False
     shared_errors: Mapping[str, float] = field(default_factory=dict)
+    instrument: InstrumentRecord | None = None
 
 
 def has_measured_values(table: Table) -> bool:
@@ -150,6 +154,7 @@ def read_observations(
             context=beside,
             source=str(table.path),
             is_noise_assumed=entry.is_noise_assumed,
+            instrument=entry.instrument,
         )
     return observations, table.places(rows.tolist())
 
@@ -158,6 +163,7 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     """Read the settings `kind` or `kinds`, and the column `kind`."""
     file, content = table.settings, table.settings.content
     several = content.get("kinds")
+    instrument = read_instrument(file, content, ())
     if several is None:
         kind = read_kind(file, content, ()).with_tool(robot.tool)
         refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
@@ -167,8 +173,10 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
             read_noise_source(file, content, ()),
         )
         kind, shared = read_shared_errors(file, content, kind, ())
-        return (KindRows(kind, noise, rows, (), is_assumed, shared),)
-    allowed = [key for key in SETTINGS if key not in ("kind", *KIND_SETTINGS)]
+        return (KindRows(kind, noise, rows, (), is_assumed, shared, instrument),)
+    allowed = [
+        key for key in SETTINGS if key == "instrument" or key not in ("kind", *KIND_SETTINGS)
+    ]
     refuse_unknown_keys(file, list(content), allowed)
     if not isinstance(several, dict) or not all(isinstance(n, dict) for n in several.values()):
         sentence = "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
@@ -187,7 +195,8 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
         noise, rows = read_noise(file, node, kind, place), np.flatnonzero(cells == label)
         is_assumed = read_noise_source(file, node, place)
         kind, shared = read_shared_errors(file, node, kind, place)
-        kinds.append(KindRows(kind, noise, rows, place, is_assumed, shared))
+        own = read_instrument(file, node, place) or instrument
+        kinds.append(KindRows(kind, noise, rows, place, is_assumed, shared, own))
     return tuple(kinds)
 
 

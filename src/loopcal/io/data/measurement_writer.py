@@ -31,6 +31,7 @@ from loopcal.io.data.columns import (
     name_covariance,
     name_measured,
 )
+from loopcal.io.data.instrument_settings import format_instrument
 from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_stated_values
@@ -50,6 +51,8 @@ and correlation up to which there is none [1].
 ADDED = """\
 # Add one row for each pose below: its name, readings and measured values; leave empty what was not
 # measured.
+# Optional setting for traceability: instrument: {name: .., serial_number: "..", certificate: "..",
+#   laboratory: .., standard: .., calibrated: 2026-01-31, due: 2027-01-31, measured: 2026-05-31}
 # Optional columns: block, session, group, time, temperature [degC], sigma.NAME, note; see
 # docs/files.md."""
 """Remarks below the header of a template."""
@@ -97,6 +100,7 @@ def format_measurements(
     reading_noise, of_poses = _tabulate_poses(data, robot)
     texts = [
         format_kind(rows.kind, noise, robot.tool, rows.is_noise_assumed)
+        | ({} if rows.instrument is None else {"instrument": format_instrument(rows.instrument)})
         for rows, (noise, _) in zip(data.observations, tables, strict=True)
     ]
     lines = _format_settings(robot, list(zip(labels, texts, strict=True)), remark)

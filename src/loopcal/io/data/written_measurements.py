@@ -76,6 +76,7 @@ def _check_rows(before: Observations, after: Observations, order: IntArray) -> N
     sd = np.where(before.present, np.sqrt(np.diagonal(before.covariance, 0, 1, 2)), np.inf)[kept]
     change = (after.covariance - before.covariance[kept]) / (sd[:, :, None] * sd[:, None, :])
     require_same(f"covariances of {name}", True, bool((np.abs(change) <= ROUNDING).all()))
+    require_same(f"instrument of {name}", before.instrument, after.instrument)
     for what in ("session", "group"):
         values = [unicodedata.normalize("NFC", v) for v in getattr(before, what)[kept].tolist()]
         require_same(f"{what}s of {name}", values, getattr(after, what).tolist())
