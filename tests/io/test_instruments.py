@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instruments of measurement files: read strictly, written back, carried to results, dates checked."""
+"""Instruments of measurement files: read strictly, written back, in results; dates are checked."""
 
 import json
 from dataclasses import replace
@@ -74,15 +74,16 @@ def test_kinds_have_instruments_of_their_own(tmp_path, robot) -> None:
 # instrument: camera
 # kinds:
 #   place: {kind: component, components: [x, y], noise: {"*": 5 um}}
-#   rod: {kind: distance, anchor: [0 mm, 0 mm, 0 mm], noise: {"*": 5 um}, instrument: {serial_number: "07"}}
-pose,kind,left [deg],right [deg],x [mm],y [mm],d [mm]
+#   rod: {kind: distance, anchor: [0 mm, 0 mm, 0 mm], noise: {"*": 5 um},
+#     instrument: {serial_number: "07"}}
+pose,kind,left [deg],right [deg],x [mm],y [mm],distance [mm]
 1,place,140,40,0,330,
 1,rod,140,40,,,330
 """
     (tmp_path / "data.csv").write_text(text, "utf-8")
     data = lc.load_measurements(tmp_path / "data.csv", robot)
     names = {o.kind.name: str(o.instrument) for o in data.observations}
-    assert names == {"component": "camera", "distance": "the instrument, serial number 07"}
+    assert names == {"component": "camera", "distance": "serial number 07"}
 
 
 @pytest.mark.parametrize(

@@ -72,8 +72,8 @@ class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 
     `is_noise_assumed` where the settings say that nobody stated the noise. `shared_errors` are
-    standard deviations of biases and drifts, see `read_shared_errors`. `instrument` is what measured
-    them.
+    standard deviations of biases and drifts, see `read_shared_errors`. `instrument` is what
+    measured them.
     """
 
     kind: Kind
