@@ -117,7 +117,7 @@ def test_results_and_findings_have_the_instrument(robot, data) -> None:
     report = lc.calibrate(robot, late, lc.CalibrationOptions(hold_out=0.25))
     assert report.verdict is lc.Verdict.RESERVATIONS
     (found,) = (f for f in report.findings if f.code == "data.instrument-past-due")
-    assert "AT960, serial number 0750123 measured on 2026-02-01, after" in str(found)
+    assert "instrument AT960, serial number 0750123 measured on 2026-02-01, after" in str(found)
     (stored,) = json.loads(json.dumps(report.to_dict()))["instruments"]
     assert stored == FACTS | {"measured": "2026-02-01"}
 

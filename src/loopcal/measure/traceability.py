@@ -62,7 +62,7 @@ class InstrumentRecord:
         """Return the instrument as a sentence names it."""
         name = self.name or " ".join(x for x in (self.manufacturer, self.model) if x)
         number = f"serial number {self.serial_number}" if self.serial_number else ""
-        return ", ".join(part for part in (name, number) if part) or "the instrument"
+        return ", ".join(part for part in (name, number) if part) or "without a name"
 
     @property
     def is_traceable(self) -> bool:
