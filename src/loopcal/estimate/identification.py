@@ -28,10 +28,10 @@ from loopcal.estimate.fit_input import (
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
-from loopcal.estimate.inference.data_information import collect_information
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import (
     VarianceSources,
+    add_data,
     compute_posterior,
     find_variance_sources,
 )
@@ -41,7 +41,6 @@ from loopcal.estimate.inference.prior import (
     report_unknown_rows,
 )
 from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
-from loopcal.estimate.inference.shown_noise import find_shown_noise
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.loss_uncertainty import add_loss_uncertainty
 from loopcal.estimate.methods.losses import Loss
@@ -138,11 +137,7 @@ def identify(
     if open_poses.poses:
         findings.append(open_poses.report("fit.poses-open-at-start"))
     rows = collect_used_rows(robot, data, options.prior)
-    shown = find_shown_noise(fit.decomposition, result.residual_test)
-    information = collect_information(free, fit.decomposition, result.residual_test)
-    posterior = replace(
-        result.posterior, fitted_rows=rows, shown_noise=shown, information=information
-    )
+    posterior = add_data(result.posterior, free, fit.decomposition, result.residual_test, rows)
     return replace(result, posterior=posterior, findings=tuple(findings))
 
 

@@ -24,7 +24,11 @@ from loopcal.estimate.inference.covariance_parts import (
     parts_from_arrays,
     store_parts,
 )
-from loopcal.estimate.inference.data_information import DataInformation, information_from_arrays
+from loopcal.estimate.inference.data_information import (
+    DataInformation,
+    collect_information,
+    information_from_arrays,
+)
 from loopcal.estimate.inference.measured_frames import MeasuredFrames, frames_from_arrays
 from loopcal.estimate.inference.model_discrepancy import (
     DISCREPANCY,
@@ -32,7 +36,11 @@ from loopcal.estimate.inference.model_discrepancy import (
     discrepancy_from_arrays,
 )
 from loopcal.estimate.inference.residual_test import ResidualTest
-from loopcal.estimate.inference.shown_noise import ShownNoise, shown_noise_from_arrays
+from loopcal.estimate.inference.shown_noise import (
+    ShownNoise,
+    find_shown_noise,
+    shown_noise_from_arrays,
+)
 from loopcal.estimate.methods.penalties import Method
 from loopcal.findings import report_finding
 from loopcal.measure import FittedRows, fitted_rows_from_arrays
@@ -210,6 +218,27 @@ def find_variance_sources(
     prior = method.prior_variance(decomposition, penalty, free)
     is_known = test.intervals and (prior is None or not np.isnan(prior).any())
     return VarianceSources(test.sigma_scale**2 if is_known else np.nan, prior)
+
+
+def add_data(
+    posterior: Posterior,
+    free: FreeParameters,
+    decomposition: Decomposition,
+    test: ResidualTest,
+    rows: FittedRows | None,
+) -> Posterior:
+    """Return a posterior with what is known of its data: rows, noise and information.
+
+    Parameters
+    ----------
+    free, decomposition, test : of the fit (t = 1). rows : see `Posterior.fitted_rows`.
+    """
+    return replace(
+        posterior,
+        fitted_rows=rows,
+        shown_noise=find_shown_noise(decomposition, test),
+        information=collect_information(free, decomposition, test),
+    )
 
 
 def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:
