@@ -61,6 +61,10 @@ SECTIONS = {
         "reproduce": "Repeat a published study and compare its numbers.",
         "per-leg": "Identify a hexapod leg by leg, to compare with calibrate.",
     },
+    "Begin": {
+        "example": "Write the files of an example, to try the commands with.",
+        "completion": "Print the script with which a shell completes commands.",
+    },
 }
 """Headings of the help, and the commands below each."""
 
@@ -75,6 +79,7 @@ MODULES = {
     "sampling_commands": ("bootstrap", "sample", "region"),
     "study_commands": ("study",),
     "paper_commands": ("reproduce", "per-leg"),
+    "help_commands": ("example", "completion"),
 }
 """Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
 
@@ -122,7 +127,9 @@ def find_running_command(words: Sequence[str]) -> click.Command | None:
         "show_default": True,
     },
 )
-@click.version_option(package_name="loopcal", message="loopcal %(version)s")
+@click.version_option(
+    None, "-V", "--version", package_name="loopcal", message="loopcal %(version)s"
+)
 def command_line() -> None:
     """Calibrate the geometry of robots with closed kinematic loops.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from loopcal.errors import DataError, UnitError
 from loopcal.units import Dimension, parse_quantity
@@ -23,7 +24,18 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 FILE = click.Path(path_type=Path)
 
-robot_argument = click.argument("robot", metavar="ROBOT")
+
+def _complete_robot(
+    _context: click.Context, _argument: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the shipped robots that begin as a word; files where there is none."""
+    from loopcal.io.robot.robot_file import list_shipped_robots
+
+    names = [name for name in list_shipped_robots() if name.startswith(incomplete)]
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+robot_argument = click.argument("robot", metavar="ROBOT", shell_complete=_complete_robot)
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
 )
