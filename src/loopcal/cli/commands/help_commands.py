@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal example` and `loopcal completion`: files to begin with, and names that a shell fills in."""
+"""`loopcal example` and `loopcal completion`: files to begin with, and the completion of a shell."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ def example(name: str | None, output: Path | None, as_json: bool) -> int:
 
 @click.command()
 @click.argument("shell", type=click.Choice(SHELLS))
-def completion(shell: str) -> int:
+@json_option
+def completion(shell: str, as_json: bool) -> int:
     """Print the script with which SHELL completes commands, options, names of robots and files.
 
     \b
@@ -58,6 +59,10 @@ def completion(shell: str) -> int:
       bash  ~/.bashrc                        eval "$(loopcal completion bash)"
       zsh   ~/.zshrc                         eval "$(loopcal completion zsh)"
       fish  ~/.config/fish/config.fish       loopcal completion fish | source
+
+    \b
+    Examples:
+      loopcal completion bash
     """  # noqa: D301
     from click.shell_completion import get_completion_class
 
@@ -66,5 +71,9 @@ def completion(shell: str) -> int:
     writer = get_completion_class(shell)
     assert writer is not None  # SHELLS are those of click
     script = writer(command_line, {}, "loopcal", "_LOOPCAL_COMPLETE")
-    terminal.print_text(script.source_template % script.source_vars())
+    text = script.source_template % script.source_vars()
+    if as_json:
+        terminal.print_json({"shell": shell, "script": text})
+    else:
+        terminal.print_text(text)
     return 0
