@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal example` and `loopcal completion`: files to begin with, and the completion of a shell."""
+"""`loopcal example` and `loopcal completion`: files to begin with, and a shell that completes."""
 
 from __future__ import annotations
 
