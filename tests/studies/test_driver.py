@@ -13,9 +13,9 @@ import pytest
 
 import loopcal
 from evidence.study_interruption import examine, read_contents
-from loopcal.errors import FileError
+from loopcal.errors import FileError, StudyError
 from loopcal.studies.driver import Share, count_blocks, count_stored, run_blocks
-from loopcal.studies.execution import Answer, Processes, Serial
+from loopcal.studies.execution import Answer, Dask, Processes, Serial
 from loopcal.studies.files.merging import merge_studies
 from loopcal.studies.files.store import NAME, open_store
 from loopcal.studies.files.study_folder import StudySource, extend_study, open_study, read_study
@@ -101,6 +101,45 @@ def test_folder_is_refused_where_it_is_in_use_changed_or_of_others(undisturbed, 
     (tmp_path / "file").touch()
     with pytest.raises(FileError, match="this is a file, but a study is a folder"):
         run_study(source, tmp_path / "file", Serial())
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_workers_that_are_not_reached_leave_nothing(tmp_path, exists) -> None:
+    source, folder = read_source(write_study(tmp_path)), tmp_path / "study"
+    if exists:
+        folder.mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    for _ in range(2):
+        with expect_refusal("workers.cluster-not-reached", StudyError):
+            run_study(source, folder, Dask("tcp://127.0.0.1:1", patience=0.5))
+        assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_workers_that_are_not_reached_later_leave_the_stored_blocks(tmp_path) -> None:
+    file, folder = write_study(tmp_path, replicates=10), tmp_path / "study"
+    run_study(read_source(file), folder, Serial())
+    before = read_contents(folder)
+    with expect_refusal("workers.cluster-not-reached", StudyError):
+        workers = Dask("tcp://127.0.0.1:1", patience=0.5)
+        run_study(read_source(write_study(tmp_path)), folder, workers, resume=True)
+    assert read_contents(folder) == before
+
+
+class RefusesSecondBlock:
+    """Workers that end with an error of the library at the second block."""
+
+    def map_blocks(self, function, tasks):
+        for task in tasks:
+            if isinstance(task, BlockTask) and task.block == 1:
+                raise StudyError("the cluster was shut down")
+            yield Answer(task, function(task))
+
+
+def test_error_after_the_first_block_leaves_it_stored(tmp_path) -> None:
+    source, folder = read_source(write_study(tmp_path)), tmp_path / "study"
+    with pytest.raises(StudyError, match="the cluster was shut down"):
+        run_study(source, folder, RefusesSecondBlock())
+    assert len(read_contents(folder)) == 1
 
 
 def test_store_of_other_numbers_is_refused(undisturbed, tmp_path) -> None:

@@ -17,7 +17,7 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.studies.files import file_systems
-from loopcal.studies.files.file_systems import find_type, is_network
+from loopcal.studies.files.file_systems import find_type, is_network, parse_statfs
 from loopcal.studies.files.store import (
     NAME,
     StoreHeader,
@@ -233,6 +233,22 @@ MOUNTS = """\
 )
 def test_file_system_is_that_of_the_deepest_and_latest_mount(path, kind, refused) -> None:
     assert find_type(MOUNTS, Path(path)) == kind
+    assert is_network(kind) == refused
+
+
+@pytest.mark.parametrize(
+    ("kind", "is_local", "refused"),
+    [("apfs", True, False), ("smbfs", False, True), ("nfs", False, True), ("webdav", False, True),
+     ("afpfs", False, True), ("macfuse", True, True), ("msdos", True, False)],
+)  # fmt: skip
+def test_file_system_of_macos_is_read_as_its_header_defines_it(kind, is_local, refused) -> None:
+    """struct statfs of sys/mount.h: f_flags begins at byte 64, f_fstypename at byte 72."""
+    flags = 0x00001000 if is_local else 0x00000018
+    content = bytearray(2168)
+    content[64:68] = flags.to_bytes(4, "little")
+    content[72 : 72 + len(kind)] = kind.encode()
+    content[88:96] = b"/Volumes"
+    assert parse_statfs(bytes(content)) == (kind, is_local)
     assert is_network(kind) == refused
 
 

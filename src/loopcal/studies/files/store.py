@@ -143,6 +143,11 @@ class StudyStore:
             )
         return done.rowcount == 1
 
+    def has_blocks(self) -> bool:
+        """Return whether any block is stored."""
+        with _report_errors(self.path):
+            return self.connection.execute("SELECT 1 FROM blocks LIMIT 1").fetchone() is not None
+
     def list_keys(self, levels: Levels) -> frozenset[str]:
         """Return the keys of the stored blocks of a cell."""
         question = "SELECT key FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?)"

@@ -6,6 +6,7 @@ A new folder takes its name when it is complete, so a driver that is killed leav
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import loopcal
-from loopcal.errors import FileError
+from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
 from loopcal.io.core.outputs import replace_folder, resolve_folder
@@ -51,6 +52,9 @@ class StudySource:
 def open_study(folder: Path, source: StudySource, resume: bool = False) -> Iterator[StudyStore]:
     """Open the folder of a study as its driver; it is made where it does not exist.
 
+    A folder that was made is removed where the body raises a LoopcalError before it stored a block,
+    as where no worker can be reached.
+
     Parameters
     ----------
     resume : a folder of the same study is continued. The study may have more replicates or further
@@ -61,10 +65,32 @@ def open_study(folder: Path, source: StudySource, resume: bool = False) -> Itera
     FileError : the folder contains something else, or another study, or (without `resume`) any; or
         see `open_store`.
     """
-    if not (folder / NAME).is_file():
-        _make_folder(folder, source)
-    elif not resume:
-        raise FileError(report_finding("store.in-use"), folder)
+    if (folder / NAME).is_file():
+        if not resume:
+            raise FileError(report_finding("store.in-use"), folder)
+        with _continue_study(folder, source) as store:
+            yield store
+        return
+    is_empty_folder = folder.is_dir()
+    _make_folder(folder, source)
+    is_used = True
+    try:
+        with _continue_study(folder, source) as store:
+            try:
+                yield store
+            except LoopcalError:
+                is_used = store.has_blocks()
+                raise
+    finally:
+        if not is_used:
+            shutil.rmtree(folder, ignore_errors=True)
+            if is_empty_folder:
+                folder.mkdir(exist_ok=True)
+
+
+@contextmanager
+def _continue_study(folder: Path, source: StudySource) -> Iterator[StudyStore]:
+    """Open the folder of the same study as its driver, and store its further levels."""
     with open_store(folder) as store:
         header, study = store.header, source.study
         if changes := list_conflicts(load_specification(store).to_json(), study.to_json()):
