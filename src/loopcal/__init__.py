@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from loopcal.errors import FileError as FileError
     from loopcal.errors import LoopcalError as LoopcalError
     from loopcal.errors import MechanismError as MechanismError
+    from loopcal.errors import MissingPackageError as MissingPackageError
     from loopcal.errors import StudyError as StudyError
     from loopcal.errors import UnitError as UnitError
     from loopcal.estimate import GCV as GCV
@@ -175,7 +176,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
-            StudyError UnitError
+            MissingPackageError StudyError UnitError
         """,
         "loopcal.estimate": """
             Combination DescentStatus FitOptions GCV Huber Identification IdentifiedTrials

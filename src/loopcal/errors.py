@@ -63,6 +63,10 @@ class StudyError(LoopcalError):
     """A study that cannot be computed as asked, such as without workers."""
 
 
+class MissingPackageError(LoopcalError, ImportError):
+    """An optional package that is not installed; the text says how to install it."""
+
+
 class ArgumentTypeError(LoopcalError, TypeError):
     """An argument of the wrong type; the text says what to pass."""
 

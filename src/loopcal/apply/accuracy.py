@@ -34,6 +34,7 @@ from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
 from loopcal.numerics.chi_square import compute_f_quantile
+from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray
 
 COMPONENT_LEVEL = 0.954499736103642
@@ -63,7 +64,7 @@ class PoseDegrees(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PoseUncertainty:
+class PoseUncertainty(TableResult):
     """Uncertainty of n poses.
 
     The components are those of `COMPONENTS`: a small rotation, then the displacement of the point.

@@ -35,6 +35,7 @@ from loopcal.mechanism import (
     inverse,
     read_coordinates,
 )
+from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
 from loopcal.units import Dimension
 
@@ -80,7 +81,7 @@ CODES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Compensation:
+class Compensation(TableResult):
     """Readings or commands for n targets, and the poses they lead to.
 
     Errors are twists (n, 6), rotation first [rad, m].

@@ -35,6 +35,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Observations
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
 
@@ -66,7 +67,7 @@ class Decision(Enum):
 
 
 @dataclass(frozen=True)
-class Conformity:
+class Conformity(HtmlResult):
     """An error with its uncertainty against a limit.
 
     Attributes

@@ -41,6 +41,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Solution, sample_workspace
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -109,7 +110,7 @@ class HalvedErrors(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorBudget:
+class ErrorBudget(HtmlResult):
     """The uncertainty of the parameters and of poses over the workspace, by source.
 
     Attributes

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -55,11 +55,15 @@ from loopcal.findings import Finding, Severity
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
+from loopcal.presentation import TableResult, draw
 from loopcal.units import Unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class Validation(TableResult):
     """Errors on measured poses before and after calibration, over the r rows of all kinds.
 
     Positions are compared target by target in the frame of their instrument, see `frame`.
@@ -184,6 +188,10 @@ class Validation:
             "commanded after": self.commanded_after,
             "not compensable": self.not_compensable,
         }
+
+    def plot(self) -> Figure:
+        """Draw the errors by pose before and after calibration, with the noise floor and limits."""
+        return draw("draw_validation", self)
 
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""

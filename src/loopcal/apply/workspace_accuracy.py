@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,11 +16,15 @@ from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.mechanism import forward, resolve_poses
+from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
-class AccuracyMap:
+class AccuracyMap(TableResult):
     """Uncertainty over the workspace, and at the measured poses.
 
     Attributes
@@ -51,6 +55,10 @@ class AccuracyMap:
     def extrapolated(self) -> BoolArray:
         """(n,) poses that are less certain than every measured pose."""
         return (self.position_ratio > 1.0) | (self.orientation_ratio > 1.0)
+
+    def plot(self) -> Figure:
+        """Draw the uncertainty in slices of the workspace, beside the measured poses."""
+        return draw("draw_accuracy_map", self)
 
     def __str__(self) -> str:
         """Return medians and maxima, and how many poses are extrapolated."""

@@ -33,6 +33,7 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import decompose
+from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 NOTHING_LEFT = 1e-12
@@ -40,7 +41,7 @@ NOTHING_LEFT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class CrossValidation:
+class CrossValidation(TableResult):
     """Prediction errors of poses by fits that did not use them.
 
     Attributes

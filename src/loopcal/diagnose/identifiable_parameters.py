@@ -7,7 +7,7 @@ Singular values are those of whitened rows in units of tolerance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -36,8 +36,12 @@ from loopcal.numerics.decomposition import (
     are_nonzero,
     decompose,
 )
+from loopcal.presentation import TableResult, draw
 from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_WEAK = 5
 """Number of weak directions that are listed, weakest first."""
@@ -89,7 +93,7 @@ class ParameterIdentifiability:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identifiability:
+class Identifiability(TableResult):
     """What measurements determine, in units of sigma (rows) and tolerance (columns).
 
     Attributes
@@ -155,6 +159,10 @@ class Identifiability:
     def improved(self) -> int:
         """Number of directions known better than their tolerance (singular value above 1)."""
         return int((self.singular_values[: self.rank] > 1.0).sum())
+
+    def plot(self) -> Figure:
+        """Draw the singular values with the gap, null vectors and weak directions."""
+        return draw("draw_identifiability", self)
 
     def __repr__(self) -> str:
         name, rank = self.free_parameters.robot.name, f"rank {self.rank} of {self.n_parameters}"

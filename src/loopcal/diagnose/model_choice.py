@@ -29,6 +29,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import are_nonzero
+from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
@@ -97,7 +98,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class ModelChoice:
+class ModelChoice(TableResult):
     """The comparison of sets of free parameters.
 
     Attributes

@@ -22,6 +22,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import LinearMap, Mechanism
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 
 SETTABLE, NONZERO = 0.1, 0.3
@@ -70,7 +71,7 @@ class MergedParameter:
 
 
 @dataclass(frozen=True, eq=False)
-class IdentifiableSubset:
+class IdentifiableSubset(HtmlResult):
     """A set of free parameters that carries all information of the measurements.
 
     Attributes

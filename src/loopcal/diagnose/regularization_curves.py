@@ -30,6 +30,7 @@ from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 PER_DECADE = 4
@@ -82,7 +83,7 @@ class RegularizationCurve:
 
 
 @dataclass(frozen=True, eq=False)
-class RegularizationCurves:
+class RegularizationCurves(TableResult):
     """How the error at held-out poses depends on regularization.
 
     Attributes

@@ -37,6 +37,7 @@ from loopcal.measure import (
 )
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -81,7 +82,7 @@ class FurtherMeasurement:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasurementSuggestion:
+class MeasurementSuggestion(HtmlResult):
     """An unidentifiable combination, and the measurements that determine it, simplest first."""
 
     combination: Combination

@@ -38,6 +38,7 @@ from loopcal.geometry.alignment import align_point_sets
 from loopcal.mechanism import Mechanism, Status, forward_trials
 from loopcal.numerics.chi_square import compute_chi_square_tail, compute_f_tail
 from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -54,7 +55,7 @@ state some seven digits.
 
 
 @dataclass(frozen=True, eq=False)
-class ValueComparison:
+class ValueComparison(TableResult):
     """A fit against given values of its parameters; arrays (k,) in the order of `names`.
 
     Attributes

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimate the parameters of a robot from measurements."""
 
-from loopcal.estimate.identification import IdentifiedTrials as IdentifiedTrials
 from loopcal.estimate.identification import identify as identify
 from loopcal.estimate.identification import identify_trials as identify_trials
+from loopcal.estimate.identified_trials import IdentifiedTrials as IdentifiedTrials
 from loopcal.estimate.inference.null_space import Combination as Combination
 from loopcal.estimate.inference.posterior import Posterior as Posterior
 from loopcal.estimate.inference.prior import Prior as Prior

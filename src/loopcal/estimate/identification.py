@@ -5,7 +5,7 @@ many trials at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from loopcal.estimate.fit_input import (
 )
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import (
@@ -74,9 +75,8 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, find_impossible_values
-from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
+from loopcal.typing import FloatArray, Progress, report_no_progress
 
 
 def identify(
@@ -139,49 +139,6 @@ def identify(
     rows = collect_used_rows(robot, data, options.prior)
     posterior = add_data(result.posterior, free, fit.decomposition, result.residual_test, rows)
     return replace(result, posterior=posterior, findings=tuple(findings))
-
-
-@dataclass(frozen=True, eq=False)
-class IdentifiedTrials:
-    """t machines identified at once; arrays are (t, ...), SI.
-
-    Attributes
-    ----------
-    values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
-    cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
-    decomposition, penalty : variances and leverages are read from them.
-    prior_variance : (t, p) see `Method.prior_variance`.
-    """
-
-    values: FloatArray
-    status: IntArray
-    iterations: IntArray
-    cost: FloatArray
-    free_parameters: FreeParameters
-    decomposition: Decomposition
-    penalty: FloatArray
-    prior_variance: FloatArray | None = None
-
-    def __repr__(self) -> str:
-        """Return the number of trials and how many converged."""
-        return (
-            f"<IdentifiedTrials of {self.free_parameters.robot.name}: {len(self.values)} trials of "
-            f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
-        )
-
-    @property
-    def converged(self) -> BoolArray:
-        """(t,) which trials converged."""
-        return self.status == DescentStatus.CONVERGED
-
-    def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
-        """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
-        parameter. They do not contain the uncertainty of factors on the tolerances.
-        """
-        scaled = self.decomposition.standard_deviations(
-            self.penalty, noise_variance, self.prior_variance
-        )
-        return scaled * self.free_parameters.tolerance
 
 
 def identify_trials(

@@ -33,6 +33,7 @@ from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_averaged_tail
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 MOST_TRIED = 60
@@ -51,7 +52,7 @@ EXPLAINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class Change(HtmlResult):
     """Whether parameters have changed between two calibrations.
 
     Attributes

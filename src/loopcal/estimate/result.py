@@ -24,6 +24,7 @@ from loopcal.estimate.residuals import KindResiduals, store_residuals
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.presentation import FitFigures, TableResult
 from loopcal.typing import FloatArray
 
 LAST_DIGITS = 3
@@ -74,7 +75,7 @@ class History:
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class Identification(TableResult):
     """A robot identified from measurements.
 
     Arrays over parameters are (p,) in the order of `names`, in SI units.
@@ -230,6 +231,11 @@ class Identification:
         factor = least if least == most else f"{least} to {most}"
         law = "normal" if np.isinf(nu).all() else f"Student's t, at least {nu.min():.3g} degrees"
         return f"95 % intervals: {factor} standard uncertainties ({law})."
+
+    @property
+    def plot(self) -> FitFigures:
+        """The figures of the fit, such as `fit.plot.residuals()`."""
+        return FitFigures(self)
 
     def __repr__(self) -> str:
         """Return a summary on one screen; `print` shows the parameters."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.estimate.frame_freedoms import find_measured_frames
-from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.inference.posterior import Posterior, VarianceSources, compute_posterior
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Trials

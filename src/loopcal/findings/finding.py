@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from loopcal.presentation import HtmlResult
+
 
 class Severity(StrEnum):
     """How much a finding matters."""
@@ -29,7 +31,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Finding(HtmlResult):
     """What loopcal noticed, in a form that programs can read.
 
     Build findings with `loopcal.findings.report_finding`, which takes the severity from the catalog

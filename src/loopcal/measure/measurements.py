@@ -16,6 +16,7 @@ from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nu
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
 from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SAME_READING = 1e-9
@@ -23,7 +24,7 @@ SAME_READING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measurements:
+class Measurements(TableResult):
     """Everything measured on one robot.
 
     Parameters

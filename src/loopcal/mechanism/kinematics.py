@@ -34,6 +34,7 @@ from loopcal.mechanism.sensitivity import (
 )
 from loopcal.mechanism.solution_modes import solve_in_mode
 from loopcal.mechanism.states import Status, is_closed, select_poses
+from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
 
@@ -46,7 +47,7 @@ PROJECTION_STEPS = 12
 
 
 @dataclass(frozen=True, repr=False)
-class Solution:
+class Solution(TableResult):
     """Poses and joints of n rows.
 
     Attributes
@@ -211,7 +212,7 @@ def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
 
 
 @dataclass(frozen=True, repr=False)
-class Jacobian:
+class Jacobian(TableResult):
     """Derivatives of n poses in parameters and readings, labeled.
 
     The platform's twist has the rows `components`: rotation (rx, ry, rz) [rad] about base axes,

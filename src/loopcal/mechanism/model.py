@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +17,12 @@ from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
 from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
+from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit, find_unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHOWN_ACTUATORS = 8
 """Actuators that `repr` names before it counts the others."""
@@ -113,7 +117,7 @@ class LimbMap:
 
 
 @dataclass(frozen=True, repr=False)
-class Mechanism:
+class Mechanism(TableResult):
     """A robot with closed loops, ready to compute.
 
     Attributes
@@ -138,6 +142,10 @@ class Mechanism:
     units: Mapping[Dimension, str]
     findings: tuple[Finding, ...] = ()
     record: Any = None
+
+    def plot(self) -> Figure:
+        """Draw the robot at home: in the plane where it is planar, else in two views."""
+        return draw("draw_robot", self)
 
     def __repr__(self) -> str:
         """Return name, family, actuators, freedoms and counts, on a few lines."""

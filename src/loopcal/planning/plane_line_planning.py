@@ -10,7 +10,7 @@ and docs/theory/planning.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,7 +30,11 @@ from loopcal.planning.design import (
 from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.plane_line_groups import AXIS, PlaneLineGroups
 from loopcal.planning.result import PlannedPoses
+from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SWEEPS = 3
 """Sweeps over all coordinates: one more gains a few per cent."""
@@ -61,7 +65,7 @@ class SurfaceOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePlan:
+class SurfacePlan(TableResult):
     """Points to bring onto planes and lines.
 
     Attributes
@@ -160,6 +164,10 @@ class SurfacePlan:
             rank=self.possible,
             needed=-(-self.possible // (k - SPENT)),
         )
+
+    def plot(self) -> Figure:
+        """Draw the poses, numbered in their order, with the path between them."""
+        return draw("draw_plan", self)
 
     def __repr__(self) -> str:
         u, k = self.poses.groups.shape

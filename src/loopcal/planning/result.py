@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,11 @@ from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import ExpectedErrors
 from loopcal.planning.problem import name_groups
 from loopcal.planning.sample_size import ErrorCurve
+from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WEAK = 0.5
 """Efficiency below which the certificate guarantees little."""
@@ -127,7 +131,7 @@ class ErrorForecast:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(TableResult):
     """Poses to measure.
 
     Attributes
@@ -170,6 +174,10 @@ class Plan:
             *curve,
             *self.notes,
         )
+
+    def plot(self) -> Figure:
+        """Draw the poses, numbered in their order, with the path between them."""
+        return draw("draw_plan", self)
 
     def __repr__(self) -> str:
         return (

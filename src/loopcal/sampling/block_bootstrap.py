@@ -30,6 +30,7 @@ from loopcal.estimate.resampling import Resamples, draw_centers, fit_resamples, 
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.presentation import TableResult
 from loopcal.sampling.block_errors import compute_block_errors
 from loopcal.sampling.block_scatter import BlockScatter, describe_scatter
 from loopcal.sampling.blocks import choose_blocks
@@ -58,7 +59,7 @@ WEBB = np.sqrt([0.5, 1.0, 1.5])
 
 
 @dataclass(frozen=True, eq=False)
-class Bootstrap:
+class Bootstrap(TableResult):
     """Estimates of T resamples of one calibration. Arrays over parameters are (p,) as in the fit.
 
     Attributes

@@ -21,6 +21,7 @@ import numpy as np
 
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.multiple_tests import compute_single_level
+from loopcal.presentation import TableResult
 from loopcal.sampling.weighted_sample import weighted_quantiles
 from loopcal.typing import BoolArray, FloatArray
 
@@ -35,7 +36,7 @@ FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Intervals:
+class Intervals(TableResult):
     """Intervals of parameters; arrays are (p,) [SI], NaN where the data determine none.
 
     Attributes

@@ -33,6 +33,7 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.numerics.multiple_tests import compute_single_level
+from loopcal.presentation import TableResult
 from loopcal.sampling.intervals import half_widths
 from loopcal.typing import FloatArray, IntArray
 
@@ -48,7 +49,7 @@ SMALLEST = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class JointRegion:
+class JointRegion(TableResult):
     """An ellipsoid of q quantities.
 
     Attributes
@@ -125,7 +126,7 @@ class JointRegion:
 
 
 @dataclass(frozen=True, eq=False)
-class SimultaneousIntervals:
+class SimultaneousIntervals(TableResult):
     """Intervals that hold for all q quantities at once with a probability.
 
     Attributes

@@ -23,6 +23,7 @@ from loopcal.estimate.methods.penalties import MAP, LeastSquares
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.presentation import TableResult
 from loopcal.sampling.intervals import OFF, Intervals, compare_ends, half_widths, report_intervals
 from loopcal.sampling.posterior_density import PosteriorDensity, describe_density
 from loopcal.sampling.weighted_sample import effective_size, fit_tail_shape, normalize_weights
@@ -50,7 +51,7 @@ FLATTENED = 50.0
 
 
 @dataclass(frozen=True, eq=False)
-class PosteriorSample:
+class PosteriorSample(TableResult):
     """T weighted draws from the posterior of a fit.
 
     Attributes

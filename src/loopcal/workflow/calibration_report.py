@@ -27,6 +27,7 @@ from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import InstrumentRecord, Measurements, list_instruments
 from loopcal.mechanism import Mechanism
+from loopcal.presentation import TableResult
 from loopcal.serialization import to_json
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
@@ -78,7 +79,7 @@ def _count_fitted_poses(fit: Identification, data: Measurements) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationReport:
+class CalibrationReport(TableResult):
     """The result of `calibrate`.
 
     Attributes

@@ -13,6 +13,7 @@ from loopcal.apply.run_comparison.pair_comparison import PairComparison, compare
 from loopcal.apply.run_comparison.stored_run import StoredRun
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
+from loopcal.presentation import HtmlResult
 from loopcal.units import UNITS, Unit, find_unit
 
 
@@ -36,7 +37,7 @@ class RunSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class RunComparison:
+class RunComparison(HtmlResult):
     """Calibrations side by side; the first one is the reference of all others.
 
     Attributes

@@ -53,6 +53,7 @@ from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, forward
+from loopcal.presentation import HtmlResult
 
 IMPLAUSIBLE = 10.0
 """Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
@@ -71,7 +72,7 @@ neighbors (rows may be shifted by one) that contain them.
 
 
 @dataclass(frozen=True, eq=False)
-class ConventionCheck:
+class ConventionCheck(HtmlResult):
     """The stated conventions of measurements against the robot, and the best other interpretation.
 
     Attributes

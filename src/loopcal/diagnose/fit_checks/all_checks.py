@@ -18,11 +18,12 @@ from loopcal.estimate.fit_input import check_fitted_data
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.measure import Measurements
+from loopcal.presentation import HtmlResult
 from loopcal.typing import Progress, report_no_progress
 
 
 @dataclass(frozen=True, eq=False)
-class FitExamination:
+class FitExamination(HtmlResult):
     """The results of all examinations of a fit by its own data.
 
     Attributes

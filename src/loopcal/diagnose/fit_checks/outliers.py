@@ -43,6 +43,7 @@ from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 MOST_ROBUST = 20_000
@@ -97,7 +98,7 @@ class Conflict:
 
 
 @dataclass(frozen=True, eq=False)
-class OutlierCheck:
+class OutlierCheck(TableResult):
     """The result for all blocks.
 
     Attributes

@@ -15,6 +15,7 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 
 NEGLIGIBLE = 1e-6
@@ -26,7 +27,7 @@ MINOR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Combination:
+class Combination(HtmlResult):
     """A combined change of parameters that changes no measured value, or hardly any.
 
     Attributes

@@ -16,6 +16,7 @@ from loopcal.io.core.text_file import sha256
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.runs.run_verdict import find_run_failure
 from loopcal.mechanism import Mechanism
+from loopcal.presentation import HtmlResult
 
 if TYPE_CHECKING:
     from loopcal.estimate import Posterior
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(HtmlResult):
     """A calibration read from its run folder, or a robot file as if it were one.
 
     Parameters

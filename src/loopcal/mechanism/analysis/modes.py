@@ -27,6 +27,7 @@ from loopcal.mechanism.kinematics import Solution, check_arguments, make_solutio
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
 from loopcal.mechanism.transmission import joints_from_readings
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -39,7 +40,7 @@ SCALES = (0.1, 1.0)
 
 
 @dataclass(frozen=True, repr=False)
-class Modes:
+class Modes(HtmlResult):
     """Solutions found from random starts.
 
     Attributes

@@ -31,6 +31,7 @@ from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.states import driven_values, join_states
+from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -41,7 +42,7 @@ SAMPLE_SIZE = 400
 
 
 @dataclass(frozen=True, repr=False)
-class Singularity:
+class Singularity(HtmlResult):
     """Distance of n poses from singularities.
 
     Attributes

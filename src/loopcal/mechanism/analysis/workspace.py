@@ -17,6 +17,7 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.mechanism.kinematics import Solution, check_arguments, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import compute_limb_frames
+from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -114,7 +115,7 @@ def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[
 
 
 @dataclass(frozen=True)
-class WorkspaceSample:
+class WorkspaceSample(HtmlResult):
     """Positions drawn at random from a workspace.
 
     Attributes

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
+from loopcal.presentation import TableResult
 from loopcal.studies.execution.optional_packages import import_optional
 from loopcal.studies.files.store import StudyStore, read_store
 from loopcal.studies.files.study_folder import load_specification, read_study
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class StudyResult:
+class StudyResult(TableResult):
     """The results of a study in its folder; nothing is read before it is asked for.
 
     Parameters
@@ -42,6 +43,23 @@ class StudyResult:
     def study(self) -> Study:
         """The study."""
         return read_study(self.folder)
+
+    def _repr_html_(self) -> str:
+        """Return the summary of all cells as HTML."""
+        from loopcal.report.notebook import render_html
+        from loopcal.studies.results.summary_view import list_shown, view_summary
+
+        summary = self.summarize()
+        shown = list_shown(self.study, summary)
+        return render_html(view_summary(self.study, summary, shown))
+
+    def to_frame(self) -> Any:
+        """Return all trials as a pandas DataFrame; see `to_pandas`."""
+        return self.to_pandas()
+
+    def to_dataset(self) -> Any:
+        """Return all trials as an xarray Dataset; see `to_xarray`."""
+        return self.to_xarray()
 
     def summarize(self) -> StudySummary:
         """Return medians, quantiles and coverage of all cells, with intervals."""

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
+from loopcal.presentation import HtmlResult
 from loopcal.studies.specification.cells import Cell, list_cells
 from loopcal.studies.specification.keys import compute_key, describe_block, dump_json, load_json
 from loopcal.studies.specification.levels import (
@@ -31,7 +32,7 @@ BLOCK, REPLICATES = 50, 1000
 
 
 @dataclass(frozen=True)
-class Study:
+class Study(HtmlResult):
     """The specification of a study; equal specifications give equal numbers.
 
     Parameters
@@ -58,6 +59,15 @@ class Study:
     order: tuple[str, ...] = ("robot",)
     scores: Scores = field(default_factory=Scores)
     questions: Mapping[str, Question] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Return title, size and factors as HTML."""
+        from loopcal.report.notebook import render_html
+
+        levels = {n: dict.fromkeys(c.levels[n] for c in self.cells) for n in self.order}
+        factors = [f"{name}: {', '.join(names)}" for name, names in levels.items()]
+        size = f"{len(self.cells)} cells of {self.replicates} trials, seed {self.seed}"
+        return render_html(["\n".join([f"{self.title}: {size}", *factors])])
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of identifying many machines at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.presentation import TableResult
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedTrials(TableResult):
+    """t machines identified at once; arrays are (t, ...), SI.
+
+    Attributes
+    ----------
+    values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
+    cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
+    decomposition, penalty : variances and leverages are read from them.
+    prior_variance : (t, p) see `Method.prior_variance`.
+    """
+
+    values: FloatArray
+    status: IntArray
+    iterations: IntArray
+    cost: FloatArray
+    free_parameters: FreeParameters
+    decomposition: Decomposition
+    penalty: FloatArray
+    prior_variance: FloatArray | None = None
+
+    def __repr__(self) -> str:
+        """Return the number of trials and how many converged."""
+        return (
+            f"<IdentifiedTrials of {self.free_parameters.robot.name}: {len(self.values)} trials of "
+            f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
+        )
+
+    @property
+    def converged(self) -> BoolArray:
+        """(t,) which trials converged."""
+        return self.status == DescentStatus.CONVERGED
+
+    def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
+        """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
+        parameter. They do not contain the uncertainty of factors on the tolerances.
+        """
+        scaled = self.decomposition.standard_deviations(
+            self.penalty, noise_variance, self.prior_variance
+        )
+        return scaled * self.free_parameters.tolerance
