@@ -136,6 +136,7 @@ UNCHECKED = {
     *("save_run(report)", "save_run(inputs)", "load_robot(source)", "identify(loss)"),
     *("suggest_measurements(sigma)", "validate(uncertainty)"),
     *("sample_truth(seed)", "simulate_trials(seed)"),
+    *("write_report(path)", "write_report(report)"),
     *("load_study(path)", "study(source)", "study(folder)", "study(executor)"),
 }
 """Parameters of public functions that check them themselves, or use objects of any class."""

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import find_outliers as find_outliers
     from loopcal.diagnose import identifiability as identifiability
     from loopcal.diagnose import suggest_measurements as suggest_measurements
+    from loopcal.documents import write_report as write_report
     from loopcal.errors import ArgumentTypeError as ArgumentTypeError
     from loopcal.errors import DataError as DataError
     from loopcal.errors import EstimationError as EstimationError
@@ -174,6 +175,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
             compare_with_values compute_regularization_curves cross_validate examine_fit
             find_outliers identifiability suggest_measurements
         """,
+        "loopcal.documents": "write_report",
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
             MissingPackageError StudyError UnitError

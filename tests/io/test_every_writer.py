@@ -94,6 +94,7 @@ COMMANDS = {
     "papers/writing.py:write_folder": ("STUDY",),
     "studies/files/template.py:write_template": ("study new --robot five-bar F.yaml",),
     "io/runs/curves_folder.py:write_curves": ("regularize five-bar data.csv -o F",),
+    "documents/writing.py:write_report": ("report run -o F.html",),
 }
 """Commands that write the file or folder F, by the function that writes it."""
 
@@ -107,6 +108,9 @@ OF_STUDIES = {
     "studies/results/summary_view.py:write_summary": "each file is read by the reader of its kind",
 }
 """Functions of studies that need a computed study, with their readers; not damaged here."""
+
+BY_BROWSER = {"documents/printing.py:print_pdf": "begin and end of the PDF file are read"}
+"""Functions that need Chromium, with what is read; see tests/documents/test_browser.py."""
 
 FILES = {
     "io/runs/curves_folder.py:write_curves": ("curves.csv",),
@@ -173,7 +177,7 @@ def test_every_writer_has_a_command_here() -> None:
         for module, name, node, owner in list_names()
         if name in CORE and isinstance(node, ast.Name) and not module.startswith("io/core/")
     }
-    assert writers == set(COMMANDS) | set(COPIES) | set(OF_STUDIES)
+    assert writers == set(COMMANDS) | set(COPIES) | set(OF_STUDIES) | set(BY_BROWSER)
 
 
 @pytest.fixture(scope="module")

@@ -61,7 +61,7 @@ def test_csv_and_html_contain_the_same_cells():
     assert TABLE.to_csv().splitlines()[2] == "x & y,12.5,-"
     page = TABLE.to_html()
     assert "<caption>Errors</caption>" in page
-    assert '<td class="words">x &amp; y</td><td class="numbers">12.5</td>' in page
+    assert '<th scope="row" class="words wraps">x &amp; y</th><td class="numbers">12.5</td>' in page
     assert page.count("<tr>") == 3
 
 

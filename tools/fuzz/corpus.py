@@ -224,6 +224,8 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         1 validate run/robot.yaml more.csv
         4 budget run
         1 budget run --json
+        0.3 report run -o out.html
+        0.3 report run -o out.html --json
         5 compensate run targets.csv -o out.csv
         1 compensate run targets.csv --mode commands
         1 compensate truth.yaml targets.csv -o out.csv --json

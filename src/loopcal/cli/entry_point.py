@@ -43,6 +43,7 @@ SECTIONS = {
     },
     "Calibrate": {
         "calibrate": "Identify the parameters of a robot and validate them.",
+        "report": "Write the report of a calibration as HTML, JSON and PDF.",
         "validate": "Validate a calibration, or a robot file, with measurements.",
         "budget": "Show the uncertainty of a calibration by source.",
         "compare": "Compare calibrations side by side: has the machine changed, and where?",
@@ -75,6 +76,7 @@ MODULES = {
     "plan_command": ("plan",),
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
     "compare_command": ("compare",),
+    "report_command": ("report",),
     "regularize_command": ("regularize",),
     "sampling_commands": ("bootstrap", "sample", "region"),
     "study_commands": ("study",),

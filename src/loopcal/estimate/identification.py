@@ -56,7 +56,7 @@ from loopcal.estimate.nuisance.estimate import (
     empty_nuisance_estimate,
     estimate_nuisance,
 )
-from loopcal.estimate.observation_rows import Residuals, linked_blocks
+from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.poses.estimate import (
     EstimatedPoses,
@@ -69,7 +69,7 @@ from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
-from loopcal.estimate.residuals import KindResiduals
+from loopcal.estimate.residuals import label_residuals
 from loopcal.estimate.result import History, Identification, Spectrum
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
@@ -261,7 +261,7 @@ def _assemble(
         unidentifiable=unidentifiable,
         residual_test=test,
         prior_conflict=conflict,
-        residuals=_label_residuals(problem.residuals(fit.deviation, solution), data, problem),
+        residuals=label_residuals(problem.residuals(fit.deviation, solution), data, problem),
         pose_weights=weights,
         history=history,
         nuisance=nuisance,
@@ -329,27 +329,3 @@ def _report_poses(
         return []
     doubtful = report_doubtful_readings(robot, poses)
     return [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]
-
-
-def _label_residuals(
-    residuals: tuple[Residuals, ...], data: Measurements, problem: Problem
-) -> tuple[KindResiduals, ...]:
-    """Return the residuals (t = 1) of every kind with labels; those of uncertain readings last."""
-    observations = [o for o in data.observations if len(o)]
-    present, context = [o.present for o in observations], [o.context for o in observations]
-    if problem.is_uncertain:
-        present.append(np.isfinite(data.readings))
-        context.append(data.context)
-    return tuple(
-        KindResiduals(
-            kind=s.kind.name,
-            components=tuple(column.name for column in s.kind.noise_columns),
-            poses=tuple("/".join(data.labels[i] for i in members) for members in s.poses_by_link),
-            raw=np.where(measured, r.raw[0], np.nan),
-            whitened=r.whitened[0],
-            context=columns,
-            dimensions=tuple(column.dimension for column in s.kind.noise_columns),
-            readings=data.readings[s.poses_by_link[:, 0]],
-        )
-        for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
-    )

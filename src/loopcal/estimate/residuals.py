@@ -6,11 +6,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.estimate.observation_rows import Residuals
+    from loopcal.estimate.problem import Problem
+    from loopcal.measure import Measurements
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +92,27 @@ def residuals_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[KindResidua
             )
         )
     return tuple(result)
+
+
+def label_residuals(
+    residuals: tuple[Residuals, ...], data: Measurements, problem: Problem
+) -> tuple[KindResiduals, ...]:
+    """Return the residuals (t = 1) of every kind with labels; those of uncertain readings last."""
+    observations = [o for o in data.observations if len(o)]
+    present, context = [o.present for o in observations], [o.context for o in observations]
+    if problem.is_uncertain:
+        present.append(np.isfinite(data.readings))
+        context.append(data.context)
+    return tuple(
+        KindResiduals(
+            kind=s.kind.name,
+            components=tuple(column.name for column in s.kind.noise_columns),
+            poses=tuple("/".join(data.labels[i] for i in members) for members in s.poses_by_link),
+            raw=np.where(measured, r.raw[0], np.nan),
+            whitened=r.whitened[0],
+            context=columns,
+            dimensions=tuple(column.dimension for column in s.kind.noise_columns),
+            readings=data.readings[s.poses_by_link[:, 0]],
+        )
+        for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
+    )

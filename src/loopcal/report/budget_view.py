@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from loopcal.mechanism import Mechanism
@@ -76,6 +76,37 @@ def build_budget_table(budget: Mapping[str, Any], robot: Mechanism) -> Table:
     )
 
 
+def build_share_table(budget: Mapping[str, Any]) -> Table:
+    """Return the share of each source in the variance of poses."""
+    kinds = ("position",) if budget["orientation"]["rms"] == 0.0 else ("position", "orientation")
+    totals = [sum(line[kind] or 0.0 for line in budget["sources"]) for kind in kinds]
+    shares: list[tuple[Column, Callable[[Mapping[str, Any]], str]]] = [
+        (Column(kind, "%"), lambda line, kind=kind, total=total: _show_share(line[kind], total))
+        for kind, total in zip(kinds, totals, strict=True)
+    ]
+    return build_table(
+        "Share of each source in the variance of the expected error",
+        budget["sources"],
+        (word_column("source"), _name_source),
+        (word_column("type"), lambda line: line["evaluation"]),
+        *shares,
+    )
+
+
+def _show_share(variance: float | None, total: float) -> str:
+    """Return a part of a variance in percent; a dash where one of them is not finite."""
+    if variance is None or not math.isfinite(total) or total <= 0.0:
+        return ABSENT
+    share = 100.0 * variance / total
+    return "below 0.1" if 0.0 < share < 0.1 else f"{share:.1f}"
+
+
+def _name_source(line: Mapping[str, Any]) -> str:
+    """Return the words for a source."""
+    kind: str = line["kind"]
+    return WORDS[kind].format(name=line["name"]) if kind in WORDS else kind
+
+
 def _add(budget: Mapping[str, Any]) -> dict[str, Any]:
     """Return the line of the sum."""
     worst = budget["worst_parameter"]
@@ -100,9 +131,8 @@ def _list_row(line: Mapping[str, Any], worst: str, units: Sequence[Any]) -> list
         values.append(line["parameters"][worst])
         left.append(None if halved is None else halved["worst_parameter_sd"])
     degrees = line["degrees"]
-    kind: str = line["kind"]
     return [
-        WORDS[kind].format(name=line["name"]) if kind in WORDS else kind,
+        _name_source(line),
         line["evaluation"],
         ABSENT if degrees is None else format_number(degrees, 3),
         *(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -105,8 +106,18 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
     return blocks
 
 
-def build_parameter_table(caption: str, rows: Iterable[Mapping[str, Any]]) -> Table:
-    """Return identified parameters: rows of `Identification.to_dict()["parameters"]`."""
+def build_parameter_table(
+    caption: str, rows: Iterable[Mapping[str, Any]], is_complete: bool = False
+) -> Table:
+    """Return identified parameters: rows of `Identification.to_dict()["parameters"]`.
+
+    Parameters
+    ----------
+    is_complete : whether standard uncertainty, degrees of freedom, coverage factor, and the shift
+        in tolerances have columns, too.
+    """
+    details = _list_details() if is_complete else []
+    expanded = "U (95 %)" if is_complete else "+/- (95 %)"
     return build_table(
         caption,
         rows,
@@ -115,12 +126,35 @@ def build_parameter_table(caption: str, rows: Iterable[Mapping[str, Any]]) -> Ta
             (Column(key), lambda row, key=key: format_with_uncertainty(row[key], row["plus_minus"]))
             for key in ("nominal", "estimate")
         ),
+        *details,
         (
-            Column("+/- (95 %)"),
+            Column(expanded),
             lambda row: format_uncertainty(row["plus_minus"]) if row.get("free", True) else "fixed",
         ),
         (word_column("unit"), lambda row: row["unit"]),
     )
+
+
+def _list_details() -> list[tuple[Column, Callable[[Mapping[str, Any]], str]]]:
+    """Return the columns of a complete table of parameters."""
+
+    def factor(row: Mapping[str, Any]) -> float:
+        return row["plus_minus"] / row["sd"] if row["sd"] > 0.0 else math.nan
+
+    def shift(row: Mapping[str, Any]) -> float:
+        return (row["estimate"] - row["nominal"]) / row["tolerance"]
+
+    return [
+        (Column("shift [tolerances]"), lambda row: f"{shift(row):+.2f}"),
+        (Column("u"), lambda row: format_uncertainty(row["sd"])),
+        (Column("degrees of freedom"), lambda row: _format_degrees(row["degrees"])),
+        (Column("k"), lambda row: format_number(factor(row), 3)),
+    ]
+
+
+def _format_degrees(degrees: float) -> str:
+    """Return degrees of freedom, which are infinite where no variance was estimated."""
+    return "infinite" if math.isinf(degrees) else format_number(degrees, 3)
 
 
 def _note_intervals(fit: Identification) -> list[Block]:

@@ -68,15 +68,20 @@ def _fixed_layout(figure: Figure) -> Iterator[None]:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     is_arranged = [(axes, axes.get_in_layout()) for axes in figure.axes]
-    for axes in figure.axes:
-        x, y, width, height = (round(v, PLACES) for v in axes.get_position(original=True).bounds)
-        axes.set_position((x, y, width, height))
+    _round_positions(figure)
     try:
         yield
     finally:
         for axes, is_in_layout in is_arranged:
             axes.set_in_layout(is_in_layout)
         figure.set_layout_engine(engine)
+
+
+def _round_positions(figure: Figure) -> None:
+    """Round the positions of all axes."""
+    for axes in figure.axes:
+        x, y, width, height = (round(v, PLACES) for v in axes.get_position(original=True).bounds)
+        axes.set_position((x, y, width, height))
 
 
 def render_figure(figure: Figure, ending: str) -> bytes:
@@ -86,6 +91,24 @@ def render_figure(figure: Figure, ending: str) -> bytes:
     stream = BytesIO()
     with rc_context({"svg.hashsalt": SALT}), _fixed_layout(figure):
         figure.savefig(stream, format=ending[1:], dpi=DPI, metadata=METADATA[ending])
+    return stream.getvalue()
+
+
+def render_svg_text(figure: Figure) -> bytes:
+    """Return a figure as SVG whose texts stay text, in a font of the reader.
+
+    The layout is computed once: saving would compute it twice, and draw twice.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
+        _round_positions(figure)
+    stream = BytesIO()
+    with rc_context({"svg.hashsalt": SALT, "svg.fonttype": "none"}):
+        FigureCanvasSVG(figure).print_svg(stream, metadata=METADATA[".svg"])
     return stream.getvalue()
 
 

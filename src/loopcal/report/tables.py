@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
+from loopcal.plain_text import escape
+
 GAP = 2
 """Blanks between two columns of text."""
 
@@ -92,17 +94,30 @@ class Table:
         return stream.getvalue()
 
     def to_html(self) -> str:
-        """Return a `<table>` element; classes `words` and `numbers` mark the alignment."""
-        classes = ["words" if column.align == "left" else "numbers" for column in self.columns]
+        """Return a `<table>` element; classes `words` and `numbers` mark the alignment, and `wraps`
+        a column whose long words may be broken.
 
-        def row(tag: str, cells: Sequence[str]) -> str:
-            marked = zip(classes, cells, strict=True)
-            inner = "".join(f'<{tag} class="{c}">{html.escape(x)}</{tag}>' for c, x in marked)
-            return f"<tr>{inner}</tr>"
+        Headings have a scope. So have the cells of the first column where it contains words.
+        """
+        classes = [
+            ("words" if column.align == "left" else "numbers") + " wraps" * column.wraps
+            for column in self.columns
+        ]
 
-        caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
-        head = row("th", [column.heading for column in self.columns])
-        body = "\n".join(row("td", cells) for cells in self.rows)
+        def cell(i: int, text: str, scope: str) -> str:
+            tag = f'th scope="{scope}"' if scope else "td"
+            shown = html.escape(escape(text, "\n"))
+            return f'<{tag} class="{classes[i]}">{shown}</{tag[:2]}>'
+
+        def row(cells: Sequence[str], scopes: Sequence[str]) -> str:
+            inner = (cell(i, *pair) for i, pair in enumerate(zip(cells, scopes, strict=True)))
+            return f"<tr>{''.join(inner)}</tr>"
+
+        n = len(self.columns)
+        scopes = ["row" if i == 0 and self.columns[0].align == "left" else "" for i in range(n)]
+        caption = f"<caption>{html.escape(escape(self.caption))}</caption>" if self.caption else ""
+        head = row([column.heading for column in self.columns], ["col"] * n)
+        body = "\n".join(row(cells, scopes) for cells in self.rows)
         return f"<table>{caption}\n<thead>{head}</thead>\n<tbody>\n{body}\n</tbody>\n</table>"
 
     def _natural_widths(self, headings: Sequence[str]) -> list[int]:

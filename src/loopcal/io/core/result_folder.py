@@ -139,6 +139,18 @@ def _check_content(path: Path, kind: FolderKind) -> None:
         raise FileError(report_finding(code, content=kind.content, files=changed), path)
 
 
+def list_changed_files(path: Path, kind: FolderKind) -> tuple[str, ...]:
+    """Return the files of a folder that differ from what was written; without a list of files the
+    document itself, because nothing is known of it.
+    """
+    document = _read_document(path / kind.document)
+    listed = {} if document is None else _list_digests(document)
+    if kind.document not in listed:
+        return (kind.document,)
+    present = (name for name in listed if (path / name).is_file())
+    return tuple(name for name in present if _is_changed(path, name, kind, listed))
+
+
 def write_result_folder(
     path: Path,
     kind: FolderKind,

@@ -12,6 +12,7 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import build_robot, load_robot, write_robot
+from loopcal.io.runs.run import Run
 from loopcal.io.runs.run_folder import load_run_or_robot
 from loopcal.mechanism import Mechanism
 
@@ -67,7 +68,11 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
 
 def load_source(path: str | Path) -> ExportSource:
     """Return the robot of a run folder, a robot file, or a shipped robot by its name, to export."""
-    run = load_run_or_robot(path)
+    return build_source(load_run_or_robot(path))
+
+
+def build_source(run: Run) -> ExportSource:
+    """Return the robot of a run to export, with its intervals."""
     rows = run.result.get("fit", {}).get("parameters", [])
     nulls = run.result.get("nulls", {})
     reasons = {

@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import FileError
-from loopcal.findings import Finding
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.result_folder import (
     FolderKind,
     describe_leftover,
+    list_changed_files,
     refuse_folder,
     write_result_folder,
 )
@@ -243,6 +244,13 @@ def load_run(path: str | Path) -> Run:
         for key in ("local_estimate", "local_start")
     )
     return Run(path, result, robot, initial, values, initial_values, arrays)
+
+
+def refuse_changed_run(run: Run) -> None:
+    """Raise FileError where a file of a run folder is not the one that the calibration wrote."""
+    changed = list_changed_files(run.path, RUN)
+    if changed:
+        raise FileError(report_finding("files.run-changed", files=changed), run.path)
 
 
 def load_run_or_robot(path: str | Path) -> Run:

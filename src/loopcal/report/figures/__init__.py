@@ -17,4 +17,5 @@ from loopcal.report.figures.regularization_figure import draw_regularization as 
 from loopcal.report.figures.residual_figure import draw_residual_rows as draw_residual_rows
 from loopcal.report.figures.residual_figure import draw_residuals as draw_residuals
 from loopcal.report.figures.robot_figure import draw_robot as draw_robot
+from loopcal.report.figures.scene_figure import draw_scene as draw_scene
 from loopcal.report.figures.validation_figure import draw_validation as draw_validation

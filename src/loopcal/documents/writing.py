@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the report of a calibration: `NAME.html` to read, and `NAME.json` with the same content."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+from loopcal.documents.sources import load_record
+from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.io import Run
+from loopcal.io.core.json_text import read_json, to_json
+from loopcal.io.core.limits import TABLE_SIZE
+from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import as_path, read_text, write_text
+from loopcal.report.document.calibration_document import build_document
+from loopcal.report.document.page import render_html
+from loopcal.workflow import CalibrationReport
+
+HTML = (".html", ".htm")
+"""Endings of a report's name."""
+
+
+def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
+    """Write the report of a calibration as one HTML file for people, and as JSON beside it.
+
+    The HTML file loads nothing and runs no program; it can be printed, sent and archived. An older
+    report of this name is replaced. Commands: see `loopcal report`.
+
+    Parameters
+    ----------
+    path : of the HTML file, whose name ends in .html; the JSON file has the same name otherwise.
+    report : of `loopcal.calibrate`, or a run from `loopcal.load_run`.
+
+    Returns
+    -------
+    path of the HTML file.
+
+    Raises
+    ------
+    FileError : the name has another ending, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> robot = lc.load_robot("hexapod-42")
+    >>> data = lc.load_measurements("examples/hexapod-42/measurements.csv", robot)
+    >>> report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
+    >>> lc.write_report("report.html", report)  # doctest: +SKIP
+    """
+    path = as_path(path, "report")
+    if not isinstance(report, CalibrationReport | Run):
+        raise ArgumentTypeError(
+            f"report is {type(report).__name__}; pass the result of loopcal.calibrate, or of "
+            "loopcal.load_run"
+        )
+    _, data = name_files(path)
+    refuse_outputs((path, data), (), force=True)
+    document = build_document(load_record(report))
+    html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
+    with restore_on_failure((path, data)):
+        write_text(path, html, lambda file: _check_html(file, html))
+        write_text(data, json_text, lambda file: read_json(file, "report", "", TABLE_SIZE))
+    return path
+
+
+def name_files(path: Path) -> tuple[Path, Path]:
+    """Return the HTML and the JSON file of a report.
+
+    Raises
+    ------
+    FileError : the name does not end in .html.
+    """
+    if path.suffix.lower() not in HTML:
+        ending = repr(path.suffix) if path.suffix else "no ending"
+        sentence = f"the name of a report ends in .html, but this one has {ending}"
+        raise FileError(f"{sentence}; choose another name, such as report.html", path)
+    return path, path.with_suffix(".json")
+
+
+def _check_html(file: Path, html: str) -> None:
+    """Read a written page; raise LoopcalError where it is not the one that was made."""
+    text = read_text(file, "report", limit=TABLE_SIZE)
+    require_same("page", html, text)
+    parser = HTMLParser()
+    parser.feed(text)
+    parser.close()

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a calibration: its sections in the order in which readers ask."""
+
+from __future__ import annotations
+
+from loopcal.report.document.elements import Document
+from loopcal.report.document.record import CalibrationRecord
+from loopcal.report.document.sections.data import (
+    build_finding_section,
+    build_open_section,
+    build_outlier_section,
+    build_residual_section,
+)
+from loopcal.report.document.sections.errors import build_error_section, build_workspace_section
+from loopcal.report.document.sections.parameters import (
+    build_budget_section,
+    build_parameter_section,
+)
+from loopcal.report.document.sections.provenance import (
+    build_controller_section,
+    build_pose_section,
+    build_provenance_section,
+)
+from loopcal.report.document.sections.verdict import build_verdict_section
+
+SECTIONS = (
+    build_verdict_section,
+    build_open_section,
+    build_outlier_section,
+    build_error_section,
+    build_residual_section,
+    build_workspace_section,
+    build_parameter_section,
+    build_budget_section,
+    build_controller_section,
+    build_finding_section,
+    build_provenance_section,
+    build_pose_section,
+)
+"""Functions that build the sections, in order."""
+
+
+def build_document(record: CalibrationRecord) -> Document:
+    """Return the report of a calibration; a section without content is left out."""
+    sections = (build(record) for build in SECTIONS)
+    verdict, versions = record.verdict, (record.result.get("made_by") or {}).get("versions", {})
+    summary = f"{verdict.value[0].upper()}{verdict.value[1:]}: {record.robot.name}."
+    return Document(
+        title=f"Calibration report: {record.robot.name}",
+        verdict=verdict.name.lower(),
+        summary=str(record.result.get("headline") or summary),
+        made_by=f"loopcal {versions.get('loopcal', '')}".strip(),
+        sections=tuple(section for section in sections if section.elements),
+    )

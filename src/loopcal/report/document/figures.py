@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of the report, drawn from a record; each function yields a picture or a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from loopcal.apply import accuracy_map
+from loopcal.errors import LoopcalError
+from loopcal.estimate.residuals import KindResiduals
+from loopcal.report.document.elements import Element
+from loopcal.report.document.inline_svg import make_picture
+from loopcal.report.document.record import CalibrationRecord
+from loopcal.report.document.stored_fit import restore_fit
+from loopcal.report.figures import (
+    draw_accuracy_map,
+    draw_correlation,
+    draw_parameters,
+    draw_residual_rows,
+    draw_scene,
+    draw_validation,
+)
+
+MOST_ROWS = 3000
+"""Rows that the figures of a report show."""
+
+MOST_PARAMETERS = 120
+"""Parameters up to which the report draws them."""
+
+MAP_POSES, SEED = 400, 0
+"""Poses of the accuracy map, and the seed of their draw."""
+
+
+def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the residuals, of many rows some, evenly spread over the order of measurement."""
+    count = sum(len(rows.raw) for rows in record.residuals)
+    residuals = [thin_rows(rows, count) for rows in record.residuals]
+    if count > MOST_ROWS:
+        yield f"The figure shows {sum(len(r.raw) for r in residuals):,} of {count:,} rows."
+    setup = [row["name"] for row in record.result["fit"].get("local") or ()]
+    yield make_picture(
+        draw_residual_rows(record.robot, residuals, setup),
+        "residual-figure",
+        "Residuals of the fitted rows.",
+        "The panels show the residuals in the order of the poses, by component, as a histogram and "
+        "normal plot, and against actuator readings and recorded quantities. Whitened residuals "
+        "are divided by their sigma; 95 % of them lie between the dashed lines if the stated noise "
+        "is right.",
+    )
+
+
+def thin_rows(rows: KindResiduals, count: int) -> KindResiduals:
+    """Return residuals with at most their share of MOST_ROWS rows, evenly spread.
+
+    Parameters
+    ----------
+    count : number of the rows of all kinds.
+    """
+    if count <= MOST_ROWS:
+        return rows
+    share = max(1, MOST_ROWS * len(rows.raw) // count)
+    kept = np.unique(np.linspace(0, len(rows.raw) - 1, share).astype(np.intp))
+    return replace(
+        rows,
+        poses=tuple(rows.poses[i] for i in kept),
+        raw=rows.raw[kept],
+        whitened=rows.whitened[kept],
+        context={name: values[kept] for name, values in rows.context.items()},
+        readings=rows.readings[kept],
+    )
+
+
+def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the errors at held-out poses before and after; of many rows none."""
+    errors = record.validation
+    if errors is None or not errors.quantities:
+        return
+    if len(errors.poses) > MOST_ROWS:
+        yield f"The errors of {len(errors.poses):,} rows are too many for a figure."
+        return
+    yield make_picture(
+        draw_validation(errors),
+        "validation-figure",
+        "Errors at held-out poses before and after calibration.",
+        "For each held-out pose the figure shows the size of the error before and after "
+        "calibration, with the noise floor.",
+    )
+
+
+def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the robot at home with the measured poses and the errors that calibration removes."""
+    readings = record.readings
+    if readings is None or not len(readings):
+        yield "The run does not contain the readings of its poses, so they are not drawn."
+        return
+    kept = np.unique(np.linspace(0, len(readings) - 1, MOST_ROWS).astype(np.intp))
+    if len(kept) < len(readings):
+        yield f"The figure shows {len(kept):,} of {len(readings):,} fitted poses."
+    figure, magnification = draw_scene(record.robot, record.initial, readings[kept])
+    yield make_picture(
+        figure,
+        "scene-figure",
+        "The robot at home, and the tool point at the fitted poses.",
+        "A point is the tool at a fitted pose. The line from it is the position error of the "
+        f"geometry before calibration there, {magnification:g} times magnified: its predicted "
+        "position minus that of the calibrated geometry at the same readings, in the base frame of "
+        "the robot file.",
+    )
+
+
+def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the uncertainty of poses over the workspace, and the sentence that sums it up."""
+    budget, readings = record.result.get("expected_error"), record.readings
+    if record.posterior is None or readings is None or not budget:
+        yield "This run has no intervals, so the accuracy over the workspace is not known."
+        return
+    try:
+        accuracy = accuracy_map(
+            record.posterior, readings, MAP_POSES, SEED, frame=budget.get("frame", "fitted")
+        )
+    except LoopcalError as error:
+        yield f"The accuracy over the workspace cannot be computed: {error}"
+        return
+    less = int(accuracy.extrapolated.sum())
+    yield (
+        f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
+        f"of the workspace, {accuracy.uncertainty.frame}. {less} of these poses are less certain "
+        "than every measured pose."
+    )
+    yield make_picture(
+        draw_accuracy_map(accuracy),
+        "accuracy-figure",
+        "Standard uncertainty of poses over the workspace.",
+        "Slices of the workspace show the standard uncertainty of position and orientation by "
+        "color.",
+    )
+
+
+def draw_parameter_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield shifts and uncertainties of the parameters in tolerances."""
+    if (count := len(record.result["fit"]["parameters"])) > MOST_PARAMETERS:
+        yield f"{count} parameters are too many for a figure."
+        return
+    fit = restore_fit(record.result["fit"], record.arrays, record.robot)
+    yield make_picture(
+        draw_parameters(fit),
+        "parameter-figure",
+        "Shift and uncertainty of the parameters in tolerances.",
+        "For each parameter the figure shows the estimate minus the nominal value with its 95 % "
+        "interval, and the half-width of that interval.",
+    )
+
+
+def draw_correlation_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the correlations of the parameters."""
+    if not 1 < len(record.result["fit"]["parameters"]) <= MOST_PARAMETERS:
+        return
+    fit = restore_fit(record.result["fit"], record.arrays, record.robot)
+    yield make_picture(
+        draw_correlation(fit),
+        "correlation-figure",
+        "Correlations of the parameters.",
+        "The matrix shows the correlation of each pair of parameters by color. The findings of the "
+        "residuals name the pairs that are strongly correlated.",
+    )

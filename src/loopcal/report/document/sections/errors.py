@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors at held-out poses, and the accuracy over the workspace."""
+
+from __future__ import annotations
+
+from loopcal.report.document.elements import Element, Section
+from loopcal.report.document.figures import (
+    draw_accuracy_picture,
+    draw_scene_picture,
+    draw_validation_picture,
+)
+from loopcal.report.document.record import CalibrationRecord
+from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
+
+BASELINE = (
+    "Before: the geometry before calibration, with frames, targets, surfaces and offsets fitted to "
+    "the same rows. After: the calibrated geometry. Noise floor: the error that the stated "
+    "measurement noise alone causes."
+)
+NOT_HELD_OUT = (
+    "No pose was held out of this fit, so the report states no error at poses that were not fitted."
+)
+NOT_STORED = (
+    "This run folder was written by an earlier version, whose errors at held-out poses cannot be "
+    "shown here. Repeat the calibration to see them."
+)
+
+
+def build_error_section(record: CalibrationRecord) -> Section:
+    """Return the errors at held-out poses before and after, with the noise floor."""
+    errors = record.validation
+    if errors is None:
+        stored = record.result.get("validation")
+        reason = NOT_HELD_OUT if not record.held_out_labels else NOT_STORED
+        if record.held_out_labels and stored is None:
+            reason = "The errors at the held-out poses could not be computed; see the findings."
+        return Section("errors", "Errors at held-out poses", (reason,))
+    elements: list[Element] = [BASELINE, *view_errors(errors, "held-out")]
+    elements += [" ".join(describe_improvements(errors)), *draw_validation_picture(record)]
+    elements += [table for table in view_error_statistics(errors) if not isinstance(table, str)]
+    return Section("errors", "Errors at held-out poses", tuple(e for e in elements if e))
+
+
+def build_workspace_section(record: CalibrationRecord) -> Section:
+    """Return the robot with its measured poses, and the uncertainty over its workspace."""
+    elements = (*draw_scene_picture(record), *draw_accuracy_picture(record))
+    return Section("workspace", "Measured poses and accuracy over the workspace", elements)

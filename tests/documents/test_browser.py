@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report in Chromium: no requests, no errors, accessible, at most 12 pages, complete as it is.
+
+These tests need Chromium, which `.ci/run` installs, and the packages of the extra `test`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from loopcal.cli import main
+from loopcal.documents.printing import find_browser, is_root
+
+BROWSER = find_browser()
+playwright = pytest.importorskip("playwright.sync_api")
+axe = pytest.importorskip("axe_playwright_python")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed"),
+]
+
+MOST_PAGES = 12
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as program:
+        options = ["--no-sandbox"] * is_root()
+        started = program.chromium.launch(executable_path=BROWSER, args=options)
+        yield started
+        started.close()
+
+
+def count_pages(pdf: bytes) -> int:
+    return len(re.findall(rb"/Type\s*/Page\b", pdf))
+
+
+def test_page_opens_without_requests_errors_and_javascript(browser, page) -> None:
+    context = browser.new_context(java_script_enabled=False, offline=True)
+    tab, logged, asked = context.new_page(), [], []
+    tab.on("console", lambda message: logged.append(message.text))
+    tab.on("pageerror", lambda error: logged.append(str(error)))
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.goto(page.as_uri())
+    assert asked == [page.as_uri()]
+    assert logged == []
+    assert tab.locator("h2").count() == 11
+    assert tab.locator("figure > svg").count() == 6
+    for i in range(6):
+        box = tab.locator("figure > svg").nth(i).bounding_box()
+        assert box["width"] > 300.0
+        assert box["height"] > 150.0
+    assert tab.locator("main p").first.is_visible()
+    assert count_pages(tab.pdf(prefer_css_page_size=True)) <= MOST_PAGES
+    context.close()
+
+
+def test_colors_of_figures_and_page_survive_the_policy(browser, page) -> None:
+    context = browser.new_context(offline=True, color_scheme="dark")
+    tab = context.new_page()
+    tab.goto(page.as_uri())
+    paper = tab.eval_on_selector("body", "e => getComputedStyle(e).backgroundColor")
+    assert paper == "rgb(21, 24, 28)"
+    colors = tab.eval_on_selector_all(
+        "figure > svg [stroke]", "all => all.map(e => getComputedStyle(e).stroke)"
+    )
+    assert len(set(colors)) > 5
+    context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_page_passes_axe(browser, page, scheme) -> None:
+    context = browser.new_context(offline=True, color_scheme=scheme, bypass_csp=True)
+    tab = context.new_page()
+    tab.goto(page.as_uri())
+    tab.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text("utf-8"))
+    answer = tab.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    assert [(v["id"], v["nodes"][0]["html"]) for v in answer["violations"]] == []
+    context.close()
+
+
+def test_page_can_be_used_with_the_keyboard_alone(browser, page) -> None:
+    context = browser.new_context(offline=True)
+    tab = context.new_page()
+    tab.goto(page.as_uri())
+    tab.keyboard.press("Tab")
+    assert tab.evaluate("document.activeElement.textContent") == "Go to the content"
+    tab.keyboard.press("Enter")
+    assert tab.evaluate("location.hash") == "#content"
+    tab.evaluate("document.querySelector('nav a').focus()")
+    assert tab.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    tab.keyboard.press("Tab")
+    tab.keyboard.press("Enter")
+    assert tab.evaluate("location.hash") == "#determined"
+    wide = "[...document.querySelectorAll('main *')].filter(e => e.scrollWidth > e.clientWidth + 1"
+    wide += " && getComputedStyle(e).overflowX === 'auto' && e.tabIndex < 0).length"
+    assert tab.evaluate(wide) == 0
+    context.close()
+
+
+def test_option_pdf_prints_at_most_12_pages(run, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(run.path), "--pdf"]) == 0
+    assert capsys.readouterr().out == "Written to report.html, report.json, report.pdf\n"
+    content = Path("report.pdf").read_bytes()
+    assert 1 < count_pages(content) <= MOST_PAGES
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["report.html", "report.json", "report.pdf"]

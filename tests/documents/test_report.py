@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a calibration: complete, the same from memory and from a run, and safe to open."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.documents.sources import load_record
+from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.report.document.calibration_document import SECTIONS, build_document
+from loopcal.report.document.elements import Document
+from loopcal.report.document.figures import thin_rows
+from loopcal.report.document.page import render_html
+from loopcal.report.validation_view import view_errors
+
+ORDER = (
+    *("verdict", "determined", "outliers", "errors", "residuals", "workspace", "parameters"),
+    *("budget", "controller", "provenance", "poses"),
+)
+HOSTILE = "<script>alert(1)</script>=1+1\x1b[31m\u202e$\\frac{"
+
+
+def build(record, *names: str) -> Document:
+    """Return the document of a record with some sections only."""
+    builders = [b for b in SECTIONS if any(name in b.__name__ for name in names)]
+    sections = tuple(builder(record) for builder in builders)
+    return Document("Report", record.verdict.name.lower(), "Summary", "loopcal", sections)
+
+
+def test_sections_are_in_the_order_in_which_readers_ask(page) -> None:
+    document = json.loads(page.with_suffix(".json").read_text("utf-8"))
+    assert tuple(section["name"] for section in document["sections"]) == ORDER
+    text = page.read_text("utf-8")
+    assert tuple(re.findall(r'<h2 id="([a-z]+)">', text)) == ORDER
+    assert text.startswith('<!doctype html>\n<html lang="en">')
+    assert len(re.findall("<h1>", text)) == 1
+    for words in (
+        "Calibrated: hexapod-42, 42 parameters from 30 poses.",
+        "Expected error over the workspace: position",
+        "Share of each source in the variance of the expected error",
+        "The data determine all 42 parameters.",
+        "Errors at 10 held-out poses",
+        "degrees of freedom",
+        "setp genhexkins.base.0.x",
+        "30 fitted poses: 1, 2, 4,",
+        "10 held-out poses: 3, 6, 9,",
+        hashlib.sha256(
+            (Path(__file__).parents[2] / "examples/hexapod-42/measurements.csv").read_bytes()
+        ).hexdigest(),
+    ):
+        assert words in text, words
+
+
+def test_page_runs_no_program_and_loads_nothing(page) -> None:
+    text = page.read_text("utf-8")
+    style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)
+    assert style is not None
+    digest = base64.b64encode(hashlib.sha256(style[1].encode()).digest()).decode()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert policy is not None
+    allowed = policy[1].replace("&#39;", "'")
+    assert allowed.startswith(f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:;")
+    assert "<script" not in text
+    assert re.search(r"\sstyle=|\son[a-z]+=", text) is None  # blocked by the policy
+    addresses = re.findall(r'(?:href|src)="([^"]*)"', text)
+    assert all(a.startswith(("#", "data:image/png;base64,")) for a in addresses)
+    assert "@import" not in style[1]
+    assert "url(" not in style[1]
+    assert page.stat().st_size < 1.5e6
+
+
+def test_identifiers_are_unique_and_references_lead_somewhere(page) -> None:
+    text = page.read_text("utf-8")
+    names = re.findall(r'\bid="([^"]*)"', text)
+    assert len(names) == len(set(names))
+    targets = re.findall(r'href="#([^"]*)"', text) + re.findall(r"url\(#([^)]*)\)", text)
+    targets += re.findall(r'aria-labelledby="([^"]*)"', text)
+    assert set(targets) <= set(names)
+
+
+def test_pictures_have_descriptions_and_tables_have_scopes(page) -> None:
+    text = page.read_text("utf-8")
+    pictures = re.findall(r"<figure>\s*(<svg.*?</svg>)", text, re.DOTALL)
+    names = ("validation", "residual", "scene", "accuracy", "parameter", "correlation")
+    for name, picture in zip(names, pictures, strict=True):
+        assert f'role="img" aria-labelledby="{name}-figure-description"' in picture
+        assert "<text" in picture  # text, not outlines
+        described = re.search(f'id="{name}-figure-description">([^<]+)</span>', text)
+        assert described is not None
+        assert described[1].endswith(".")
+    assert len(re.findall("<th ", text)) == len(re.findall('<th scope="(?:col|row)"', text))
+    assert "<th>" not in text
+
+
+def test_report_in_memory_and_run_folder_give_the_same_page(calibration, run) -> None:
+    first, second = (load_record(source) for source in (calibration, run))
+    names = ("verdict", "open", "outlier", "budget", "finding")
+    assert build(first, *names).to_dict() == build(second, *names).to_dict()
+    assert first.validation is not None
+    assert second.validation is not None
+    assert view_errors(first.validation, "held-out") == view_errors(second.validation, "held-out")
+    assert [c.text for c in first.controllers] == [c.text for c in second.controllers]
+    assert first.fitted_labels == second.fitted_labels
+
+
+def test_hostile_names_are_text(run) -> None:
+    record = load_record(run)
+    (rows,) = record.residuals
+    labels = (HOSTILE, *rows.poses[1:])
+    arrays = {**record.arrays, "poses": np.array([HOSTILE, "=1+1"], str)}
+    record = replace(record, residuals=(replace(rows, poses=labels),), arrays=arrays)
+    text = render_html(build(record, "residual", "pose"))
+    assert "<script" not in text
+    assert "\x1b" not in text
+    assert "\u202e" not in text
+    assert text.count("&lt;script&gt;alert(1)&lt;/script&gt;=1+1\\x1b[31m\\u202e$") >= 1
+    assert "=1+1." in text
+
+
+def test_what_a_run_lacks_is_stated_in_one_sentence(run) -> None:
+    record = load_record(run)
+    result = {k: v for k, v in record.result.items() if k not in ("split", "validation")}
+    lacking = replace(
+        record,
+        result={**result, "expected_error": None, "made_by": None, "next_step": None},
+        arrays={k: v for k, v in record.arrays.items() if k not in ("poses", "frames_readings")},
+        posterior=None,
+        validation=None,
+        residuals=(),
+    )
+    text = re.sub(r"\s+", " ", render_html(build_document(lacking)))
+    for sentence in (
+        "No pose was held out of this fit",
+        "does not contain the labels of its residuals",
+        "does not contain the readings of its poses",
+        "the accuracy over the workspace is not known",
+        "there is no uncertainty budget",
+        "does not name its fitted poses",
+        "No pose was held out.",
+    ):
+        assert sentence in text, sentence
+
+
+def test_failed_fit_has_no_values_for_a_machine(run) -> None:
+    record = load_record(run)
+    fit = {**record.result["fit"], "status": "out_of_iterations", "rank": None, "degrees": None}
+    failed = replace(
+        record,
+        result={**record.result, "verdict": "not_calibrated", "fit": fit, "headline": "Failed."},
+        validation=None,
+        posterior=None,
+    )
+    text = render_html(build_document(failed))
+    assert "setp genhexkins" not in text
+    assert "the report states no values for a controller" in text
+    assert "A quality gate is not met. Do not write these values to a machine." in text
+    assert "Where the iteration ended (no estimates)" in text
+
+
+def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
+    record = load_record(run)
+    (rows,) = record.residuals
+    times = 4000
+    many = replace(
+        rows,
+        poses=tuple(f"p{i}" for i in range(len(rows.raw) * times)),
+        raw=np.tile(rows.raw, (times, 1)),
+        whitened=np.tile(rows.whitened, (times, 1)),
+        readings=np.tile(rows.readings, (times, 1)),
+    )
+    arrays = {**record.arrays, "poses": np.array(many.poses)}
+    arrays["frames_readings"] = np.tile(record.arrays["frames_readings"], (times, 1))
+    text = render_html(build(replace(record, residuals=(many,), arrays=arrays), "residual", "pose"))
+    assert "The figure shows 3,000 of 120,000 rows." in text
+    assert "120,000 fitted poses, of which the first 3,000 are listed" in text
+    assert len(text) < 5e6
+    assert thin_rows(rows, len(rows.raw)) is rows
+
+
+def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:
+    with pytest.raises(FileError, match=r"the name of a report ends in \.html, but this one has"):
+        lc.write_report(tmp_path / "report.pdf", calibration)
+    with pytest.raises(ArgumentTypeError, match="pass the result of"):
+        lc.write_report(tmp_path / "report.html", lc.load_robot("five-bar"))  # pyright: ignore
+    with pytest.raises(FileError, match="does not exist"):
+        lc.write_report(tmp_path / "nowhere" / "report.html", calibration)
+    assert list(tmp_path.iterdir()) == []
