@@ -13,13 +13,19 @@ from loopcal import geometry
 from loopcal.apply import pose_uncertainty
 from loopcal.diagnose import adjust_uncertainty
 from loopcal.diagnose.fit_checks.held_out_rows import Predictor
-from loopcal.diagnose.residuals.model_discrepancy import add_slow_errors, find_slow_errors
+from loopcal.diagnose.residuals.model_discrepancy import (
+    SlowErrorRows,
+    add_slow_errors,
+    detect_slow_errors,
+    find_slow_errors,
+)
 from loopcal.diagnose.residuals.residual_patterns import LEVEL
 from loopcal.diagnose.tool_errors import locate_measured_poses
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
 from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
 from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
+from loopcal.estimate.poses.smooth_errors import describe_smooth_errors
 from loopcal.measure import (
     Component,
     Gaussian,
@@ -32,6 +38,7 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.mechanism import Mechanism, differentiate_pose, forward, sample_workspace
+from loopcal.numerics.variance_component import compute_component_tail
 from tests.estimate.problems import UM, URAD
 
 SIGMA = 10 * UM
@@ -130,6 +137,38 @@ def test_a_wrong_sigma_is_no_discrepancy():
         for data in (measure(delta(), 30, seed, 2.0) for seed in range(16))
     ]
     assert np.mean(found) <= LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 16)
+
+
+def test_probabilities_agree_with_all_eigenvectors_of_the_variances():
+    rng = np.random.default_rng(3)
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, :3, 3] = rng.standard_normal((6, 3))
+    errors = describe_smooth_errors(T, np.zeros(3))
+    half = errors.count // 2
+    rows = np.triu(rng.standard_normal((2 * half, 2 * half)))
+    y = 5.0 * rng.standard_normal(2 * half)
+    found = detect_slow_errors(SlowErrorRows(errors, rows, rows, y), known=0.0, level=1.0)
+    variance = np.eye(2 * half)
+    for part, (component, p_value) in found.items():
+        own = rows[:, part * half : (part + 1) * half]
+        root = np.linalg.inv(np.linalg.cholesky(variance))
+        weights, axes = np.linalg.eigh(root @ own @ own.T @ root.T)
+        kept = weights > 1e-12 * weights[-1]
+        by_all = compute_component_tail(weights[kept], axes[:, kept].T @ root @ y)
+        assert p_value == pytest.approx(by_all, rel=1e-9)
+        variance += component.ratio * own @ own.T
+    assert set(found) == {0, 1}
+
+
+def test_linearized_poses_are_those_of_the_forward_kinematics():
+    data = measure(delta())
+    fit = identify(delta(), data)
+    linearized = linearize_fit(fit, data).solution.linearized
+    assert linearized is not None
+    assert linearized.is_reached.all()
+    located = locate_measured_poses(fit, data).T
+    # [m] and entries of rotations, double rounding
+    np.testing.assert_allclose(linearized.T[0], located, rtol=0.0, atol=1e-13)
 
 
 def add_model_discrepancy(fit: Identification, data: Measurements) -> Identification:

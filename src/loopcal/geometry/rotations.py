@@ -18,7 +18,8 @@ _TINY = 1e-200
 
 def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray:
     """Stack a rows of b entries, which broadcast against each other, into matrices (..., a, b)."""
-    shape = np.broadcast_shapes(*{np.shape(entry) for row in rows for entry in row})
+    shapes = {entry.shape for row in rows for entry in row if isinstance(entry, np.ndarray)}
+    shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
     stacked = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):

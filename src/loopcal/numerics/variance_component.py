@@ -100,7 +100,9 @@ def _tail(values: FloatArray) -> float:
     t = 0.0
     for _ in range(NEWTON):  # K' grows: bisection cannot fail
         low, high = (t, high) if slope(t) < 0.0 else (low, t)
-        t = 0.5 * (low + high)
+        before, t = t, 0.5 * (low + high)
+        if t == before:
+            break
     K = -0.5 * float(np.log1p(-2.0 * t * values).sum())
     curvature = 2.0 * float(((values / (1.0 - 2.0 * t * values)) ** 2).sum())
     w, v = np.sign(t) * np.sqrt(max(-2.0 * K, 0.0)), t * np.sqrt(curvature)

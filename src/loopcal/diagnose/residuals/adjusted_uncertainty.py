@@ -31,7 +31,7 @@ from loopcal.diagnose.tool_errors import (
     locate_measured_poses,
 )
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.inference.added_covariance import add_covariance
 from loopcal.estimate.inference.covariance_parts import NOISE
 from loopcal.estimate.inference.residual_test import choose_severity
@@ -71,20 +71,26 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     linear = linearize_fit(fit, data)
     rows = collect_residual_rows(fit, data, linear)
-    measured = locate_measured_poses(fit, data)
-    slow = find_slow_errors(fit, data, linear, measured.T)
+    slow = find_slow_errors(fit, data, linear, _place_measured_poses(fit, data, linear))
     if rows is not None:
-        fit = _add_patterns(fit, data, rows, measured, is_slow=slow is not None)
+        fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
     return fit if slow is None else add_slow_errors(fit, slow)
 
 
+def _place_measured_poses(
+    fit: Identification, data: Measurements, linear: FitLinearization
+) -> FloatArray:
+    """Return the measured poses (n, 4, 4) [m] that the calibrated robot reaches: those of the
+    linearization, where readings are exact and it has kept them.
+    """
+    poses = linear.solution.linearized
+    if poses is None or fit.poses is not None:
+        return locate_measured_poses(fit, data).T
+    return poses.T[0, poses.is_reached[0]]
+
+
 def _add_patterns(
-    fit: Identification,
-    data: Measurements,
-    rows: ResidualRows,
-    measured: Solution,
-    *,
-    is_slow: bool,
+    fit: Identification, data: Measurements, rows: ResidualRows, *, is_slow: bool
 ) -> Identification:
     """Return a fit whose covariance allows for the patterns of its residuals. A dependence on a
     reading is a slow error of the poses, and counts once where such errors were found.
@@ -94,7 +100,7 @@ def _add_patterns(
     is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
     if not (effects or patterns.is_correlated or is_small):
         return fit
-    tool = state_tool_uncertainty(fit, measured)
+    tool = state_tool_uncertainty(fit, locate_measured_poses(fit, data))
     for effect in effects:
         root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
         finding = _report_effect(effect, tool.measure_growth(root))

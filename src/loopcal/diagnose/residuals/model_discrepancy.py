@@ -185,14 +185,10 @@ def detect_slow_errors(
     """
     parts = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
     level = compute_single_level(level, len(parts))
-    whitening, found = np.eye(len(rows.residuals)), {}
+    residuals, whitened, found = rows.residuals, rows.rows, {}
     while parts:
-        y = whitening @ rows.residuals
-        turned = {
-            part: _find_axes(whitening @ rows.rows[:, _columns(rows.errors, part)])
-            for part in parts
-        }
-        tests = {part: (w, u.T @ y) for part, (u, w) in turned.items()}
+        turned = {part: _find_axes(whitened[:, _columns(rows.errors, part)]) for part in parts}
+        tests = {part: (w, u.T @ residuals) for part, (u, w) in turned.items()}
         p_values = {part: compute_component_tail(*test) for part, test in tests.items()}
         part = min(parts, key=lambda each: p_values[each])
         if p_values[part] >= level:
@@ -202,7 +198,8 @@ def detect_slow_errors(
         found[part] = (component, p_values[part])
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
         shrink = 1.0 / np.sqrt(1.0 + component.ratio * w) - 1.0
-        whitening = (np.eye(len(y)) + (u * shrink) @ u.T) @ whitening
+        residuals = residuals + (u * shrink) @ (u.T @ residuals)
+        whitened = whitened + (u * shrink) @ (u.T @ whitened)
         parts.remove(part)
     return found
 
@@ -249,9 +246,16 @@ def _find_axes(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the axes u (k, r) of the variances that rows (k, m) times independent errors have, and
     these variances (r,). Weak ones need no accuracy: they weigh little.
     """
-    variances, axes = np.linalg.eigh(rows @ rows.T)
+    filled = rows.any(axis=1)  # a triangle has zeros below
+    part, basis = rows[filled], None
+    if part.shape[0] > part.shape[1]:
+        basis, part = np.linalg.qr(part)
+    variances, inner = np.linalg.eigh(part @ part.T)
     kept = variances > NEGLIGIBLE * variances[-1]
-    return axes[:, kept], variances[kept]
+    inner = inner[:, kept]
+    axes = np.zeros((len(rows), inner.shape[1]))
+    axes[filled] = inner if basis is None else basis @ inner
+    return axes, variances[kept]
 
 
 def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from loopcal.diagnose.residuals.residual_rows import ResidualRows, order_rows
 from loopcal.measure import Measurements, Observations
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.mechanism import Mechanism
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
@@ -64,23 +65,25 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
     rows : of a fit. data : its measurements, without excluded poses. robot : names the actuators.
     """
     observations = [o for o in data.observations if len(o)]
-    effects = [_build_trend(rows, observations)]
+    total, shifts = len(rows.residual), _shift_components(rows, observations)
+    trend, has_time = _list_trends(observations)
+    effects = [_build(total, shifts, trend, TIME if has_time else ORDER)]
     names = dict.fromkeys(name for o in observations for name in o.context if name != TIME)
     for name in names:
         functions = [
             [scale_to_range(o.context[name])] if name in o.context else [] for o in observations
         ]
-        effects.append(_build(rows, observations, functions, TEMPERATURE, name))
+        effects.append(_build(total, shifts, functions, TEMPERATURE, name))
     functions = [
         [(o.session == name).astype(float) for name in np.unique(o.session)] for o in observations
     ]
-    effects.append(_build(rows, observations, functions, SESSION))
+    effects.append(_build(total, shifts, functions, SESSION))
     for i, actuator in enumerate(robot.actuators):
         functions = []
         for o in observations:
             x = scale_to_range(data.readings[o.rows.reshape(len(o), -1)[:, 0], i])
             functions.append([x, 4.0 * x**2])
-        effects.append(_build(rows, observations, functions, READING, actuator.name))
+        effects.append(_build(total, shifts, functions, READING, actuator.name))
     return tuple(effects)
 
 
@@ -95,34 +98,60 @@ def scale_to_range(values: FloatArray) -> FloatArray:
     return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
 
 
-def _build_trend(rows: ResidualRows, observations: Sequence[Observations]) -> Effect:
-    """Return the linear trend in time, or in the order of the rows."""
+def _list_trends(observations: Sequence[Observations]) -> tuple[list[list[FloatArray]], bool]:
+    """Return the time of the rows of each kind, or their order, and whether it is the time."""
     has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
     functions = []
     for o in observations:
         values = o.context[TIME] if has_time else order_rows(o).astype(float)
         functions.append([scale_to_range(values)])
-    return _build(rows, observations, functions, TIME if has_time else ORDER)
+    return functions, has_time
+
+
+class _ShiftedRows(NamedTuple):
+    """How an offset of each measured component shifts the whitened rows of a kind.
+
+    places : (k,) of these rows among all. row : (k,) number of the row of the kind. shifts : for
+    each component, the change (k,) by a unit of it.
+    """
+
+    places: IntArray
+    row: IntArray
+    shifts: tuple[tuple[EffectColumn, FloatArray], ...]
+
+
+def _shift_components(
+    rows: ResidualRows, observations: Sequence[Observations]
+) -> tuple[_ShiftedRows, ...]:
+    """Return the shifts of the rows of each kind."""
+    kinds = []
+    for number, o in enumerate(observations):
+        chosen = np.flatnonzero(rows.kind == number)
+        whitener = o.whitener[rows.row[chosen], rows.column[chosen]]
+        shifts = (
+            (label, whitener[:, members].sum(axis=1)) for label, members in list_components(o)
+        )
+        kinds.append(_ShiftedRows(chosen, rows.row[chosen], tuple(shifts)))
+    return tuple(kinds)
 
 
 def _build(
-    rows: ResidualRows,
-    observations: Sequence[Observations],
+    count: int,
+    kinds: Sequence[_ShiftedRows],
     functions: Sequence[Sequence[FloatArray]],
     source: str,
     name: str = "",
 ) -> Effect:
-    """Return an effect from functions (r,) of the rows of each kind, less their means: an offset of
-    all rows is no such effect.
+    """Return an effect on `count` rows from functions (r,) of the rows of each kind, less their
+    means: an offset of all rows is no such effect.
     """
-    columns, labels = [np.zeros((len(rows.residual), 0))], []
-    for number, (o, of_kind) in enumerate(zip(observations, functions, strict=True)):
-        chosen = np.flatnonzero(rows.kind == number)
-        for label, members in list_components(o):
-            shift = o.whitener[rows.row[chosen], rows.column[chosen]][:, members].sum(axis=1)
-            for function in of_kind:
-                column = np.zeros(len(rows.residual))
-                column[chosen] = -shift * (function - function.mean())[rows.row[chosen]]
+    columns, labels = [np.zeros((count, 0))], []
+    for kind, of_kind in zip(kinds, functions, strict=True):
+        centered = [(function - function.mean())[kind.row] for function in of_kind]
+        for label, shift in kind.shifts:
+            for function in centered:
+                column = np.zeros(count)
+                column[kind.places] = -shift * function
                 if column.any():
                     columns.append(column[:, None])
                     labels.append(label)

@@ -16,6 +16,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,20 +90,20 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
     """
     listed = list_effects(rows, data, robot)
     order = TIME if any(effect.source == TIME for effect in listed) else ORDER
-    effects = [e for e in listed if _is_testable(rows, e)]
+    effects = _list_testable(rows, listed)
     correlation, p_value = test_correlation(rows)
     tests = len(effects) + int(np.isfinite(p_value))
     significant: list[EffectSizes] = []
     while effects:
-        p_values = [test_effect(rows, effect) for effect in effects]
+        p_values = [_compute_tail(rows, basis) for _, basis in effects]
         best = int(np.argmin(p_values))
         p_any = compute_any_probability(p_values[best], tests)
         if not p_any < LEVEL:
             break
-        effect = effects.pop(best)
+        effect, _ = effects.pop(best)
         significant.append(estimate_sizes(rows, effect, p_any))
         rows = rows.with_effects(effect.columns)
-        effects = [e for e in effects if _is_testable(rows, e)]
+        effects = _list_testable(rows, [other for other, _ in effects])
     if significant:
         correlation, p_value = test_correlation(rows)
     p_any = compute_any_probability(p_value, tests)
@@ -114,7 +115,11 @@ def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> R
 
 def test_effect(rows: ResidualRows, effect: Effect) -> float:
     """Return the probability of a larger F for independent errors."""
-    basis = span_columns(rows.project(effect.columns))
+    return _compute_tail(rows, span_columns(rows.project(effect.columns)))
+
+
+def _compute_tail(rows: ResidualRows, basis: FloatArray) -> float:
+    """Return the same for an effect with the basis (R, q) of what nothing estimated explains."""
     q, explained = basis.shape[1], float(((basis.T @ rows.residual) ** 2).sum())
     left = rows.degrees - q
     statistic = explained / q / ((rows.square - explained) / left)
@@ -199,9 +204,16 @@ def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:
     return float(betainc((1.0 - center) * total, center * total, place))
 
 
-def _is_testable(rows: ResidualRows, effect: Effect) -> bool:
-    """Return whether residuals can show an effect, and enough degrees of freedom are left."""
-    if not effect.columns.shape[1]:
-        return False
-    rank = span_columns(rows.project(effect.columns)).shape[1]
-    return rank > 0 and rows.degrees >= (1.0 + FEWEST_LEFT) * rank
+def _list_testable(
+    rows: ResidualRows, effects: Iterable[Effect]
+) -> list[tuple[Effect, FloatArray]]:
+    """Return the effects that residuals can show, with enough degrees of freedom left, each with
+    the basis (R, q) of what nothing estimated explains of it.
+    """
+    testable = []
+    for effect in effects:
+        if effect.columns.shape[1]:
+            basis = span_columns(rows.project(effect.columns))
+            if basis.shape[1] > 0 and rows.degrees >= (1.0 + FEWEST_LEFT) * basis.shape[1]:
+                testable.append((effect, basis))
+    return testable
