@@ -137,13 +137,19 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
         taken = basis.T @ errors + others @ rng.standard_normal((others.shape[1], BATCH))
         drawn = _standardize(errors - basis @ taken, left, member)
         smaller += int((_compute_statistic(drawn) <= observed).sum())
-        median += float(np.median(np.abs(drawn), axis=0).sum())
+        median += float(_compute_medians(np.abs(drawn)).sum())
         done += BATCH
         if (1 + smaller) / (1 + done) > DOUBT:
             break
     size = np.abs(u)
     p_value = (1 + smaller) / (1 + done)
     return HeavyTails(len(kept), p_value, float(np.median(size)), median / done, float(size.max()))
+
+
+def _compute_medians(values: FloatArray) -> FloatArray:
+    """Return the median of each column of (n, c), faster than `np.median` for some hundred rows."""
+    ordered, n = np.sort(values, axis=0), len(values)
+    return np.asarray(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
 
 
 def _untested(rows: int) -> HeavyTails:
