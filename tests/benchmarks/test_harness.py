@@ -2,8 +2,9 @@
 """The benchmark gate fails for metrics that worsen or exceed their limit, and for no others."""
 
 import json
-import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -76,10 +77,19 @@ def test_complete_update_removes_old_metrics_and_stores_the_reason(tmp_path: Pat
     assert json.loads(path.read_text("utf-8"))["reason"] == "a new machine"
 
 
-def test_measure_ratio_returns_the_ratio_of_the_times() -> None:
-    metric = harness.measure_ratio(
-        "sleep", lambda: time.sleep(0.03), lambda: time.sleep(0.01), repeats=5
-    )
-    assert (
-        2.0 < metric.value < 4.0
-    )  # [1], 3 nominally; sleeping overshoots by up to a few ms on a busy machine
+def test_measure_ratio_returns_the_ratio_of_the_shortest_times(monkeypatch) -> None:
+    """A clock that the calls set shows their times: a busy machine would lengthen real ones."""
+    clock = [0.0]
+    monkeypatch.setattr(harness, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+
+    def last(seconds: list[float]) -> Callable[[], None]:
+        def run() -> None:
+            clock[0] += seconds.pop(0)
+
+        return run
+
+    subject, reference = [9.0, 5.0, 3.0, 4.0], [9.0, 1.0, 2.0, 8.0]  # the first is not counted
+    metric = harness.measure_ratio("calls", last(subject), last(reference), repeats=3)
+    assert (metric.value, metric.note) == (3.0, "3 s against 1 s")
+    assert not subject
+    assert not reference

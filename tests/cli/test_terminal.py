@@ -18,7 +18,7 @@ from loopcal.report.calibration_view import no_hint, with_hint
 WORK = """
 import sys, time
 from loopcal.cli import terminal
-terminal.DELAY = 0.2
+terminal.DELAY = float(sys.argv[2])
 with terminal.ProgressBar() as progress:
     for i in range(int(sys.argv[1])):
         progress(i, 10, "fitting")
@@ -70,10 +70,13 @@ def test_findings_are_sorted_from_failure_to_info():
     assert sort_by_importance((info, warning, failure)) == (failure, warning, info)
 
 
-def _run_on_terminal(steps: int) -> str:
-    """Return what a program writes to a terminal."""
+def _run_on_terminal(steps: int, delay: float) -> str:
+    """Return what a program writes to a terminal that shows progress after a delay [s].
+
+    A step takes 0.1 s, or more on a busy machine: delays are far from the time of all steps.
+    """
     parent, child = pty.openpty()
-    words = [sys.executable, "-c", WORK, str(steps)]
+    words = [sys.executable, "-c", WORK, str(steps), str(delay)]
     with subprocess.Popen(words, stdout=child, stderr=child) as process:
         os.close(child)
         text = b""
@@ -91,7 +94,7 @@ def _run_on_terminal(steps: int) -> str:
 
 
 def test_long_work_shows_percentage_and_remaining_time_on_a_terminal():
-    shown = _run_on_terminal(8)
+    shown = _run_on_terminal(8, 0.05)
     assert "fitting" in shown
     assert "%" in shown
     assert "0:00" in shown
@@ -114,8 +117,8 @@ def test_bar_begins_at_the_steps_that_are_done_and_keeps_its_time():
 
 
 def test_progress_is_hidden_for_short_work_and_without_a_terminal():
-    assert _run_on_terminal(1).split() == ["end"]
-    words = [sys.executable, "-c", WORK, "8"]
+    assert _run_on_terminal(1, 60.0).split() == ["end"]
+    words = [sys.executable, "-c", WORK, "8", "0.05"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("end\n", "")
 
