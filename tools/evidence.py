@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run evidence/*.py, write docs/evidence/*.json, and make the tables of the documentation from
-those files.
+"""Run evidence/*.py, write docs/evidence/*.json and figures, and make the tables of the
+documentation from those files.
 
 Run as `python -m tools.evidence`. `--tables` makes the tables only; names choose scripts.
 evidence/README.md says what a script returns.
@@ -50,8 +50,28 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
     temporary.replace(path)
 
 
+def write_figures(folder: Path, script: str, figures: dict[str, bytes]) -> list[str]:
+    """Write the figures of a script as `SCRIPT-NAME`, remove its other ones, and return the names
+    of the files.
+    """
+    contents = {f"{script}-{name}": content for name, content in sorted(figures.items())}
+    for old in find_figures(folder):
+        if old.name.startswith(f"{script}-") and old.name not in contents:
+            old.unlink()
+    for name, content in contents.items():
+        temporary = folder / f"{name}.tmp"
+        temporary.write_bytes(content)
+        temporary.replace(folder / name)
+    return list(contents)
+
+
+def find_figures(folder: Path) -> list[Path]:
+    """Return the figures in the folder of the evidence files."""
+    return sorted(path for path in folder.iterdir() if path.suffix in (".png", ".svg"))
+
+
 def run_script(script: Path) -> None:
-    """Collect one script's evidence and write its JSON file."""
+    """Collect one script's evidence, and write its JSON file and its figures."""
     begin = time.perf_counter()
     document = collect(script)
     seconds = round(time.perf_counter() - begin, 1)
@@ -60,7 +80,10 @@ def run_script(script: Path) -> None:
         "seconds": seconds,
         "machine": describe_machine(),
     }
-    write_json(ROOT / "docs" / "evidence" / f"{script.stem}.json", {"made": provenance, **document})
+    folder = ROOT / "docs" / "evidence"
+    if figures := write_figures(folder, script.stem, document.pop("figures", {})):
+        document["figures"] = figures
+    write_json(folder / f"{script.stem}.json", {"made": provenance, **document})
     print(f"evidence: {script.stem} took {seconds} s", flush=True)
 
 

@@ -70,11 +70,11 @@ def test_the_title_states_score_and_frame_and_a_line_the_limit_of_the_question(
         FRAMES["base"],
         "n = 20 converged trials of each cell; bars are 95 % intervals",
     ]
-    limits = [line for line in figure.axes[0].lines if list(line.get_xdata()) == [0, 1]]
+    limits = [line for line in figure.axes[0].lines if np.array_equal(line.get_xdata(), [0, 1])]
     assert_allclose([line.get_ydata() for line in limits], [[0.015, 0.015]])  # mm
     other = result.draw("condition")
     assert "frame" not in other.get_suptitle()
-    assert not any(list(line.get_xdata()) == [0, 1] for line in other.axes[0].lines)
+    assert not any(np.array_equal(line.get_xdata(), [0, 1]) for line in other.axes[0].lines)
 
 
 @pytest.mark.parametrize(
@@ -93,6 +93,6 @@ def test_long_names_of_levels_do_not_overlap(names: tuple[str, ...], tmp_path: P
             boxes = [text.get_window_extent() for text in labels]
             assert all(one.x1 < other.x0 for one, other in pairwise(boxes))
         else:
-            assert all(text.get_ha() == "right" for text in labels)
+            assert all(text.get_horizontalalignment() == "right" for text in labels)
             ends = [text.get_window_extent().x1 for text in labels]
-            assert min(np.diff(ends)) > 3.0 * labels[0].get_fontsize() * figure.dpi / 72.0
+            assert min(np.diff(ends)) > 3.0 * float(labels[0].get_fontsize()) * figure.dpi / 72.0

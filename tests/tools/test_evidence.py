@@ -67,6 +67,31 @@ def test_nan_is_refused_and_the_old_file_is_kept(tmp_path: Path) -> None:
     assert json.loads(path.read_text("utf-8")) == {"value": 1}
 
 
+def test_figures_of_a_script_are_written_under_its_name_and_old_ones_removed(tmp_path) -> None:
+    first = {"b.png": b"second", "a.svg": b"first"}
+    assert evidence.write_figures(tmp_path, "poses", first) == ["poses-a.svg", "poses-b.png"]
+    evidence.write_figures(tmp_path, "methods", {"a.svg": b"other"})
+    (tmp_path / "poses.json").write_text("{}")
+    assert evidence.write_figures(tmp_path, "poses", {"a.svg": b"new"}) == ["poses-a.svg"]
+    assert [path.name for path in evidence.find_figures(tmp_path)] == [
+        "methods-a.svg",
+        "poses-a.svg",
+    ]
+    assert (tmp_path / "poses-a.svg").read_bytes() == b"new"
+
+
+def test_every_figure_belongs_to_evidence_and_is_shown_on_a_page(root: Path) -> None:
+    folder = root / "docs" / "evidence"
+    named = [
+        name
+        for path in folder.glob("*.json")
+        for name in json.loads(path.read_text("utf-8")).get("figures", [])
+    ]
+    assert sorted(named) == [path.name for path in evidence.find_figures(folder)]
+    pages = "".join(page.read_text("utf-8") for page in evidence.find_pages(root))
+    assert [name for name in named if f"evidence/{name})" not in pages] == []
+
+
 def test_tables_in_the_pages_agree_with_the_evidence_files(root: Path) -> None:
     assert list(evidence.find_outdated(root)) == [], "run `make docs`"
 
