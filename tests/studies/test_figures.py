@@ -71,7 +71,7 @@ def test_the_title_states_score_and_frame_and_a_line_the_limit_of_the_question(
         "n = 20 converged trials of each cell; bars are 95 % intervals",
     ]
     limits = [line for line in figure.axes[0].lines if np.array_equal(line.get_xdata(), [0, 1])]
-    assert_allclose([line.get_ydata() for line in limits], [[0.015, 0.015]])  # mm
+    assert_allclose([np.asarray(line.get_ydata()) for line in limits], [[0.015, 0.015]])  # mm
     other = result.draw("condition")
     assert "frame" not in other.get_suptitle()
     assert not any(np.array_equal(line.get_xdata(), [0, 1]) for line in other.axes[0].lines)
