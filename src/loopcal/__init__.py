@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from loopcal.apply import Compensation as Compensation
     from loopcal.apply import Conformity as Conformity
     from loopcal.apply import PoseUncertainty as PoseUncertainty
+    from loopcal.apply import Repeatability as Repeatability
     from loopcal.apply import RunComparison as RunComparison
     from loopcal.apply import Validation as Validation
     from loopcal.apply import accuracy_map as accuracy_map
+    from loopcal.apply import assess_repeatability as assess_repeatability
     from loopcal.apply import compare_runs as compare_runs
     from loopcal.apply import compensate as compensate
     from loopcal.apply import judge_estimate as judge_estimate
@@ -164,9 +166,9 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
     package: names.split()
     for package, names in {
         "loopcal.apply": """
-            AccuracyMap AccuracySimulation Compensation Conformity PoseUncertainty RunComparison
-            Validation accuracy_map compare_runs compensate judge_estimate judge_largest_error
-            pose_uncertainty simulate_accuracy validate
+            AccuracyMap AccuracySimulation Compensation Conformity PoseUncertainty Repeatability
+            RunComparison Validation accuracy_map assess_repeatability compare_runs compensate
+            judge_estimate judge_largest_error pose_uncertainty simulate_accuracy validate
         """,
         "loopcal.diagnose": """
             ConventionCheck CrossValidation FitExamination Identifiability ModelChoice

@@ -34,7 +34,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "outliers": ("outliers",),
     "data": ("conventions", "data"),
     "mechanism": ("kinematics", "limits", "singularity", "mechanism"),
-    "apply": ("validation", "accuracy", "compensation", "conformity"),
+    "apply": ("validation", "accuracy", "compensation", "conformity", "repeatability"),
     "sampling": ("sampling",),
     "studies": ("study",),
     "plan": ("plan",),

@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pose accuracy and pose repeatability by ISO 9283:1998, sections 7.2.1 and 7.2.2, with intervals.
+
+A commanded pose is visited n times along the same path. With the attained minus the commanded
+position d_j, and the small rotation (a_j, b_j, c_j) from the commanded to the attained orientation:
+
+    AP_p = |mean d|                     RP_l = mean l + 3 S_l,  l_j = |d_j - mean d|
+    AP_a = mean a                       RP_a = 3 S_a
+
+The commanded pose is the one that the geometry of the robot file predicts at the readings, and the
+difference is stated in the frame of the instrument. Where that frame is not known, it is fitted to
+these poses; AP is then what remains after the best fit, while RP does not change to first order.
+
+Intervals of 95 %, for normal errors: of AP_p from the noncentral chi-square distribution of the
+squared mean over its variance, of RP_l from drawn visits with the same scatter (the ratio of their
+RP_l to the true one hardly depends on it), of AP_a from Student's t and of RP_a from chi-square.
+Derivation and measured coverage: docs/theory/repeatability.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal.apply.validation_findings import describe_frame, group_setup
+from loopcal.diagnose import compare_predictions, compute_noise_floor, compute_row_errors
+from loopcal.diagnose.row_errors import QuantityErrors
+from loopcal.errors import DataError
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import Measurements, check_actuators
+from loopcal.measure.kinds.error_groups import list_error_groups
+from loopcal.mechanism import Mechanism
+from loopcal.numerics.chi_square import compute_chi_square_quantile
+from loopcal.typing import FloatArray, IntArray
+
+TAIL = 0.025
+"""Probability beyond each bound of an interval."""
+
+STANDARD_VISITS = 30
+"""Visits of each pose that ISO 9283 asks for."""
+
+LARGEST_NOISE = 0.25
+"""Share of the scatter that the uncertainty of the instrument may be (ISO 9283, section 6.4)."""
+
+FEWEST_VISITS = 2
+"""Visits without which there is no scatter."""
+
+NORMAL = 1.959963984540054
+"""Quantile of the normal distribution for intervals of 95 %."""
+
+LARGE = 1e3
+"""Square of the mean over its variance beyond which its length is normal."""
+
+SMALLEST_SHARE = 0.05
+"""Share of the variance that the direction of the mean has at least."""
+
+DRAWS = 1000
+"""Drawn sets of visits for the interval of RP_l."""
+
+MANY = 20
+"""Sets of visits that together give the true RP_l of a scatter, in terms of `DRAWS` visits."""
+
+POSITION, ORIENTATION = "position", "orientation"
+
+
+class Estimate(NamedTuple):
+    """A value [m] or [rad] with its interval of 95 %."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class VisitedPose:
+    """Pose accuracy and repeatability of one target at one commanded pose.
+
+    Attributes
+    ----------
+    pose : label of its first visit. target, direction : names of the target and of the direction of
+        approach (the group of the rows); empty for the only one. visits : their number.
+    components : names of the measured components, such as ("x", "y", "z").
+    mean : (c,) attained minus commanded values.
+    accuracy, repeatability : AP_p and RP_l of a position; None for an orientation.
+    accuracies, repeatabilities : AP and RP of each component.
+    commanded : number of the commanded pose.
+    """
+
+    pose: str
+    target: str
+    direction: str
+    visits: int
+    components: tuple[str, ...]
+    mean: FloatArray
+    accuracy: Estimate | None
+    repeatability: Estimate | None
+    accuracies: tuple[Estimate, ...]
+    repeatabilities: tuple[Estimate, ...]
+    commanded: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content by name for JSON, SI."""
+        listed = {
+            name: {
+                component: estimate._asdict()
+                for component, estimate in zip(self.components, estimates, strict=True)
+            }
+            for name, estimates in (("AP", self.accuracies), ("RP", self.repeatabilities))
+        }
+        whole = {
+            name: estimate._asdict()
+            for name, estimate in (("AP_p", self.accuracy), ("RP_l", self.repeatability))
+            if estimate is not None
+        }
+        names = ("pose", "target", "direction", "visits")
+        return {**{name: getattr(self, name) for name in names}, **whole, **listed}
+
+
+@dataclass(frozen=True, eq=False)
+class Repeatability:
+    """Pose accuracy and repeatability of a machine.
+
+    Attributes
+    ----------
+    frame : in which frame the differences are, in words.
+    poses : by quantity, "position" and "orientation", one entry for each pose, target, direction.
+    variations : (pose, target) -> largest distance of the mean positions of two directions of
+        approach (vAP_p) [m], where there are several.
+    findings : what limits these numbers.
+    """
+
+    frame: str
+    poses: Mapping[str, tuple[VisitedPose, ...]]
+    variations: Mapping[tuple[str, str], float]
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content by name for JSON, SI."""
+        return {
+            "standard": "ISO 9283:1998",
+            "frame": self.frame,
+            **{name: [pose.to_dict() for pose in poses] for name, poses in self.poses.items()},
+            "variations": [
+                {"pose": pose, "target": target, "vAP_p": value}
+                for (pose, target), value in self.variations.items()
+            ],
+            "findings": self.findings,
+        }
+
+
+def assess_repeatability(
+    robot: Mechanism, data: Measurements, nuisance_values: Mapping[str, float] | None = None
+) -> Repeatability:
+    """Compute pose accuracy and repeatability by ISO 9283 from repeated visits.
+
+    Visits of a pose have the same readings, as they have where a file states commanded coordinates.
+
+    Parameters
+    ----------
+    robot : its geometry is that of the controller. data : poses or positions, each visited several
+        times. nuisance_values : values [SI] by name of frames and targets to keep; others are
+        fitted to these rows.
+
+    Raises
+    ------
+    DataError : no position or orientation is measured, or no pose is visited twice.
+    """
+    check_actuators(data, robot)
+    data = _keep_poses(data)
+    compared = compare_predictions(robot, robot, data, nuisance_values, nuisance_values)
+    rows = compared.data.observations
+    errors = compute_row_errors(rows, compared.after.residuals(rows))
+    noise = compute_noise_floor(rows)
+    places = _place_rows(compared.data)
+    poses = {
+        quantity: entries
+        for quantity in (POSITION, ORIENTATION)
+        if (entries := _describe_poses(errors[quantity], quantity, places, compared.data.labels))
+    }
+    if not poses:
+        raise DataError(report_finding("repeatability.no-repeats"))
+    setup = group_setup(compared.after)
+    return Repeatability(
+        frame=describe_frame(errors, (*setup["kept"], *setup["fitted"])),
+        poses=poses,
+        variations=_find_variations(poses.get(POSITION, ())),
+        findings=_report(poses, setup["fitted"], noise.rms),
+    )
+
+
+class _RowPlaces(NamedTuple):
+    """Of each row (r,): the number of the commanded pose, of its visit, and the direction."""
+
+    commanded: IntArray
+    visit: IntArray
+    direction: NDArray[np.str_]
+
+
+def _keep_poses(data: Measurements) -> Measurements:
+    """Return the rows that measure positions or orientations of one pose."""
+    kept = tuple(
+        o
+        for o in data.observations
+        if o.kind.poses_per_row == 1
+        and {g.quantity for g in list_error_groups(o.kind)} & {POSITION, ORIENTATION}
+    )
+    if not kept:
+        raise DataError(report_finding("repeatability.nothing-measured"))
+    return replace(data, observations=kept)
+
+
+def _place_rows(data: Measurements) -> _RowPlaces:
+    """Return which commanded pose and visit each row of the observations belongs to."""
+    visit = np.concatenate([o.rows for o in data.observations])
+    direction = np.concatenate([o.group for o in data.observations])
+    return _RowPlaces(data.repeats[visit], visit, direction)
+
+
+def _describe_poses(
+    errors: QuantityErrors, quantity: str, places: _RowPlaces, labels: Sequence[str]
+) -> tuple[VisitedPose, ...]:
+    """Return the characteristics of all targets at poses that were visited twice or more."""
+    is_measured = np.isfinite(errors.components).any(axis=0)
+    names = np.array(["", "", ""], dtype=object)
+    names[is_measured] = errors.measured[: int(is_measured.sum())]
+    keys: dict[tuple[int, str, str], list[int]] = {}
+    for i, (row, target) in enumerate(zip(errors.rows.tolist(), errors.targets, strict=True)):
+        key = (int(places.commanded[row]), target, str(places.direction[row]))
+        keys.setdefault(key, []).append(i)
+    entries = []
+    for (commanded, target, direction), chosen in keys.items():
+        attained = -errors.components[chosen]
+        columns = np.isfinite(attained).all(axis=0)
+        attained = attained[:, columns]
+        if len(chosen) < FEWEST_VISITS or not attained.size:
+            continue
+        label = labels[int(places.visit[errors.rows[chosen[0]]])]
+        shown = tuple(str(name) for name in names[columns])
+        entry = describe_visits(attained, quantity == POSITION)
+        entries.append(
+            replace(
+                entry,
+                pose=label,
+                target=target,
+                direction=direction,
+                components=shown,
+                commanded=commanded,
+            )
+        )
+    return tuple(entries)
+
+
+def describe_visits(attained: FloatArray, is_position: bool) -> VisitedPose:
+    """Return the characteristics of n visits of one pose.
+
+    Parameters
+    ----------
+    attained : (n, c) attained minus commanded values of the measured components [m] or [rad].
+    is_position : whether the components are those of one displacement.
+    """
+    n = len(attained)
+    mean, sd = attained.mean(axis=0), attained.std(axis=0, ddof=1)
+    half = _student_quantile(n - 1) * sd / np.sqrt(n)
+    low, high = (np.sqrt((n - 1) / compute_chi_square_quantile(n - 1, p)) for p in (TAIL, 1 - TAIL))
+    return VisitedPose(
+        pose="",
+        target="",
+        direction="",
+        visits=n,
+        components=(),
+        mean=mean,
+        accuracy=_estimate_accuracy(attained) if is_position else None,
+        repeatability=_estimate_repeatability(attained) if is_position else None,
+        accuracies=tuple(
+            Estimate(m, m - h, m + h) for m, h in zip(mean.tolist(), half.tolist(), strict=True)
+        ),
+        repeatabilities=tuple(
+            Estimate(r, float(low * r), float(high * r)) for r in (3.0 * sd).tolist()
+        ),
+    )
+
+
+def compute_repeatability(attained: FloatArray) -> FloatArray:
+    """Return RP_l = mean l + 3 S_l of sets (.., n, c) of n attained positions [m]."""
+    lengths = np.linalg.norm(attained - attained.mean(axis=-2, keepdims=True), axis=-1)
+    return np.asarray(lengths.mean(axis=-1) + 3.0 * lengths.std(axis=-1, ddof=1))
+
+
+def _estimate_accuracy(attained: FloatArray) -> Estimate:
+    """Return AP_p with an interval, from the noncentral chi-square distribution.
+
+    n |mean|^2 has the mean n |true mean|^2 + trace of the covariance, and far from zero the
+    variance of the scatter along the mean. So, over that variance, it is compared with a noncentral
+    chi-square of trace over this variance degrees of freedom, which is exact for equal variances.
+    That the variance is estimated widens the interval as Student's t does.
+    """
+    from scipy.special import chndtr, chndtrinc
+
+    n, mean = len(attained), attained.mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    covariance = np.atleast_2d(np.cov(attained.T))
+    trace = float(np.trace(covariance))
+    if trace == 0.0:
+        return Estimate(size, size, size)
+    along = float(mean @ covariance @ mean) / size**2 if size > 0.0 else 0.0
+    unit = max(along, SMALLEST_SHARE * trace)
+    factor, degrees = _student_quantile(n - 1), trace / unit
+    unit *= (factor / NORMAL) ** 2 / n
+    statistic = size**2 / unit
+    if statistic > LARGE:
+        return Estimate(size, size - NORMAL * np.sqrt(unit), size + NORMAL * np.sqrt(unit))
+    bounds = [
+        float(np.sqrt(chndtrinc(statistic, degrees, p) * unit))
+        if chndtr(statistic, degrees, 0.0) > p
+        else 0.0
+        for p in (1.0 - TAIL, TAIL)
+    ]
+    low, high = bounds
+    return Estimate(size, low, max(high, NORMAL * float(np.sqrt(unit))))
+
+
+def _estimate_repeatability(attained: FloatArray) -> Estimate:
+    """Return RP_l with an interval, from drawn visits with the same scatter."""
+    n = len(attained)
+    value = float(compute_repeatability(attained))
+    covariance = np.atleast_2d(np.cov(attained.T))
+    variances, _ = np.linalg.eigh(covariance)
+    if variances[-1] <= 0.0:
+        return Estimate(value, value, value)
+    root = np.sqrt(np.maximum(variances, 0.0))
+    stream = np.random.default_rng(0)
+    true = float(compute_repeatability(stream.standard_normal((MANY * DRAWS, len(root))) * root))
+    drawn = compute_repeatability(stream.standard_normal((DRAWS, n, len(root))) * root)
+    low, high = np.quantile(drawn / true, [TAIL, 1.0 - TAIL])
+    return Estimate(value, value / float(high), value / float(low))
+
+
+def _student_quantile(degrees: int) -> float:
+    """Return the quantile of Student's t for intervals of 95 %."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(degrees, 1.0 - TAIL))
+
+
+def _find_variations(poses: Sequence[VisitedPose]) -> dict[tuple[str, str], float]:
+    """Return vAP_p of targets at poses that were approached from several directions.
+
+    Entries of one commanded pose have the same number of components; their labels differ, so the
+    pose has the label of its first direction.
+    """
+    groups: dict[tuple[int, str], list[VisitedPose]] = {}
+    for pose in poses:
+        groups.setdefault((pose.commanded, pose.target), []).append(pose)
+    variations = {}
+    for (_, target), of in groups.items():
+        if len(of) > 1 and len({p.components for p in of}) == 1:
+            means = np.array([p.mean for p in of])
+            distances = np.linalg.norm(means[:, None] - means[None], axis=2)
+            variations[of[0].pose, target] = float(distances.max())
+    return variations
+
+
+def _report(
+    poses: Mapping[str, Sequence[VisitedPose]], fitted: tuple[str, ...], noise: Mapping[str, float]
+) -> tuple[Finding, ...]:
+    """Return what limits the numbers."""
+    findings = []
+    if fitted:
+        findings.append(report_finding("repeatability.frame-fitted", names=fitted))
+    visits = min(pose.visits for of in poses.values() for pose in of)
+    if visits < STANDARD_VISITS:
+        findings.append(
+            report_finding("repeatability.few-visits", visits=visits, standard=STANDARD_VISITS)
+        )
+    for quantity, of in poses.items():
+        scatter = [np.sqrt(sum((r.value / 3.0) ** 2 for r in p.repeatabilities)) for p in of]
+        share = noise[quantity] / float(np.sqrt(np.mean(np.square(scatter)))) if scatter else 0.0
+        if share > LARGEST_NOISE:
+            findings.append(
+                report_finding(
+                    "repeatability.instrument-noise",
+                    quantity=quantity,
+                    share=share,
+                    largest=LARGEST_NOISE,
+                )
+            )
+    return tuple(findings)

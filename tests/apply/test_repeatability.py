@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pose accuracy and repeatability: the formulas of ISO 9283, coverage of the intervals, frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.apply.repeatability import compute_repeatability, describe_visits
+from loopcal.cli.entry_point import main
+from loopcal.errors import DataError
+from tests.estimate.problems import UM, hexapod_poses, tracker
+
+MM = 1e-3
+SHIFT = np.array([0.02, -0.03, 0.05]) * MM
+
+
+def visit_poses(robot, poses, visits, sigma, shift):
+    """Return measured full poses of a machine whose tool is shifted, at repeated visits."""
+    commanded = np.repeat(poses, visits, axis=0)
+    instrument = tracker(sigma, 5e-6)
+    data = lc.simulate(robot, commanded, instrument, seed=4)
+    (rows,) = data.observations
+    columns = [c.name for c in rows.kind.columns]
+    moved = rows.measured.copy()
+    moved[:, [columns.index(c) for c in "xyz"]] += shift
+    return replace(data, observations=(replace(rows, measured=moved),))
+
+
+def test_numbers_equal_those_of_the_formulas() -> None:
+    """A direct transcription of ISO 9283, 7.2.1 and 7.2.2, with sums over the visits."""
+    robot = lc.load_robot("hexapod-42")
+    data = visit_poses(robot, hexapod_poses(2), 6, 10 * UM, SHIFT)
+    result = lc.assess_repeatability(robot, data)
+    (rows,) = data.observations
+    names = [c.name for c in rows.kind.columns]
+    for k, pose in enumerate(result.poses["position"]):
+        attained = rows.measured[6 * k : 6 * k + 6][:, [names.index(c) for c in "xyz"]]
+        commanded = lc.forward(robot, data.readings[6 * k : 6 * k + 1]).T[0] @ robot.tool
+        bary = [sum(row[i] for row in attained) / 6 for i in range(3)]
+        ap = sum((bary[i] - commanded[i, 3]) ** 2 for i in range(3)) ** 0.5
+        lengths = [sum((row[i] - bary[i]) ** 2 for i in range(3)) ** 0.5 for row in attained]
+        mean = sum(lengths) / 6
+        rp = mean + 3 * (sum((x - mean) ** 2 for x in lengths) / 5) ** 0.5
+        assert pose.visits == 6
+        assert pose.accuracy.value == pytest.approx(ap, rel=1e-6)
+        assert pose.repeatability.value == pytest.approx(rp, rel=1e-6)
+        assert pose.mean == pytest.approx(SHIFT, abs=15 * UM)  # attained minus commanded
+    turns = result.poses["orientation"][0]
+    assert turns.accuracy is None
+    assert turns.components == ("rx", "ry", "rz")
+    assert turns.repeatabilities[0].value == pytest.approx(3 * 5e-6, rel=0.8)
+
+
+@pytest.mark.parametrize("sd", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2)])
+@pytest.mark.parametrize(("visits", "bias"), [(5, 0.0), (5, 5.0), (30, 0.3), (30, 2.0)])
+def test_intervals_contain_the_truth(visits, bias, sd) -> None:
+    rng, true_mean, tests = np.random.default_rng(1), np.array([bias, 0.0, 0.0]), 100
+    true = float(compute_repeatability(rng.standard_normal((200_000, 3)) * sd))
+    inside = np.zeros(4)
+    for _ in range(tests):
+        pose = describe_visits(true_mean + rng.standard_normal((visits, 3)) * sd, True)
+        inside += [
+            pose.accuracy.low <= bias <= pose.accuracy.high,
+            pose.repeatability.low <= true <= pose.repeatability.high,
+            pose.accuracies[1].low <= 0.0 <= pose.accuracies[1].high,
+            pose.repeatabilities[1].low <= 3.0 * sd[1] <= pose.repeatabilities[1].high,
+        ]
+    assert (inside / tests >= 0.88).all(), inside
+
+
+def test_unknown_frame_hides_a_common_shift_but_not_the_scatter() -> None:
+    robot = lc.load_robot("hexapod-42")
+    known = visit_poses(robot, hexapod_poses(5), 5, 10 * UM, SHIFT)
+    (rows,) = known.observations
+    free = replace(rows, kind=replace(rows.kind, unknown=("frame",), frame="tracker"))
+    fitted = lc.assess_repeatability(robot, replace(known, observations=(free,)))
+    stated = lc.assess_repeatability(robot, known)
+    for a, b in zip(stated.poses["position"], fitted.poses["position"], strict=True):
+        assert a.accuracy.value > 40 * UM > b.accuracy.value
+        assert a.repeatability.value == pytest.approx(b.repeatability.value, rel=1e-3)
+    assert stated.frame == "in the stated frame"
+    assert "best fit of tracker" in fitted.frame
+    codes = {f.code for f in fitted.findings}
+    assert {"repeatability.frame-fitted", "repeatability.few-visits"} <= codes
+    assert "repeatability.frame-fitted" not in {f.code for f in stated.findings}
+
+
+def test_directions_of_approach_have_numbers_of_their_own() -> None:
+    robot = lc.load_robot("hexapod-42")
+    data = visit_poses(robot, hexapod_poses(1), 10, 1 * UM, 0.0)
+    (rows,) = data.observations
+    side = np.array(["up"] * 5 + ["down"] * 5)
+    moved = rows.measured.copy()
+    moved[:5, [c.name for c in rows.kind.columns].index("z")] += 30 * UM
+    rows = replace(rows, measured=moved, group=side)
+    result = lc.assess_repeatability(robot, replace(data, observations=(rows,)))
+    assert [p.direction for p in result.poses["position"]] == ["up", "down"]
+    assert result.variations["1", ""] == pytest.approx(30 * UM, abs=2 * UM)
+    assert all(p.repeatability.value < 10 * UM for p in result.poses["position"])
+
+
+def test_coarse_instruments_are_reported() -> None:
+    robot = lc.load_robot("hexapod-42")
+    result = lc.assess_repeatability(robot, visit_poses(robot, hexapod_poses(1), 8, 10 * UM, 0.0))
+    noise = [f for f in result.findings if f.code == "repeatability.instrument-noise"]
+    assert {f.data["quantity"] for f in noise} == {"position", "orientation"}
+
+
+def test_data_without_repeats_or_poses_are_refused() -> None:
+    robot = lc.load_robot("hexapod-42")
+    with pytest.raises(DataError, match="No pose is visited twice"):
+        lc.assess_repeatability(robot, visit_poses(robot, hexapod_poses(3), 1, UM, 0.0))
+    legs = lc.Instrument((lc.Sensor(lc.Distance(), lc.Gaussian(np.array([UM]))),))
+    data = lc.simulate(robot, hexapod_poses(3), legs, seed=0)
+    with pytest.raises(DataError, match="No row measures a position or orientation"):
+        lc.assess_repeatability(robot, data)
+
+
+def test_command_prints_the_page(tmp_path, capsys) -> None:
+    robot = lc.load_robot("hexapod-42")
+    lc.save_measurements(
+        visit_poses(robot, hexapod_poses(2), 5, 10 * UM, SHIFT), tmp_path / "visits.csv", robot
+    )
+    assert main(["repeatability", "hexapod-42", str(tmp_path / "visits.csv")]) == 0
+    text = capsys.readouterr().out
+    assert "Position by ISO 9283 with intervals of 95 %, in the stated frame" in text
+    assert "ISO 9283 asks for 30" in text
