@@ -460,7 +460,7 @@ def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> 
 
 def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
     """Identify leg by leg."""
-    from loopcal.papers.hexapod_42.leg_form import identify_per_leg
+    from loopcal.estimate.published_methods.per_leg import identify_per_leg
 
     result = identify_per_leg(machine, data, steps)
     return {"values": result.robot.values, "conditions": result.conditions}
@@ -888,13 +888,9 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
     """Run raw ridge estimation and truncated SVD, and the library's methods, on one machine with
     the printed noise.
     """
+    from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penalize_truncated
     from loopcal.papers.tsvd_2016 import cases
-    from loopcal.papers.tsvd_2016.steps import (
-        iterate,
-        linearize,
-        penalize_ridge,
-        penalize_truncated,
-    )
+    from loopcal.papers.tsvd_2016.steps import iterate, linearize
 
     measured = cases.measure_case(name, 0)
     measured = measured.five if five else measured

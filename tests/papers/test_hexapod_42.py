@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from loopcal.estimate import LeastSquares, identify_trials
+from loopcal.estimate.published_methods.per_leg import LegForm
 from loopcal.mechanism import forward
 from loopcal.papers import PAPERS
-from loopcal.papers.hexapod_42.leg_form import LegForm
 from loopcal.papers.hexapod_42.noise_study import (
     PRESUMED,
     STATED,

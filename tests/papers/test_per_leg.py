@@ -10,9 +10,9 @@ import pytest
 from loopcal.cli import main
 from loopcal.errors import EstimationError
 from loopcal.estimate import identify
+from loopcal.estimate.published_methods.per_leg import identify_per_leg
 from loopcal.io import load_robot
 from loopcal.measure import Instrument, sample_truth, simulate, simulate_trials
-from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 from tests import zoo
 from tests.estimate.problems import bed_points, hexapod, hexapod_poses, simulate_heights, tracker
 

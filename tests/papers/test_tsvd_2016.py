@@ -11,6 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loopcal.estimate.published_methods.raw_steps import (
+    EPSILON,
+    LIMIT,
+    penalize_none,
+    penalize_ridge,
+    penalize_truncated,
+)
 from loopcal.measure import Noise, Uniform
 from loopcal.mechanism import forward_trials
 from loopcal.papers import PAPERS
@@ -46,16 +53,7 @@ from loopcal.papers.tsvd_2016.machines import (
 )
 from loopcal.papers.tsvd_2016.published import read_published
 from loopcal.papers.tsvd_2016.situations import LS, RANKED, RE, TSVD, has_interior_minimum
-from loopcal.papers.tsvd_2016.steps import (
-    ENOUGH,
-    LIMIT,
-    iterate,
-    linearize,
-    list_scales,
-    penalize_none,
-    penalize_ridge,
-    penalize_truncated,
-)
+from loopcal.papers.tsvd_2016.steps import iterate, linearize, list_scales
 from loopcal.papers.tsvd_2016.study import compute
 from loopcal.papers.tsvd_2016.tables import Results, collect_history, make_tables
 from loopcal.papers.tsvd_2016.verdicts import judge_claims
@@ -278,7 +276,7 @@ def test_ridge_runs_until_its_steps_are_small(tripod) -> None:
     assert (run.count < LIMIT).all()
     again, _ = linearize(tripod, run.values, run.machine)
     step = again.deviation(again.solution(penalize_ridge(lam, 33)))
-    assert (np.abs(step).max(axis=1) < 1.01 * ENOUGH).all()
+    assert (np.abs(step).max(axis=1) < 1.01 * EPSILON).all()
 
 
 def test_diverged_iteration_has_no_values_after_its_last_step(tripod) -> None:

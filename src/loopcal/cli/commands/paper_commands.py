@@ -27,7 +27,7 @@ from loopcal.cli.options.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from loopcal.papers.hexapod_42.leg_form import PerLegEstimate
+    from loopcal.estimate.published_methods.per_leg import PerLegEstimate
     from loopcal.papers.printed import Table as PrintedTable
     from loopcal.papers.reproduction import Reproduction
     from loopcal.report.tables import Table
@@ -130,10 +130,10 @@ def per_leg(
       loopcal per-leg hexapod-42 measurements.csv
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
     """  # noqa: D301
+    from loopcal.estimate.published_methods.per_leg import identify_per_leg
     from loopcal.io import load_robot, save_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.robot.robot_file import find_robot_file
-    from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 
     refuse_outputs((output,), (find_robot_file(robot), *data), force)
     machine = load_robot(robot)

@@ -9,6 +9,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify_trials
+from loopcal.estimate.published_methods.per_leg import LegForm, identify_per_leg
 from loopcal.measure import (
     Instrument,
     Pose,
@@ -19,7 +20,6 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import forward_trials
-from loopcal.papers.hexapod_42.leg_form import LegForm, identify_per_leg
 from loopcal.papers.hexapod_42.published import MM, TO_PRINTED, Published, to_values
 from loopcal.papers.hexapod_42.steps import (
     Study,

@@ -26,10 +26,10 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
+from loopcal.estimate.published_methods.per_leg import LegForm, identify_per_leg
 from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure import Measurements, Observations, Pose, make_random_stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
-from loopcal.papers.hexapod_42.leg_form import LegForm, identify_per_leg
 from loopcal.papers.hexapod_42.published import MM
 from loopcal.typing import FloatArray
 

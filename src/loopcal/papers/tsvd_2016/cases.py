@@ -17,6 +17,11 @@ import numpy as np
 
 from loopcal.diagnose import Identifiability, identifiability
 from loopcal.estimate import GCV, MAP, LeastSquares, Ridge, identify_trials
+from loopcal.estimate.published_methods.raw_steps import (
+    penalize_none,
+    penalize_ridge,
+    penalize_truncated,
+)
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.papers.tsvd_2016.machines import (
     AppendixNoise,
@@ -26,15 +31,7 @@ from loopcal.papers.tsvd_2016.machines import (
     measure_machines,
 )
 from loopcal.papers.tsvd_2016.situations import LS, RANKED, RE, TSVD, find_bottom
-from loopcal.papers.tsvd_2016.steps import (
-    Iterations,
-    iterate,
-    linearize,
-    list_scales,
-    penalize_none,
-    penalize_ridge,
-    penalize_truncated,
-)
+from loopcal.papers.tsvd_2016.steps import Iterations, iterate, linearize, list_scales
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"

@@ -15,6 +15,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.engine import State
+from loopcal.estimate.published_methods.raw_steps import RawProblem, make_raw_problem
 from loopcal.measure import (
     Component,
     Instrument,
@@ -116,6 +117,11 @@ class Study:
         T = self.trials.T
         measured = self.kind.measure(T, np.zeros((*T.shape[:2], self.freedoms)))
         return replace(self, trials=replace(self.trials, measured=(measured,)))
+
+    @cached_property
+    def raw(self) -> RawProblem:
+        """The measurements as the paper weights them."""
+        return make_raw_problem(self.robot, self.trials)
 
     @cached_property
     def commanded(self) -> State:

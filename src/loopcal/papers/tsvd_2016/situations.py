@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penalize_truncated
 from loopcal.papers.tsvd_2016.machines import Study
-from loopcal.papers.tsvd_2016.steps import iterate, penalize_ridge, penalize_truncated
+from loopcal.papers.tsvd_2016.steps import iterate
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 LS, RANKED, RE, TSVD = "LS", "LS with rank detection", "RE", "TSVD"

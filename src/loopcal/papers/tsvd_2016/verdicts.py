@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from loopcal.estimate.published_methods.raw_steps import LINEARIZATIONS
 from loopcal.papers.reproduction import Verdict
 from loopcal.papers.tsvd_2016.draw_tables import DIVERGED
 from loopcal.papers.tsvd_2016.draws import (
@@ -51,7 +52,6 @@ from loopcal.papers.tsvd_2016.situations import (
     compute_rises,
     find_bottom,
 )
-from loopcal.papers.tsvd_2016.steps import LINEARIZATIONS
 from loopcal.papers.tsvd_2016.tables import Results
 from loopcal.papers.wording import Wording, read_wording
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.published_methods.raw_steps import list_raw_units
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism, Solution, differentiate_pose, forward
 from loopcal.numerics.decomposition import are_nonzero
@@ -91,11 +92,13 @@ class PerLegEstimate:
     ----------
     robot : at the estimated values. estimate_history : (steps + 1, p) parameters after each step
         [SI]. conditions : (6,) condition number of each leg's matrix in the last step.
+    is_converged : whether the last step was at most epsilon; always with a fixed number of steps.
     """
 
     robot: Mechanism
     estimate_history: FloatArray
     conditions: FloatArray
+    is_converged: bool = True
 
     def to_dict(self) -> dict[str, Any]:
         """Return the parameters in the units of the robot file, and the condition numbers."""
@@ -109,12 +112,15 @@ class PerLegEstimate:
         return {"robot": self.robot.name, "parameters": rows, "conditions": conditions}
 
 
-def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> PerLegEstimate:
-    """Identify a hexapod leg by leg in a fixed number of Gauss-Newton steps.
+def identify_per_leg(
+    robot: Mechanism, data: Measurements, steps: int = 3, epsilon: float = 0.0
+) -> PerLegEstimate:
+    """Identify a hexapod leg by leg by full Gauss-Newton steps.
 
     Parameters
     ----------
-    robot : start values; all parameters free. data : full poses of one kind. steps : their number.
+    robot : start values; all parameters free. data : full poses of one kind. steps : at most.
+    epsilon : largest component of a step [mm, rad] at which they end; 0 takes all steps.
 
     Raises
     ------
@@ -130,6 +136,7 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
     observations = _select_full_poses(data)
     q = data.readings[observations.rows]
     values, history, conditions = robot.values.copy(), [robot.values.copy()], np.zeros(0)
+    units, is_converged = list_raw_units(robot.parameters.dimensions), epsilon == 0.0
     for _ in range(steps):
         machine = robot.with_values(values)
         solution = forward(machine, q)
@@ -142,10 +149,15 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
         _check_members(robot, legs, len(q))
         evaluated = observations.kind.evaluate(solution.T[None], observations.measured[None])
         twists = -np.linalg.solve(evaluated.jacobian[0], evaluated.residual[0, :, :, None])[:, :, 0]
-        values = values + legs.fit(twists)
+        change = legs.fit(twists)
+        values = values + change
         history.append(values.copy())
         conditions = legs.conditions
-    return PerLegEstimate(robot.with_values(values), np.stack(history), conditions)
+        if epsilon and np.abs(change / units).max() <= epsilon:
+            is_converged = True
+            break
+    machine = robot.with_values(values)
+    return PerLegEstimate(machine, np.stack(history), conditions, is_converged)
 
 
 def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
