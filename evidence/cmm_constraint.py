@@ -100,11 +100,11 @@ def list_medians(c: Cell) -> list[float]:
     ]
 
 
-def compare_weights(study: Study, full: Cell) -> list[list[Any]]:
+def compare_weights(study: Study) -> list[list[Any]]:
     """Return errors by LS and MAP for each weighting of the rows, and the ratio of LS to that as
     printed.
     """
-    cells = layouts.compare_weights(study, SEED, DRAWS, full)
+    cells = layouts.compare_weights(study, SEED, DRAWS)
     position, parameters = (
         MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]")
     )
@@ -248,7 +248,7 @@ def collect() -> dict[str, Any]:
                     "position, LS, as printed = 1",
                 ],
                 ["", ".3g", ".3g", ".3g", ".3g", ".2f"],
-                compare_weights(study, ten),
+                compare_weights(study),
             ),
             "readings": make_table(
                 [

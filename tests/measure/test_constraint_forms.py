@@ -14,15 +14,15 @@ from loopcal.diagnose import identifiability
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
-from loopcal.findings import Finding
-from loopcal.papers.cmm_constraint_2011.forms import build_measurements, compare_covariances
-from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
-from loopcal.papers.cmm_constraint_2011.steps import (
+from loopcal.estimate.published_methods.plane_line_products import (
     Layout,
     PaperRows,
     identify_from_rows,
     map_displacements,
 )
+from loopcal.findings import Finding
+from loopcal.papers.cmm_constraint_2011.forms import build_measurements, compare_covariances
+from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
 from loopcal.planning.plane_line_groups import PlaneLineGroups, linearize_surfaces
 
 MM = 1e-3

@@ -15,9 +15,22 @@ from scipy.stats import beta
 
 from loopcal import geometry
 from loopcal.estimate import LeastSquares
+from loopcal.estimate.published_methods.plane_line_products import (
+    PaperRows,
+    identify_from_rows,
+    linearize_products,
+    map_displacements,
+)
 from loopcal.mechanism import forward, forward_trials
 from loopcal.papers import PAPERS
-from loopcal.papers.cmm_constraint_2011.calibrations import BEFORE, LS, PRIOR, Cell, calibrate_cell
+from loopcal.papers.cmm_constraint_2011.calibrations import (
+    BEFORE,
+    LS,
+    PRIOR,
+    Cell,
+    Machines,
+    calibrate_cell,
+)
 from loopcal.papers.cmm_constraint_2011.draws import compute_draw
 from loopcal.papers.cmm_constraint_2011.forms import NOISES, compare_estimates, compare_forms
 from loopcal.papers.cmm_constraint_2011.layouts import (
@@ -42,12 +55,6 @@ from loopcal.papers.cmm_constraint_2011.machines import (
     remove_gauge,
 )
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
-from loopcal.papers.cmm_constraint_2011.steps import (
-    PaperRows,
-    identify_from_rows,
-    linearize_products,
-    map_displacements,
-)
 from loopcal.papers.cmm_constraint_2011.tables import (
     Results,
     compute_gauge_effects,
@@ -306,7 +313,7 @@ def test_claims_have_the_expected_verdicts(results) -> None:
 
 @pytest.mark.slow
 def test_every_verdict_can_be_does_not_agree(results) -> None:
-    answers = collect_answers(judge_claims, results, keep=(Study,))
+    answers = collect_answers(judge_claims, results, keep=(Study, Machines))
     assert len(answers) == 21
     assert [claim for claim, given in answers.items() if False not in given] == []
     assert None in answers["1 counted"]
@@ -317,7 +324,7 @@ def test_fits_that_did_not_converge_are_left_out_of_the_medians() -> None:
     errors = np.array([[1.0], [2.0], [100.0]])
     converged = {LS: np.array([True, True, False]), PRIOR: np.zeros(3, dtype=bool)}
     cell = Cell(1e-3, 1e-5, False, {BEFORE: errors, LS: errors, PRIOR: errors},
-                np.zeros(3, dtype=int), converged)  # fmt: skip
+                np.zeros(3, dtype=int), converged, Machines(errors, {}))  # fmt: skip
     assert cell.compute_median(BEFORE)[0] == 2.0
     assert cell.compute_median(LS)[0] == 1.5
     assert np.isnan(cell.compute_median(PRIOR)[0])

@@ -17,11 +17,12 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_argument
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Gaussian, Instrument, Line, Plane, Sensor
+from loopcal.measure import Gaussian, Instrument
 from loopcal.mechanism import POSITION, Mechanism, inverse
 from loopcal.planning.constraints import ConstraintChecker, Constraints, build_checker, list_reasons
 from loopcal.planning.design import (
     D,
+    MovedDesign,
     PriorInformation,
     coordinate_exchange,
     find_observable_space,
@@ -29,6 +30,7 @@ from loopcal.planning.design import (
 )
 from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.plane_line_groups import AXIS, PlaneLineGroups
+from loopcal.planning.plane_line_sensors import make_plane_line_instrument
 from loopcal.planning.result import PlannedPoses
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
@@ -107,25 +109,10 @@ class SurfacePlan(TableResult):
     @property
     def instrument(self) -> Instrument:
         """A plane and a line along each axis that is used, unknown in each group."""
-        sensors = []
-        for axis in np.unique(self.axis):
-            groups = np.flatnonzero(self.axis == axis)
-            members = self.poses.groups[groups]
-            settings = {
-                "unknown": ("surface",),
-                "surface": f"surface-{POSITION[axis]}",
-                "along": np.eye(3)[axis],
-                "through": self.robot.home[:3, 3],
-            }
-            pairs = (
-                (Plane(**settings), np.delete(members, 1, axis=1), 1),
-                (Line(**settings), members[:, :2], 2),
-            )
-            for kind, points, m in pairs:
-                names = np.repeat([f"group{g + 1}" for g in groups], points.shape[1])
-                noise = Gaussian(np.full(m, self.options.sigma))
-                sensors.append(Sensor(kind, noise, rows=points.ravel(), group=names))
-        return Instrument(tuple(sensors)).with_tool(self.robot)
+        sigma = self.options.sigma
+        return make_plane_line_instrument(
+            self.robot, self.axis, self.poses.groups, lambda _, gaps: Gaussian(np.full(gaps, sigma))
+        )
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -229,18 +216,10 @@ def plan_surfaces(
     designs, rows = _draw_allowed(
         groups, checker, options.groups, np.random.default_rng(options.seed)
     )
-    none = PriorInformation.none(len(groups.free))
-    possible = len(find_observable_space(rows, none))
+    possible = count_observable(groups, rows)
     rank = min(possible, options.groups * (options.points - SPENT))
-    prior = none if rank == possible else PriorInformation.from_tolerances(len(groups.free))
-    best = coordinate_exchange(
-        lambda _, design: groups.linearize(design, checker),
-        designs[: options.groups],
-        groups.list_levels(),
-        D(),
-        prior,
-        SWEEPS,
-        progress,
+    best = improve_groups(
+        groups, designs[: options.groups], SWEEPS, rank == possible, checker, progress
     )
     poses, positions = _arrange_points(groups, checker, best.design)
     return SurfacePlan(
@@ -254,6 +233,39 @@ def plan_surfaces(
         _rms_sd(rows[: options.groups], rank),
         _rms_sd(best.rows, rank),
         best.is_converged,
+    )
+
+
+def count_observable(groups: PlaneLineGroups, rows: FloatArray) -> int:
+    """Return how many combinations of parameters groups with these rows (u, k - 2, p) determine."""
+    return len(find_observable_space(rows, PriorInformation.none(len(groups.free))))
+
+
+def improve_groups(
+    groups: PlaneLineGroups,
+    design: FloatArray,
+    sweeps: int,
+    is_complete: bool = True,
+    checker: ConstraintChecker | None = None,
+    progress: Progress = report_no_progress,
+) -> MovedDesign:
+    """Improve the log determinant of the information of groups (u, c) by coordinate exchange; with
+    0 sweeps they stay.
+
+    Parameters
+    ----------
+    is_complete : whether so many groups determine all that such groups can determine; otherwise the
+        tolerances take part. checker : further constraints on the poses.
+    """
+    count = len(groups.free)
+    return coordinate_exchange(
+        lambda _, moved: groups.linearize(moved, checker),
+        design,
+        groups.list_levels(),
+        D(),
+        PriorInformation.none(count) if is_complete else PriorInformation.from_tolerances(count),
+        sweeps,
+        progress,
     )
 
 

@@ -6,11 +6,16 @@ the paper's experiment, fifty points spread over the workspace and then independ
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method
+from loopcal.estimate.published_methods.plane_line_products import (
+    PaperRows,
+    Weights,
+    identify_from_rows,
+)
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
@@ -21,7 +26,13 @@ from loopcal.papers.cmm_constraint_2011.machines import (
     plan_points,
 )
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
-from loopcal.papers.cmm_constraint_2011.steps import PaperRows, Weights, identify_from_rows
+from loopcal.papers.paper_studies import load_paper_study
+from loopcal.studies.simulation.calibrated_cells import (
+    CalibratedCell,
+    calibrate_cells,
+    find_cells,
+    set_size,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BEFORE, LS, PRIOR = "before", "LS", "MAP"
@@ -36,6 +47,14 @@ STATISTICS = ("position, mean [mm]", "position, standard deviation [mm]", "orien
 
 
 @dataclass(frozen=True, eq=False)
+class Machines:
+    """True values (t, p) [m] of t machines, and their estimates by method."""
+
+    truth: FloatArray
+    estimates: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
 class Cell:
     """t machines with errors of one size, calibrated from points with noise of one size.
 
@@ -44,7 +63,7 @@ class Cell:
     sd, noise : standard deviations [m]. is_gauge_free : whether the true errors have no part
         that plane and line cannot determine.
     errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. converged : by LS,
-        MAP, (t,).
+        MAP, (t,). machines : the true ones, and those that LS and MAP identified.
     """
 
     sd: float
@@ -53,6 +72,7 @@ class Cell:
     errors: Mapping[str, FloatArray]
     iterations: IntArray
     converged: Mapping[str, BoolArray]
+    machines: Machines
 
     @property
     def failed(self) -> int:
@@ -98,31 +118,65 @@ def calibrate_cell(
     problem = PaperRows(
         study.layout, study.layout.solve_readings(truth, noise, seed), sd, noise, weights
     )
-    true = study.held_out.solve(truth)
-    errors = {
-        BEFORE: study.held_out.compute_errors(study.robot.parameters.nominal[None], truth, true)
-    }
-    converged, iterations = {}, np.zeros(trials, dtype=np.int64)
-    for name, method in METHODS.items():
-        descent = identify_from_rows(problem, method)
-        errors[name] = study.held_out.compute_errors(problem.values(descent.deviation), truth, true)
-        converged[name] = descent.status == DescentStatus.CONVERGED
-        iterations = descent.iterations if name == LS else iterations
-    return Cell(sd, noise, gauge_free, errors, iterations, converged)
+    descents = {name: identify_from_rows(problem, method) for name, method in METHODS.items()}
+    values = {name: problem.values(descent.deviation) for name, descent in descents.items()}
+    return Cell(
+        sd,
+        noise,
+        gauge_free,
+        _compute_errors(study, truth, values),
+        descents[LS].iterations,
+        {name: descent.status == DescentStatus.CONVERGED for name, descent in descents.items()},
+        Machines(truth, values),
+    )
 
 
 def calibrate_grid(
     study: Study, seed: int, trials: int, progress: Callable[[str], None]
 ) -> dict[tuple[str, str], Cell]:
-    """Return the 3 x 4 cells by (set, noise) as printed, taken as standard deviations."""
+    """Return the 3 x 4 cells by (set, noise) as printed, taken as standard deviations: those of
+    study.yaml at the points of this study.
+    """
+    grid = set_size(load_paper_study(__file__), seed, trials)
+    (level,) = grid.poses.values()
+    points = replace(level, coordinates=tuple(map(tuple, study.layout.flat.tolist())))
+    grid = replace(grid, poses={"points": points})
     cells = {}
     for given in read_published().sets:
         progress(f"Table 3, set {given} mm")
         for noise in read_published().noises:
-            cells[given, noise] = calibrate_cell(
-                study, float(given) * MM, float(noise) * MM, seed, trials
-            )
+            levels = {"errors": f"set {given}", "instrument": f"{noise} mm"}
+            made = {
+                cell.levels["method"]: cell
+                for cell in calibrate_cells(grid, find_cells(grid, **levels))
+            }
+            cells[given, noise] = _make_cell(study, float(given) * MM, float(noise) * MM, made)
     return cells
+
+
+def _make_cell(study: Study, sd: float, noise: float, made: Mapping[str, CalibratedCell]) -> Cell:
+    """Return the same machines calibrated by LS and MAP."""
+    truth, values = made[LS].truth, {name: cell.values for name, cell in made.items()}
+    return Cell(
+        sd,
+        noise,
+        False,
+        _compute_errors(study, truth, values),
+        made[LS].iterations,
+        {name: cell.is_converged for name, cell in made.items()},
+        Machines(truth, values),
+    )
+
+
+def _compute_errors(
+    study: Study, truth: FloatArray, values: Mapping[str, FloatArray]
+) -> dict[str, FloatArray]:
+    """Return errors (t, 7) before calibration and by each method."""
+    true, nominal = study.held_out.solve(truth), study.robot.parameters.nominal[None]
+    return {
+        name: study.held_out.compute_errors(machines, truth, true)
+        for name, machines in {BEFORE: nominal, **values}.items()
+    }
 
 
 def compute_rank_correlation(cells: Iterable[Cell], method: str) -> float:

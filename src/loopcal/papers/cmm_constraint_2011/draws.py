@@ -56,6 +56,6 @@ def compute_draw(study: Study, seed: int, trials: int, progress: Callable[[str],
         drawn=compute_spread(study.planned.linearize(study.first)),
         optimized=compute_spread(study.optimized.rows),
         cells=cells,
-        weights=compare_weights(study, seed, trials, cells["1", "0.01"]),
+        weights=compare_weights(study, seed, trials),
         fifties=tuple(calibrate_fifty(study, groups, seed, trials) for groups in LINES),
     )

@@ -9,15 +9,8 @@ import numpy as np
 
 from loopcal.papers.cmm_constraint_2011.calibrations import BEFORE, LS, METHODS, PRIOR
 from loopcal.papers.cmm_constraint_2011.layouts import NOISE, SET
-from loopcal.papers.cmm_constraint_2011.machines import (
-    ABSOLUTE,
-    ALIGNED,
-    MEASURES,
-    Study,
-    draw_true_machines,
-)
+from loopcal.papers.cmm_constraint_2011.machines import ABSOLUTE, ALIGNED, MEASURES
 from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.steps import PaperRows, identify_from_rows
 from loopcal.papers.cmm_constraint_2011.tables import Results
 from loopcal.papers.reproduction import Figure, Series
 from loopcal.papers.wording import read_wording
@@ -32,7 +25,8 @@ FRAMES = {
 
 def make_figures(results: Results, seed: int) -> tuple[Figure, ...]:
     """Return all figures."""
-    return _draw_figure_4(results), _draw_figure_5(results.study, seed), _draw_table_3(results)
+    del seed
+    return _draw_figure_4(results), _draw_figure_5(results), _draw_table_3(results)
 
 
 def _draw_figure_4(results: Results) -> Figure:
@@ -50,15 +44,12 @@ def _draw_figure_4(results: Results) -> Figure:
     return replace(figure, joined=False)
 
 
-def _draw_figure_5(study: Study, seed: int) -> Figure:
-    """Return position errors of single poses before and after."""
-    truth = draw_true_machines(study.robot, SET * MM, 1, seed)
-    q = study.layout.solve_readings(truth, NOISE * MM, seed)
-    problem = PaperRows(study.layout, q, SET * MM, NOISE * MM)
-    true = study.held_out.solve(truth)
+def _draw_figure_5(results: Results) -> Figure:
+    """Return position errors of single poses of the first machine, before and after."""
+    study, made = results.study, results.cells[f"{SET:g}", f"{NOISE:g}"].machines
+    true = study.held_out.solve(made.truth[:1])
     machines = {BEFORE: study.robot.parameters.nominal[None]}
-    for name, method in METHODS.items():
-        machines[name] = problem.values(identify_from_rows(problem, method).deviation)
+    machines |= {name: made.estimates[name][:1] for name in METHODS}
     sizes = {}
     for name, values in machines.items():
         for frame in (ABSOLUTE, ALIGNED):

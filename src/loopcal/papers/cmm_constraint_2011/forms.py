@@ -16,15 +16,18 @@ import numpy as np
 from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
-from loopcal.measure import Line, Measurements, Observations, Plane
-from loopcal.mechanism import POSITION
+from loopcal.estimate.published_methods.plane_line_products import (
+    Layout,
+    PaperRows,
+    identify_from_rows,
+)
+from loopcal.measure import Gaussian, Measurements, Observations
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.papers.cmm_constraint_2011.calibrations import LS, METHODS
 from loopcal.papers.cmm_constraint_2011.machines import Study, draw_true_machines
-from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows
+from loopcal.planning.plane_line_sensors import make_plane_line_instrument
 from loopcal.typing import FloatArray
 
-SURFACE = "held"
 ERRORS, NOISES = 1e-3, (1e-6, 1e-5)
 """Standard deviations [m] of parameters and of held coordinates."""
 HARDEST, SHARE = (max(NOISES), LS), 5
@@ -85,30 +88,20 @@ def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measureme
     """
     number = np.arange(layout.points).reshape(layout.groups, -1)
     axis = np.abs(layout.levers[0]).argmax(axis=1)
-    observations = []
-    for along in np.unique(axis):
-        stated = {
-            "unknown": ("surface",),
-            "surface": f"{SURFACE}_{POSITION[along]}",
-            "through": layout.robot.home[:3, 3],
-        }
-        plane, line = (
-            kind(along=np.eye(3)[along], **stated).with_tool(layout.robot.tool)
-            for kind in (Plane, Line)
+    instrument = make_plane_line_instrument(
+        layout.robot, axis, number, lambda _, gaps: Gaussian(np.full(gaps, sigma))
+    )
+    observations = tuple(
+        Observations.from_sigma(
+            sensor.kind,
+            sensor.assigned_rows,
+            np.zeros((len(sensor.assigned_rows), len(sensor.noise.sigma))),
+            sigma,
+            group=sensor.group,
         )
-        points, groups = (
-            number[axis == along],
-            [f"plane{i + 1}" for i in np.flatnonzero(axis == along)],
-        )
-        for kind, touched, gaps in (
-            (plane, np.delete(points, 1, axis=1), 1),
-            (line, points[:, :2], 2),
-        ):
-            zeros, group = np.zeros((touched.size, gaps)), np.repeat(groups, touched.shape[1])
-            observations.append(
-                Observations.from_sigma(kind, touched.ravel(), zeros, sigma, group=group)
-            )
-    return Measurements(layout.robot.name, q, tuple(observations))
+        for sensor in instrument.sensors
+    )
+    return Measurements(layout.robot.name, q, observations)
 
 
 def compare_forms(study: Study, seed: int, trials: int) -> Forms:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopcal.estimate.published_methods.plane_line_products import WEIGHTS
 from loopcal.papers.cmm_constraint_2011.calibrations import Cell, calibrate_cell
 from loopcal.papers.cmm_constraint_2011.machines import (
     GROUPS,
@@ -18,7 +19,6 @@ from loopcal.papers.cmm_constraint_2011.machines import (
     plan_points,
 )
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
-from loopcal.papers.cmm_constraint_2011.steps import WEIGHTS
 from loopcal.typing import FloatArray
 
 SD, VARIANCE = "standard deviation", "variance"
@@ -141,14 +141,12 @@ def rank_candidates(
     return tuple(sorted(rows, key=lambda row: row.distance))
 
 
-def compare_weights(study: Study, seed: int, trials: int, full: Cell) -> dict[str, Cell]:
-    """Return the cell of figure 5 with every weighting of the rows; `full` is that with covariance
-    of Table 3.
+def compare_weights(study: Study, seed: int, trials: int) -> dict[str, Cell]:
+    """Return calibrations with the errors and the noise of figure 5 by every weighting of the rows,
+    of the same machines.
     """
     return {
-        weights: full
-        if weights == "full"
-        else calibrate_cell(study, SET * MM, NOISE * MM, seed, trials, weights=weights)
+        weights: calibrate_cell(study, SET * MM, NOISE * MM, seed, trials, weights=weights)
         for weights in WEIGHTS
     }
 

@@ -13,12 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
+from loopcal.estimate.published_methods.plane_line_products import Layout
 from loopcal.measure import make_random_stream
 from loopcal.mechanism import POSITION, Mechanism, Solution, forward_trials, sample_workspace
 from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.steps import Layout
-from loopcal.planning.design import D, MovedDesign, PriorInformation, coordinate_exchange
+from loopcal.planning.design import MovedDesign
 from loopcal.planning.plane_line_groups import PlaneLineGroups
+from loopcal.planning.plane_line_planning import improve_groups
 from loopcal.typing import FloatArray
 
 ROBOT = "hexapod-nategh-agheli"
@@ -160,15 +161,7 @@ def plan_points(
     """
     planned = PlaneLineGroups(robot, points, MM, axes)
     first = planned.draw(groups, seed)
-    exchange = coordinate_exchange(
-        lambda _, design: planned.linearize(design),
-        first,
-        planned.list_levels(),
-        D(),
-        PriorInformation.none(len(planned.free)),
-        sweeps=sweeps,
-    )
-    return Study(robot, planned, first, exchange, seed)
+    return Study(robot, planned, first, improve_groups(planned, first, sweeps), seed)
 
 
 def compute_spread(rows: FloatArray) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,11 @@ from loopcal.diagnose.error_frames import fit_frames
 from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.measure import BlockStream, Trials, make_random_stream, simulate_trials
-from loopcal.mechanism import Mechanism, forward_trials
+from loopcal.mechanism import Mechanism, Status, forward_trials
 from loopcal.studies.simulation.effects import make_disturbance
 from loopcal.studies.simulation.fits import NOT_REACHED, FittedTrials, fit_trials, is_reached
+from loopcal.studies.simulation.held_points import measure_held_points
+from loopcal.studies.simulation.instruments import hide_columns
 from loopcal.studies.simulation.machines import draw_machines
 from loopcal.studies.simulation.preparation import PreparedCell, prepare_cell
 from loopcal.studies.specification.scores import list_columns
@@ -26,13 +29,32 @@ from loopcal.units import Dimension
 HELD_OUT = 4
 """Purpose of the random stream from which the errors of the readings of held-out poses come."""
 
+PARTS = {"position": slice(3, 6), "orientation": slice(0, 3)}
+"""Score -> its components of a twist."""
 
-def compute_scores(content: Mapping[str, Any]) -> FloatArray:
-    """Return the scores (B, s) of the content of a task."""
+
+@dataclass(frozen=True, eq=False)
+class CalibratedBlock:
+    """The calibrations of a block of trials, before they are scored."""
+
+    cell: PreparedCell
+    stream: BlockStream
+    trials: Trials
+    fits: FittedTrials
+
+
+def calibrate_block(content: Mapping[str, Any]) -> CalibratedBlock:
+    """Simulate and calibrate the machines of the content of a task."""
     cell = prepare_cell(content)
     stream = make_stream(cell.seed, content["block"])
     trials = simulate_block(cell, stream)
-    fits = fit_trials(cell, trials)
+    return CalibratedBlock(cell, stream, trials, fit_trials(cell, trials))
+
+
+def compute_scores(content: Mapping[str, Any]) -> FloatArray:
+    """Return the scores (B, s) of the content of a task."""
+    block = calibrate_block(content)
+    cell, stream, trials, fits = block.cell, block.stream, block.trials, block.fits
     scores = score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     for name in ("rank", "condition", "iterations", "noise_scale", "verdict"):
         scores[name] = getattr(fits, name)
@@ -56,10 +78,13 @@ def simulate_block(cell: PreparedCell, stream: BlockStream) -> Trials:
     if cell.scores.verdict:
         poses = np.concatenate([poses, cell.validated])
     truth = draw_machines(cell.robot, cell.errors, cell.trials, stream)
+    if cell.layout is not None:
+        return measure_held_points(cell.layout, truth, cell.instrument, stream)
     disturbance = make_disturbance(cell.robot, truth, poses, cell.effects, stream)
-    return simulate_trials(
+    trials = simulate_trials(
         cell.robot, truth, poses, cell.instrument, stream, disturbance=disturbance
     )
+    return hide_columns(trials, cell.unused)
 
 
 def score_poses(
@@ -80,9 +105,13 @@ def score_poses(
         error = _tool_errors(robot, T, truth.T)
         if not can_rotate(robot):
             error[..., :3] = np.nan
+        if cell.scores.frame == "both":
+            for name, part in PARTS.items():
+                size = np.linalg.norm(error[..., part], axis=2)
+                scores[f"{name}_base{when}"] = compute_rms(size)
         if cell.motions.shape[1]:
             error = error - _fit_motions(cell, trials, T, measured)
-        for name, part in (("position", slice(3, 6)), ("orientation", slice(0, 3))):
+        for name, part in PARTS.items():
             size = np.linalg.norm(error[..., part], axis=2)
             scores[name + when] = compute_rms(size)
             scores[f"{name}{when}_max"] = size.max(axis=1)
@@ -157,6 +186,9 @@ def _fit_motions(
     """
     robot, n = cell.robot, len(cell.measured)
     true, usable = trials.T[:, :n], trials.reached[:, :n]
+    if cell.layout is not None:  # the poses at the readings of the nominal robot
+        state = forward_trials(robot, trials.truth, cell.reference.q[None], cell.reference.state)
+        true, usable = state.T, state.status == Status.CONVERGED
     poses, places = (np.broadcast_to(a, (len(true), *a.shape[1:])) for a in (measured, T))
     errors = geometry.pose_difference(poses, true)
     explained = []

@@ -21,6 +21,7 @@ from loopcal.measure import Measurements, Trials
 from loopcal.mechanism import Status, differentiate_pose, forward, forward_trials
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.studies.simulation.preparation import PreparedCell
+from loopcal.studies.simulation.published_fits import PublishedFits, fit_published
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.workflow.calibration import calibrate
 from loopcal.workflow.calibration_options import CalibrationOptions
@@ -33,6 +34,7 @@ OUTCOMES: tuple[str, ...] = (
     "study.start-not-reached",
     "study.refused",
     "study.held-out-not-reached",
+    "study.diverged",
 )
 """Codes of the outcomes of a trial, by their number; new ones are added at the end."""
 
@@ -44,7 +46,10 @@ _OF_STATUS = {
     DescentStatus.RUNNING: 1,
     DescentStatus.NO_PROGRESS: 2,
 }
-REFUSED, NOT_REACHED = OUTCOMES.index("study.refused"), OUTCOMES.index("study.held-out-not-reached")
+REFUSED, NOT_REACHED, DIVERGED, EXHAUSTED = (
+    OUTCOMES.index(f"study.{name}")
+    for name in ("refused", "held-out-not-reached", "diverged", "out-of-iterations")
+)
 
 POSE_TIME = 60.0
 """Seconds from one pose to the next."""
@@ -88,7 +93,9 @@ class FittedTrials:
 def fit_trials(cell: PreparedCell, trials: Trials) -> FittedTrials:
     """Calibrate all trials."""
     options, scores = cell.fit_options, cell.scores
-    is_batch = options.loss is None and options.noise == "given"
+    if cell.method.is_published:
+        return describe_published(cell, fit_published(cell.method, cell.robot, trials, cell.layout))
+    is_batch = options.loss is None and options.noise == "given" and cell.layout is None
     if is_batch and not scores.verdict and scores.intervals == "stated":
         return fit_together(cell, trials)
     return fit_each(cell, trials)
@@ -112,6 +119,32 @@ def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
         iterations=fits.iterations.astype(float),
         noise_scale=compute_noise(plain.unexplained, plain.rows - plain.rank),
         verdict=np.full(len(trials), np.nan),
+    )
+
+
+def describe_published(cell: PreparedCell, fits: PublishedFits) -> FittedTrials:
+    """Return fits of a published method, whose intervals do not exist."""
+    t, free = len(fits.values), select_free_parameters(cell.robot)
+    is_known = np.isfinite(fits.values).all(axis=1)
+    values = np.where(is_known[:, None], fits.values, cell.robot.values)
+    state, measured = solve_cell_poses(cell, values)
+    outcome = np.where(fits.is_converged, 0, EXHAUSTED)
+    outcome = np.where(fits.is_diverged, DIVERGED, np.where(fits.is_refused, REFUSED, outcome))
+    lost = ~is_known[:, None, None, None]
+    nothing = np.full(t, np.nan)
+    return FittedTrials(
+        values=fits.values,
+        outcome=outcome,
+        T=np.where(lost, np.nan, state.T),
+        reached=is_reached(state),
+        T_measured=np.where(lost, np.nan, measured.T),
+        half_width=np.full((t, len(free)), np.nan),
+        expanded=np.full((*state.T.shape[:2], 2), np.nan),
+        rank=nothing if fits.rank is None else fits.rank.astype(float),
+        condition=nothing,
+        iterations=fits.iterations.astype(float),
+        noise_scale=nothing,
+        verdict=nothing,
     )
 
 
@@ -246,7 +279,7 @@ def _fit_one(cell: PreparedCell, data: Measurements) -> FittedTrials:
         fit = identify(cell.robot, data, options=cell.fit_options)
         if cell.scores.intervals == "adjusted":
             fit = adjust_uncertainty(fit, data)
-    U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=cell.scores.frame)
+    U = pose_uncertainty(fit, forward(fit.robot, cell.held_out.q), frame=cell.scores.error_frame)
     state, measured = solve_cell_poses(cell, fit.robot.values[None])
     test = fit.residual_test
     return FittedTrials(

@@ -59,7 +59,22 @@ def draw_machines(robot: Mechanism, errors: ErrorsLevel, n_trials: int, seed: Se
             values[table.index(name)] += deviation
         return np.tile(values, (n_trials, 1))
     truth = sample_truth(robot, n_trials, seed, errors.distribution)
-    return table.nominal + errors.error_factor * (truth - table.nominal)
+    drawn = truth - table.nominal
+    if errors.smallest:
+        drawn = raise_sizes(drawn, robot, errors.smallest)
+    return table.nominal + errors.error_factor * drawn
+
+
+def raise_sizes(drawn: FloatArray, robot: Mechanism, smallest: float) -> FloatArray:
+    """Return uniform errors (t, p) whose sizes lie between `smallest` times the largest one and the
+    largest one, with the same signs and standard deviations.
+    """
+    tolerance = np.nan_to_num(robot.parameters.tolerance)
+    largest = np.sqrt(3.0 / (1.0 + smallest + smallest**2)) * tolerance
+    share = np.abs(drawn) / np.where(tolerance > 0.0, np.sqrt(3.0) * tolerance, 1.0)
+    return np.sign(drawn) * np.where(
+        drawn == 0.0, 0.0, largest * (smallest + (1 - smallest) * share)
+    )
 
 
 def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[str, float]:

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.mechanism import sample_workspace
+from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.planning import PlanOptions, plan
+from loopcal.planning.plane_line_groups import PlaneLineGroups
+from loopcal.planning.plane_line_planning import improve_groups
 from loopcal.studies.simulation.instruments import make_instrument
 from loopcal.studies.simulation.machines import build_robot_of, change_tolerances
 from loopcal.studies.specification.keys import read_record
@@ -21,9 +23,13 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Scores,
 )
+from loopcal.typing import FloatArray
 
 TOLERANCES = ("tolerance_factor", "tolerances")
 """Settings of errors that change the tolerances, and with them planned poses."""
+
+SURFACE_SIGMA = 1e-3
+"""Noise for which points on surfaces are planned [m]; it does not change which are best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +70,8 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     seed = seed if level.seed is None else level.seed
     if level.coordinates:
         measured = np.array(level.coordinates)
+    elif level.is_on_surfaces:
+        measured = plan_plane_line_points(robot.nominal, level, seed)
     elif not is_planned(level):
         measured = sample_workspace(robot.nominal, level.count, seed).coordinates
     else:
@@ -76,6 +84,18 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
         chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)
         measured = chosen.poses.coordinates
     return CellPoses(measured.tolist(), held_out.tolist())
+
+
+def plan_plane_line_points(robot: Mechanism, level: PosesLevel, seed: int) -> FloatArray:
+    """Return coordinates (n, c) of points on planes and perpendicular lines; cells that differ in
+    tolerances, noise or method have the same points.
+    """
+    points = level.count // level.groups
+    planned = PlaneLineGroups(robot, points, SURFACE_SIGMA, (level.axis,))
+    drawn, equations = planned.draw(level.groups, seed), level.groups * (points - 2)
+    is_complete = equations >= len(planned.free)
+    design = improve_groups(planned, drawn, level.sweeps, is_complete).design
+    return planned.place_points(design).reshape(level.count, -1)
 
 
 def is_planned(level: PosesLevel) -> bool:

@@ -14,11 +14,13 @@ import numpy as np
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
 from loopcal.estimate import MAP, FitOptions
 from loopcal.estimate.identification import identify_trials
+from loopcal.estimate.published_methods.plane_line_products import Layout
 from loopcal.estimate.trial_posteriors import compute_trial_posterior
-from loopcal.measure import Instrument, Measurements, simulate_trials, solve_commanded_poses
+from loopcal.measure import Instrument, Measurements, Trials, simulate_trials, solve_commanded_poses
 from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.studies.simulation.effects import alter_noise
-from loopcal.studies.simulation.instruments import make_instrument
+from loopcal.studies.simulation.held_points import check_effects, make_layout, measure_held_points
+from loopcal.studies.simulation.instruments import hide_columns, make_instrument, place_instrument
 from loopcal.studies.simulation.machines import build_robot_of, change_tolerances
 from loopcal.studies.simulation.methods import make_fit_options
 from loopcal.studies.specification.keys import format_json, read_record
@@ -28,6 +30,7 @@ from loopcal.studies.specification.levels import (
     InstrumentLevel,
     MethodLevel,
     NoiseLevel,
+    PosesLevel,
     Scores,
 )
 from loopcal.typing import FloatArray
@@ -46,7 +49,8 @@ class PreparedCell:
     Attributes
     ----------
     robot : nominal, with the tolerances of the cell. instrument : with its true noise.
-    errors, effects, scores, fit_options : of the cell.
+    errors, effects, scores, method, fit_options : of the cell. unused : measured columns that the
+        fit does not get. layout : points that are held on planes and lines; None for other poses.
     measured, validated : (n, c), (h, c) controlled coordinates of measured and held-out poses.
     held_out : solution of the nominal robot at the held-out poses.
     motions : (12, k) motions of the base and platform frames that are fitted before errors are
@@ -61,6 +65,9 @@ class PreparedCell:
     errors: ErrorsLevel
     effects: EffectsLevel
     scores: Scores
+    method: MethodLevel
+    unused: tuple[str, ...]
+    layout: Layout | None
     fit_options: FitOptions
     measured: FloatArray
     validated: FloatArray
@@ -88,11 +95,25 @@ def _prepare(text: str) -> PreparedCell:
     errors = read_record(ErrorsLevel, content["errors"])
     robot = change_tolerances(build_robot_of(content["robot"]), errors).nominal
     noise = read_record(NoiseLevel, content["noise"])
-    instrument = make_instrument(read_record(InstrumentLevel, content["instrument"]), noise)
+    level = read_record(InstrumentLevel, content["instrument"])
+    measured = np.array(content["measured"])
+    poses = read_record(PosesLevel, content["poses"])
+    instrument = place_instrument(make_instrument(level, noise), robot, poses, measured)
+    method = read_record(MethodLevel, content["method"])
     effects = read_record(EffectsLevel, content["effects"])
     scores = read_record(Scores, content["scores"])
-    measured = np.array(content["measured"])
-    motions = find_fitted_motions(robot, instrument, measured, scores.frame)
+    layout = make_layout(robot, measured, poses.groups) if poses.is_on_surfaces else None
+    motions = np.zeros((12, 0))
+    if scores.error_frame != BASE:
+        nominal = robot.values[None]
+        if layout is None:
+            exact = simulate_trials(robot, nominal, measured, instrument, 0)
+            exact = hide_columns(exact, level.unused)
+        else:
+            check_effects(effects)
+            exact = measure_held_points(layout, nominal, instrument, 0, is_exact=True)
+            exact = replace(exact, recorded=None)
+        motions = find_fitted_motions(robot, exact)
     commanded = solve_commanded_poses(robot, measured)
     return PreparedCell(
         robot,
@@ -100,7 +121,10 @@ def _prepare(text: str) -> PreparedCell:
         errors,
         effects,
         scores,
-        make_fit_options(read_record(MethodLevel, content["method"])),
+        method,
+        level.unused,
+        layout,
+        make_fit_options(method),
         measured,
         np.array(content["held_out"]),
         inverse(robot, content["held_out"]),
@@ -111,16 +135,10 @@ def _prepare(text: str) -> PreparedCell:
     )
 
 
-def find_fitted_motions(
-    robot: Mechanism, instrument: Instrument, measured: FloatArray, frame: str
-) -> FloatArray:
-    """Return the motions (12, k) of frames that are fitted before errors are stated: those that the
-    measurements of the nominal robot do not determine; none in the frame "base", or where no
-    parameter moves these frames.
+def find_fitted_motions(robot: Mechanism, trials: Trials) -> FloatArray:
+    """Return the motions (12, k) of frames that are fitted before errors are stated: those that
+    measurements of the nominal robot do not determine; none where no parameter moves these frames.
     """
-    if frame == BASE:
-        return np.zeros((12, 0))
-    trials = simulate_trials(robot, robot.values[None], measured, instrument, 0)
     fits = identify_trials(robot, trials, MAP())
     posterior = compute_trial_posterior(fits, trials, 0)
     is_moved = choose_error_frame(posterior).fitted

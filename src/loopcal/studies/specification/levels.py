@@ -28,7 +28,13 @@ FACTORS: Mapping[str, str] = {
 MOST_POSES = 10_000
 """Largest number of measured or held-out poses of a trial."""
 
-MethodName = Literal["auto", "map", "least-squares", "ridge", "truncated-svd"]
+MOST_STEPS = 1_000_000
+"""Largest number of steps of a raw fit."""
+
+MOST_SWEEPS, FEWEST_POINTS = 100, 4
+"""Largest number of sweeps of an exchange; smallest number of points of a plane with its line."""
+
+MethodName = Literal["auto", "map", "least-squares", "ridge", "truncated-svd", "per-leg"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,8 @@ class InstrumentLevel:
         length and each angle, by default 10 um and 50 urad.
     unknown_frames : which of "base" and "tool" the fit estimates. distribution : of the noise; a
         sigma is its standard deviation in both, so uniform noise lies within sqrt(3) of it.
+    unused : measured columns that the fit does not get, such as psi. The noise of the others is the
+        same as without it, so that two such instruments are compared on the same measurements.
     """
 
     kinds: tuple[str, ...] = ("pose",)
@@ -59,6 +67,7 @@ class InstrumentLevel:
     sigma_angle: Angle = 5e-5
     unknown_frames: tuple[str, ...] = ()
     distribution: Distribution = "normal"
+    unused: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _require(self.sigma_position > 0.0, "sigma_position", self.sigma_position, "above 0 m")
@@ -83,15 +92,22 @@ class PosesLevel:
     Parameters
     ----------
     count : number of poses. choice : "random" draws them evenly from the workspace, "planned" plans
-        them for the robot and the instrument. seed : of the draw or the plan; by default that of
-        the study. Every trial of a cell measures the same poses.
+        them for the robot and the instrument, "plane-line" puts them on planes and perpendicular
+        lines for an instrument of the kinds plane and line. seed : of the draw or the plan; by
+        default that of the study. Every trial of a cell measures the same poses.
+    groups : planes with a line each, for "plane-line"; count is the number of all their points.
+    axis : along which their lines run. sweeps : of the coordinate exchange that improves the
+        points; 0 leaves them as drawn.
     file : CSV file of poses beside the study file, in place of these settings.
     coordinates : (n, c) controlled coordinates [m, rad] of that file.
     """
 
     PLAIN: ClassVar[str] = "count"
     count: int = 40
-    choice: Literal["random", "planned"] = "random"
+    choice: Literal["random", "planned", "plane-line"] = "random"
+    groups: int = 10
+    axis: Literal["x", "y", "z"] = "z"
+    sweeps: int = 3
     seed: int | None = None
     file: str | None = None
     coordinates: tuple[tuple[float, ...], ...] = ()
@@ -99,6 +115,19 @@ class PosesLevel:
     def __post_init__(self) -> None:
         _require(1 <= self.count <= MOST_POSES, "count", self.count, f"from 1 to {MOST_POSES}")
         _require(self.seed is None or self.seed >= 0, "seed", self.seed, "0 or more")
+        _require(0 <= self.sweeps <= MOST_SWEEPS, "sweeps", self.sweeps, f"0 to {MOST_SWEEPS}")
+        if self.choice == "plane-line":
+            whole = self.groups >= 1 and self.count % self.groups == 0
+            if not whole or self.count < FEWEST_POINTS * self.groups:
+                raise ValueError(
+                    f"{self.count} points do not make {self.groups} equal groups of at least "
+                    f"{FEWEST_POINTS}; change count or groups"
+                )
+
+    @property
+    def is_on_surfaces(self) -> bool:
+        """Whether the poses are points of planes and perpendicular lines."""
+        return self.choice == "plane-line"
 
 
 @dataclass(frozen=True)
@@ -111,6 +140,8 @@ class ErrorsLevel:
     error_factor : true errors over tolerances, which the fit does not know.
     distribution : of the errors; a tolerance is their standard deviation in both. Uniform errors
         lie within sqrt(3) of it.
+    smallest : smallest size of a uniform error as a share of its largest; the tolerance stays its
+        standard deviation.
     tolerances : other tolerances by name of a parameter or by pattern, such as `leg*.length`.
     deviations : the same true deviations from nominal in all trials, by name or pattern; other
         parameters are nominal.
@@ -120,12 +151,16 @@ class ErrorsLevel:
     tolerance_factor: float = 1.0
     error_factor: float = 1.0
     distribution: Distribution = "normal"
+    smallest: float = 0.0
     tolerances: Mapping[str, str] = field(default_factory=dict)
     deviations: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _require(self.tolerance_factor > 0, "tolerance_factor", self.tolerance_factor, "above 0")
         _require(self.error_factor >= 0, "error_factor", self.error_factor, "0 or more")
+        _require(0 <= self.smallest < 1, "smallest", self.smallest, "0 or more, and less than 1")
+        if self.smallest and self.distribution != "uniform":
+            raise ValueError("smallest belongs to uniform errors; add 'distribution: uniform'")
         is_drawn = self.error_factor != 1.0 or self.distribution != "normal"
         if self.deviations and is_drawn:
             raise ValueError(
@@ -141,9 +176,17 @@ class MethodLevel:
     Parameters
     ----------
     method : "auto" is the default of `identify`, see `loopcal.estimate.methods.penalties`.
+        "per-leg" identifies a hexapod leg by leg from full poses, as a published study does.
     lam : weight of the penalty of ridge. keep : directions of truncated-svd. Both are chosen by
         cross-validation where they are not stated.
     loss, noise : as in `FitOptions`.
+    rows : "raw" gives all rows and parameters the weight one in millimeters and radians, takes full
+        steps and filters the step, as published studies do; least-squares then has no rank
+        detection, and ridge and truncated-svd need `lam` and `keep`. "products" takes products of
+        points on planes and lines with their covariance, and "products-printed" with the weight
+        one, as another study does. For comparisons.
+    epsilon : largest component of a step [mm, rad] at which raw and per-leg fits end; 1e-6 by
+        default. steps : of these fits, at most; without epsilon, exactly.
     """
 
     PLAIN: ClassVar[str] = "method"
@@ -152,8 +195,27 @@ class MethodLevel:
     keep: int | None = None
     loss: Literal["none", "huber", "tukey"] = "none"
     noise: Literal["given", "estimated"] = "given"
+    rows: Literal["weighted", "raw", "products", "products-printed"] = "weighted"
+    epsilon: float | None = None
+    steps: int | None = None
+
+    @property
+    def is_published(self) -> bool:
+        """Whether the method is one of published studies, without uncertainties."""
+        return self.rows != "weighted" or self.method == "per-leg"
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether the fit takes full steps until they are small."""
+        return self.rows == "raw" or self.method == "per-leg"
+
+    @property
+    def is_of_products(self) -> bool:
+        """Whether the rows are products of points on planes and lines."""
+        return self.rows.startswith("products")
 
     def __post_init__(self) -> None:
+        self._check_published()
         for key, value, method in (
             ("lam", self.lam, "ridge"),
             ("keep", self.keep, "truncated-svd"),
@@ -164,6 +226,32 @@ class MethodLevel:
                     "change the method"
                 )
             _require(value is None or value >= 0, key, value, "0 or more")
+
+    def _check_published(self) -> None:
+        """Refuse settings that methods of published studies do not have, or alone have."""
+        if not self.has_steps:
+            for key in ("epsilon", "steps"):
+                if getattr(self, key) is not None:
+                    raise ValueError(
+                        f"{key} belongs to 'rows: raw' and to the method per-leg; remove it"
+                    )
+        if not self.is_published:
+            return
+        what = "the method per-leg" if self.method == "per-leg" else f"'rows: {self.rows}'"
+        if self.loss != "none" or self.noise != "given":
+            raise ValueError(f"{what} has no loss and no estimated noise; remove them")
+        if self.method == "per-leg" and self.rows != "weighted":
+            raise ValueError("the rows of per-leg are raw ones always; remove 'rows'")
+        needed = {"ridge": "lam", "truncated-svd": "keep"}.get(self.method)
+        if needed is not None and getattr(self, needed) is None:
+            raise ValueError(f"{self.method} with {what} needs {needed}; add it")
+        if self.method == "auto" or (self.method == "map" and self.rows == "raw"):
+            raise ValueError(
+                f"{self.method} needs weighted rows; remove {what}, or take another method"
+            )
+        _require(self.epsilon is None or self.epsilon > 0, "epsilon", self.epsilon, "above 0")
+        most = f"1 to {MOST_STEPS}"
+        _require(self.steps is None or 1 <= self.steps <= MOST_STEPS, "steps", self.steps, most)
 
 
 @dataclass(frozen=True)
@@ -236,7 +324,8 @@ class Scores:
     Parameters
     ----------
     held_out : number of poses at which the errors are computed; they are drawn from the workspace
-        and are not measured. frame : in which the errors are stated, "fitted" or "base".
+        and are not measured. frame : in which the errors are stated, "fitted" or "base"; "both"
+        states the fitted ones, and those in the base frame as further scores.
     intervals : "stated" computes them from the stated noise, for all trials of a block at once.
         "adjusted" computes them as a calibration does, which also uses what the residuals say about
         the noise; trials are then fitted one by one, which takes longer.
@@ -246,11 +335,16 @@ class Scores:
     """
 
     held_out: int = 20
-    frame: Literal["fitted", "base"] = "fitted"
+    frame: Literal["fitted", "base", "both"] = "fitted"
     intervals: Literal["stated", "adjusted"] = "stated"
     verdict: bool = False
     limit_position: Length | None = None
     limit_angle: Angle | None = None
+
+    @property
+    def error_frame(self) -> Literal["fitted", "base"]:
+        """Frame of the scores that every study has."""
+        return "base" if self.frame == "base" else "fitted"
 
     def __post_init__(self) -> None:
         _require(1 <= self.held_out <= MOST_POSES, "held_out", self.held_out, f"1 to {MOST_POSES}")

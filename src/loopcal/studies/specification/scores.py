@@ -57,10 +57,19 @@ VERDICT_COLUMNS = (
 )
 """Further columns of a study that calibrates every trial in full."""
 
+BASE_COLUMNS = (
+    ScoreColumn("position_base_before", "m", "position error before, in the base frame, rms"),
+    ScoreColumn("position_base", "m", "position error after, in the base frame, rms"),
+    ScoreColumn("orientation_base_before", "rad", "rotation error before, in the base frame, rms"),
+    ScoreColumn("orientation_base", "rad", "rotation error after, in the base frame, rms"),
+)
+"""Further columns of a study that states errors in both frames."""
+
 
 def list_columns(scores: Scores) -> tuple[ScoreColumn, ...]:
     """Return the columns of the results of trials."""
-    return (*COLUMNS, *(VERDICT_COLUMNS if scores.verdict else ()))
+    verdict = VERDICT_COLUMNS if scores.verdict else ()
+    return (*COLUMNS, *verdict, *(BASE_COLUMNS if scores.frame == "both" else ()))
 
 
 MORE_IS_BETTER = ("covered_", "rank")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's equations (9) to (18), many machines at once.
+"""Products of points on planes and perpendicular lines, as a published study identifies a hexapod
+from points that a coordinate measuring machine holds; many machines at once.
 
     (14) (p_i - p_0)'(p_1 - p_0) = 0
          points i on a plane, the line from p_0 to p_1 perpendicular to it
@@ -14,7 +15,7 @@ rows are correlated: noise dp of the points moves row i by B dp,
     d(d_i'd_1) = d_1'dp_i + d_i'dp_1 - (d_1 + d_i)'dp_0
 
 and the covariance of the rows is B S B'. The paper gives every row weight one. A'A is singular, see
-GAUGE_NAMES in machines.py: least squares here takes the smallest deviation along unobservable
+the study `cmm-constraint-2011`: least squares here takes the smallest deviation along unobservable
 directions. Derivation, and why this equals surfaces as unknowns: docs/theory/constraint.md.
 """
 
@@ -26,6 +27,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from loopcal import geometry
 from loopcal.engine import State
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.descent import Descent, FunctionProblem, StepControl, descend
@@ -54,7 +56,7 @@ class Layout:
 
     Attributes
     ----------
-    robot : as designed; the origin of its platform is the end point. coordinates : (g, k, 6)
+    robot : as designed; the origin of its tool is the end point. coordinates : (g, k, 6)
         controlled [m, rad] of g groups: p_0, p_1 on the line, the others in the plane.
     """
 
@@ -87,9 +89,24 @@ class Layout:
         return inverse_trials(self.robot, self.robot.parameters.nominal[None], self.flat[None])
 
     @cached_property
+    def commanded_readings(self) -> FloatArray:
+        """(n, a) readings of the machine as designed at the points."""
+        return compute_readings(self.robot, self.robot.parameters.nominal[None], self.state)[0]
+
+    @cached_property
     def levers(self) -> tuple[FloatArray, FloatArray]:
         """d_1 (g, 3) and d_i (g, k - 2, 3) [m] as commanded."""
-        return compute_levers(self.state.T[0, :, :3, 3].reshape(self.groups, -1, 3))
+        points = (self.state.T[0] @ self.robot.tool)[:, :3, 3]
+        return compute_levers(points.reshape(self.groups, -1, 3))
+
+    def hold_points(self, truth: FloatArray, noise: FloatArray) -> tuple[State, FloatArray]:
+        """Return states (t, n) and readings (t, n, a) of true machines (t, p) [SI] whose end point
+        is held where it was commanded to, but for noise (t, n, 3) [m].
+        """
+        target = np.repeat(self.flat[None], len(truth), axis=0)
+        target[:, :, [self.robot.controlled.index(name) for name in POSITION]] += noise
+        state = inverse_trials(self.robot, truth, target, self.state)
+        return state, compute_readings(self.robot, truth, state)
 
     def solve_readings(self, truth: FloatArray, sigma: float, seed: int) -> FloatArray:
         """Return readings (t, n, a) at which true machines (t, p) [SI] hold the coordinates of the
@@ -105,11 +122,7 @@ class Layout:
                 for trial in range(len(truth))
             ]
         )
-        target = np.repeat(self.flat[None], len(truth), axis=0)
-        target[:, :, [self.robot.controlled.index(name) for name in POSITION]] += sigma * noise
-        return compute_readings(
-            self.robot, truth, inverse_trials(self.robot, truth, target, self.state)
-        )
+        return self.hold_points(truth, sigma * noise)[1]
 
     def linearize_points(
         self, values: FloatArray, q: FloatArray
@@ -118,12 +131,14 @@ class Layout:
         reach all of them (t,).
         """
         state = forward_trials(self.robot, values, q, self.state)
-        D = differentiate_pose(self.robot, values, q, state).parameters[:, :, 3:]
+        by_twist = differentiate_pose(self.robot, values, q, state).parameters
+        arm = state.T[:, :, :3, :3] @ self.robot.tool[:3, 3]
+        D = by_twist[:, :, 3:] - geometry.hat(arm) @ by_twist[:, :, :3]
         shape = (len(values), self.groups, -1, 3)
         reached = np.all(state.status == Status.CONVERGED, axis=1) & np.isfinite(D).all(
             axis=(1, 2, 3)
         )
-        return state.T[:, :, :3, 3].reshape(shape), D.reshape(*shape, D.shape[3]), reached
+        return (state.T[:, :, :3, 3] + arm).reshape(shape), D.reshape(*shape, D.shape[3]), reached
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,14 +147,14 @@ class PaperRows:
 
     Attributes
     ----------
-    layout : the points. q : (t, n, a) readings. sd : of a parameter, in which deviations are
-        counted [m].
+    layout : the points. q : (t, n, a) readings. sd : of all parameters or of each (p,) [SI], in
+        which deviations are counted; 0 keeps a parameter at its nominal value.
     weights : of the rows. sigma : of the noise of a point [m].
     """
 
     layout: Layout
     q: FloatArray
-    sd: float
+    sd: float | FloatArray
     sigma: float
     weights: Weights = "full"
 
