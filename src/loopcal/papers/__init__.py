@@ -3,7 +3,8 @@
 computed ones.
 
 One folder a paper: `published.yaml` (the printed numbers and statements, with their place),
-`text.yaml` (claims, captions, sentences), `steps.py` (what the paper does) and `study.py` with
+`text.yaml` (claims, captions, sentences), `study.yaml` (its simulation as a study file, see
+`loopcal study new --paper`), `steps.py` (what the paper does) and `study.py` with
 
     compute(seed, trials, progress) -> results, with `results.printed` as read from published.yaml
     present(results, seed) -> comparisons, tables, verdicts, figures
@@ -36,12 +37,15 @@ class Paper:
     ----------
     name : on the command line. title, source : what it is and where it stands.
     module : of `compute` and `present`; imported when it is run.
+    studies : robot -> its study file in the folder of the paper; that of the first one is adapted
+        to other robots.
     """
 
     name: str
     title: str
     source: str
     module: str
+    studies: Mapping[str, str]
 
     def run(
         self, seed: int = 0, trials: int = TRIALS, progress: Callable[[str], None] | None = None
@@ -87,6 +91,7 @@ PAPERS: Mapping[str, Paper] = {
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
             "DOI known to us",
             "loopcal.papers.hexapod_42.study",
+            {"hexapod-42": "study.yaml"},
         ),
         Paper(
             "tsvd-2016",
@@ -94,6 +99,7 @@ PAPERS: Mapping[str, Paper] = {
             "RU-PUS-PRS manipulator",
             "Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908",
             "loopcal.papers.tsvd_2016.study",
+            {"3-prs": "study_3_prs.yaml", "ru-pus-prs": "study_ru_pus_prs.yaml"},
         ),
         Paper(
             "cmm-constraint-2011",
@@ -101,6 +107,7 @@ PAPERS: Mapping[str, Paper] = {
             "coordinate measuring machine",
             "International Journal of Advanced Robotic Systems 2011, doi:10.5772/45684",
             "loopcal.papers.cmm_constraint_2011.study",
+            {"hexapod-nategh-agheli": "study.yaml"},
         ),
     )
 }

@@ -49,26 +49,63 @@ def study() -> None:
 
 @study.command()
 @click.argument("study_file", metavar="STUDY", type=FILE)
-@click.option("--robot", default="linear-delta", metavar="ROBOT", help="A robot, or its file.")
+@click.option(
+    "--robot",
+    metavar="ROBOT",
+    help="A robot, or its file.  [default: linear-delta, or that of PAPER]",
+)
+@click.option("--paper", metavar="PAPER", help="Write the study of a paper that reproduce repeats.")
 @force_option("STUDY")
 @json_option
-def new(study_file: Path, robot: str, force: bool, as_json: bool) -> None:
+def new(study_file: Path, robot: str | None, paper: str | None, force: bool, as_json: bool) -> None:
     """Write a study file to fill in, with a comment for each setting.
+
+    With --paper, write the study of a paper: its errors, noises and methods. --robot replaces its
+    robot.
 
     \b
     Examples:
       loopcal study new study.yaml
       loopcal study new study.yaml --robot hexapod-42
+      loopcal study new study.yaml --paper cmm-constraint-2011 --robot hexapod-42
     """  # noqa: D301
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.studies.files.template import write_template
 
+    if paper is not None:
+        _write_paper_study(study_file, paper, robot, force, as_json)
+        return
+    robot = "linear-delta" if robot is None else robot
     refuse_outputs((study_file,), (), force)
     write_template(study_file, robot)
     if as_json:
         terminal.print_json({"written": str(study_file), "robot": robot})
         return
     terminal.print_page([f"Written: {study_file}", f"Next: loopcal study check {study_file}"])
+
+
+def _write_paper_study(
+    study_file: Path, paper: str, robot: str | None, force: bool, as_json: bool
+) -> None:
+    """Write the study of a paper and report its files."""
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.papers import paper as find_paper
+    from loopcal.papers.paper_studies import make_paper_study
+
+    made = make_paper_study(find_paper(paper), study_file, robot)
+    refuse_outputs(made.outputs, (), force)
+    made.write()
+    if as_json:
+        written = [str(path) for path in made.outputs]
+        terminal.print_json(
+            {"written": written, "paper": paper, "robot": made.robot, "replaced": made.replaced}
+        )
+        return
+    page = [f"Written: {', '.join(map(str, made.outputs))}"]
+    if made.replaced:
+        keys = " and ".join(made.replaced)
+        page.append(f"The {keys} of the paper belong to its robot and were replaced, too.")
+    terminal.print_page([*page, f"Next: loopcal study check {study_file}"])
 
 
 @study.command()

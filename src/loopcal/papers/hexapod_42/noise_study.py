@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, LeastSquares, identify_trials
-from loopcal.estimate.published_methods.per_leg import LegForm, identify_per_leg
+from loopcal.estimate.published_methods.per_leg import LegForm
 from loopcal.measure import (
     Instrument,
     Pose,
@@ -24,14 +23,24 @@ from loopcal.papers.hexapod_42.published import MM, TO_PRINTED, Published, to_va
 from loopcal.papers.hexapod_42.steps import (
     Study,
     compute_actual_poses,
-    draw_measured_poses,
     integrate_errors,
     iterate,
     name_orientation,
+    subtract_poses,
+    to_coordinates,
     to_transforms,
     to_twists,
 )
+from loopcal.papers.paper_studies import load_paper_study
 from loopcal.papers.printed import Cell
+from loopcal.studies import Study as PaperStudy
+from loopcal.studies.simulation.calibrated_cells import (
+    CalibratedCell,
+    calibrate_cells,
+    find_cells,
+    set_size,
+)
+from loopcal.studies.specification.levels import PosesLevel
 from loopcal.typing import BoolArray, FloatArray
 
 STATED = (1e-3, 1e-6)
@@ -41,9 +50,13 @@ unit that its Table 6 prints, 0.001 mrad.
 PRESUMED = (1e-6, 1e-9)
 """Limits [mm, rad] of the noise with which Tables 5 and 6 agree, as the sweep shows."""
 LEVELS = (
-    STATED, (1e-4, 1e-7), (1e-5, 1e-8), (1e-6, 0.0), PRESUMED, (1e-6, 5e-9), (1e-6, 1e-6),
+    STATED, (1e-4, 1e-7), (1e-5, 1e-8), (1e-6, 1e-12), PRESUMED, (1e-6, 5e-9), (1e-6, 1e-6),
     (1e-7, 1e-10),
 )  # fmt: skip
+"""Limits [mm, rad] of the instruments of study.yaml."""
+PER_LEG = ("per leg, 1 step", "per leg, 2 steps", "per leg, 3 steps")
+TOGETHER, PRIOR = "least squares", "MAP"
+"""Methods of study.yaml."""
 NARROW, WIDE = "as in the paper", "wide"
 RANGES = {
     NARROW: ((-10.0, -10.0, 200.0, -3.0, -3.0, -3.0), (10.0, 10.0, 210.0, 3.0, 3.0, 3.0)),
@@ -109,19 +122,43 @@ def sweep_noise(
     study: Study, iterations: int, threshold: float, seed: int, trials: int
 ) -> tuple[Level, ...]:
     """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
-    levels = []
+    levels, whole = [], set_size(load_paper_study(__file__), seed, trials)
     for limits in LEVELS:
-        sizes, needed = [], []
-        for trial in range(trials):
-            measured = draw_measured_poses(study, to_si(limits), seed, trial)
-            run = iterate(study, measured, limit=iterations + 1)
-            residual = run.pose_errors[iterations]
-            error = run.compute_parameter_errors(study.truth)[iterations]
-            rms = [_compute_rms(x) for x in (residual[:, :3] / MM, residual[:, 3:], error / MM)]
-            sizes.append([*rms, run.integrated[iterations]])
-            needed.append(run.count_needed(threshold) or np.inf)
-        levels.append(Level(limits, np.array(sizes), np.array(needed)))
+        integrated, sizes = [], np.zeros((trials, 4))
+        for i, cell in enumerate(calibrate_methods(whole, limits, PER_LEG)):
+            residual = compute_residuals(study, cell)
+            integrated.append([integrate_errors(of_trial[None])[0] for of_trial in residual])
+            if i + 1 == iterations:
+                parts = residual[..., :3] / MM, residual[..., 3:]
+                error = (study.truth.values - cell.values)[:, None] / MM
+                rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in (*parts, error)]
+                sizes = np.column_stack([*rms, integrated[-1]])
+        met = np.array(integrated) <= threshold
+        needed = np.where(met.any(axis=0), 1.0 + met.argmax(axis=0), np.inf)
+        levels.append(Level(limits, sizes, needed))
     return tuple(levels)
+
+
+def calibrate_methods(
+    whole: PaperStudy, limits: tuple[float, float], methods: Sequence[str]
+) -> Iterator[CalibratedCell]:
+    """Yield the cells of a study with one level of noise, method by method."""
+    instrument = f"{limits[0]:g} mm and {limits[1]:g} rad"
+    for method in methods:
+        yield from calibrate_cells(whole, find_cells(whole, instrument=instrument, method=method))
+
+
+def compute_residuals(study: Study, cell: CalibratedCell) -> FloatArray:
+    """Return measured minus corrected poses (t, n, 6) [m, rad]; NaN where there is no estimate."""
+    commanded = study.commanded
+    T = forward_trials(study.robot, cell.values, commanded.q[None], commanded.state).T
+    measured = np.roll(cell.measured[0], 3, axis=2)  # a kind has its angles first
+    return np.stack(
+        [
+            subtract_poses(poses, to_coordinates(reached, study.order))
+            for poses, reached in zip(measured, T, strict=True)
+        ]
+    )
 
 
 def list_levels(levels: tuple[Level, ...], published: FloatArray) -> list[tuple[Cell, ...]]:
@@ -143,13 +180,13 @@ def find_level(levels: tuple[Level, ...], limits: tuple[float, float]) -> Level:
 
 def compare_methods(study: Study, seed: int, trials: int) -> tuple[MethodResult, ...]:
     """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
-    simulated = simulate_stated_noise(study, seed, trials)
-    together, prior = (
-        identify_trials(study.robot, simulated, method).values for method in (LeastSquares(), MAP())
+    whole = set_size(load_paper_study(__file__), seed, trials)
+    alone, together, prior = (
+        cell.values for cell in calibrate_methods(whole, STATED, (PER_LEG[-1], TOGETHER, PRIOR))
     )
     values = {
         "not calibrated": study.robot.values[None],
-        "leg by leg, unweighted (the paper)": _identify_per_leg(study, simulated),
+        "leg by leg, unweighted (the paper)": alone,
         "all legs, weighted by the noise": together,
         "the same with tolerances as prior (MAP)": prior,
     }
@@ -174,15 +211,13 @@ def compare_poses(study: Study, threshold: float, seed: int, trials: int) -> lis
     for name, counts in ((NARROW, (20, 40)), (WIDE, (10, 20, 40))):
         sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
     rows: list[tuple[Cell, ...]] = []
+    whole, methods = set_size(load_paper_study(__file__), seed, trials), (PER_LEG[-1], TOGETHER)
     for name, poses in sets:
         other = Study(study.robot, study.truth, poses, study.order)
         exact = iterate(other, compute_actual_poses(other))
-        simulated = simulate_stated_noise(other, seed, trials)
-        together = identify_trials(study.robot, simulated, LeastSquares()).values
-        errors = [
-            _compute_rms((values - study.truth.values) / MM)
-            for values in (_identify_per_leg(other, simulated), together)
-        ]
+        level = PosesLevel(len(poses), coordinates=tuple(map(tuple, poses.tolist())))
+        cells = calibrate_methods(replace(whole, poses={name: level}), STATED, methods)
+        errors = [_compute_rms((cell.values - study.truth.values) / MM) for cell in cells]
         needed, condition = exact.count_needed(threshold), float(exact.conditions.max())
         left = _compute_rms(exact.compute_parameter_errors(study.truth)[-1] / MM)
         rows.append((name, len(poses), needed, left, condition, *errors))
@@ -227,17 +262,6 @@ def draw_poses(name: str, n: int, seed: int) -> FloatArray:
     """Return poses (n, 6) [m, rad] drawn uniformly in one of RANGES."""
     low, high = (np.array(end) * np.array([MM] * 3 + [np.pi / 180.0] * 3) for end in RANGES[name])
     return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
-
-
-def _identify_per_leg(study: Study, simulated: Trials) -> FloatArray:
-    """Return values (t, p); NaN where a corrected machine cannot reach the poses."""
-    values = []
-    for trial in range(len(simulated)):
-        try:
-            values.append(identify_per_leg(study.robot, simulated.trial(trial)).robot.values)
-        except EstimationError:
-            values.append(np.full(len(study.robot.parameters), np.nan))
-    return np.array(values)
 
 
 def _compute_position_error(study: Study, values: FloatArray, other: Study) -> float:

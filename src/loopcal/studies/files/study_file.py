@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from loopcal.errors import LoopcalError
+from loopcal.errors import DataError, LoopcalError
 from loopcal.io.core import limits
 from loopcal.io.core.records import read_record
 from loopcal.io.core.references import find_file_beside
@@ -16,7 +16,8 @@ from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unkn
 from loopcal.io.data.measurement_file import load_poses
 from loopcal.io.robot.robot_file import check_format, find_robot_file, get_source, load_robot
 from loopcal.mechanism import Mechanism
-from loopcal.studies.simulation.instruments import make_instrument
+from loopcal.studies.simulation.held_points import check_effects
+from loopcal.studies.simulation.instruments import check_surfaces, make_instrument
 from loopcal.studies.simulation.machines import resolve_patterns
 from loopcal.studies.simulation.methods import make_fit_options
 from loopcal.studies.specification.levels import (
@@ -264,7 +265,8 @@ def check_levels(study: Study, robots: Mapping[str, Mechanism], content: StudyCo
     """Refuse levels that no block could be computed with, at their lines."""
     for key, check in (
         ("instruments", lambda level: make_instrument(level, NoiseLevel())),
-        ("methods", make_fit_options),
+        ("poses", lambda level: _check_surfaces(level, study)),
+        ("methods", lambda level: _check_method(level, study)),
         ("errors", lambda level: _check_errors(level, robots)),
         ("questions", lambda question: check_question(study, question)),
     ):
@@ -276,6 +278,33 @@ def check_levels(study: Study, robots: Mapping[str, Mechanism], content: StudyCo
                 check(level)
             except LoopcalError as error:
                 raise content.file.error(f"{name!r} of {key!r}: {error}", (*place, *step)) from None
+
+
+def _check_surfaces(level: PosesLevel, study: Study) -> None:
+    """Raise DataError where points on planes and lines, and instruments and effects do not fit."""
+    for instrument in study.instruments.values():
+        if level.is_on_surfaces:
+            check_surfaces(make_instrument(instrument, NoiseLevel()))
+    if level.is_on_surfaces:
+        for effects in study.effects.values():
+            check_effects(effects)
+        if study.scores.verdict:
+            raise DataError("points on planes and lines are studied without a verdict; remove it")
+
+
+def _check_method(level: MethodLevel, study: Study) -> None:
+    """Raise DataError where a method of published studies does not fit the poses or the scores."""
+    make_fit_options(level)
+    if level.is_of_products and not all(poses.is_on_surfaces for poses in study.poses.values()):
+        raise DataError(
+            f"'rows: {level.rows}' needs points on planes and lines; write 'choice: plane-line' "
+            "for all poses, or remove it"
+        )
+    if level.is_published and (study.scores.verdict or study.scores.intervals == "adjusted"):
+        raise DataError(
+            "methods of published studies have neither a verdict nor intervals; remove 'verdict' "
+            "and 'intervals' of the scores"
+        )
 
 
 def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:

@@ -28,12 +28,31 @@ def write_template(path: Path, robot: str) -> None:
     ------
     FileError : there is no such robot, or the file cannot be written.
     """
+    text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
+    write_study_text(path, text.replace(f"[{PLACE}]", f"[{quote_robot(path, robot)}]"))
+
+
+def quote_robot(path: Path, robot: str) -> str:
+    """Return how a study file names a robot: a shipped one by its name, another one by its file,
+    relative to the study file.
+
+    Raises
+    ------
+    FileError : there is no such robot.
+    """
     file, name = find_robot_file(robot), robot
     if robot not in list_shipped_robots():
         name = Path(os.path.relpath(file, path.parent)).as_posix()
-    text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
-    quoted = name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)
-    text = text.replace(f"[{PLACE}]", f"[{quoted}]")
+    return name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)
+
+
+def write_study_text(path: Path, text: str) -> None:
+    """Write the text of a study file, which is read back as a study.
+
+    Raises
+    ------
+    FileError : it is no study, or the file cannot be written.
+    """
 
     def read_back(written: Path) -> None:
         require_same("text", text, read_text(written, "study file"))

@@ -192,7 +192,10 @@ def _fit_motions(
     poses, places = (np.broadcast_to(a, (len(true), *a.shape[1:])) for a in (measured, T))
     errors = geometry.pose_difference(poses, true)
     explained = []
-    for i, used in enumerate(usable):
+    for i, used in enumerate(usable & np.isfinite(poses).all(axis=(2, 3))):
+        if not used.any():  # a trial without a calibrated machine
+            explained.append(np.full((places.shape[1], 6), np.nan))
+            continue
         motion = fit_frames(robot, poses[i, used], cell.motions)(errors[i, used][..., None])
         arm = places[i, :, :3, :3] @ robot.tool[:3, 3]
         twists = frame_twists(places[i], robot.size) @ motion

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Methods and measurements of published studies: raw rows, leg by leg, points held on planes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from loopcal.errors import FileError
+from loopcal.estimate.published_methods.per_leg import identify_per_leg
+from loopcal.studies import OUTCOMES, load_study, replay_trial
+from loopcal.studies.simulation.calibrated_cells import calibrate_cells, find_cells, set_size
+from loopcal.studies.simulation.machines import draw_machines
+from loopcal.studies.simulation.preparation import prepare_cell
+from loopcal.studies.simulation.tasks import list_tasks
+from loopcal.studies.specification.levels import (
+    ErrorsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    PosesLevel,
+    Scores,
+)
+from tests.studies.studies import compute_cells, make_study, read_robot
+
+POSE = InstrumentLevel(("pose",), sigma_position=1e-7, sigma_angle=1e-7)
+FIRST_KEY = "0b5fafce58b8870932723e4bbd43912f1327fd4d97746f316314d4115f572b02"
+SECOND_KEY = "1670e76092db1fe1347edf9692705f423a29dd79adc20c99bc8dd2f4f8dd8368"
+
+CMM = InstrumentLevel(("plane", "line"), sigma_position=1e-6)
+HELD = PosesLevel(50, "plane-line", groups=5, sweeps=0)
+POSES = PosesLevel(36)
+SMALL = ErrorsLevel(0.1)
+
+
+def make_held(method: MethodLevel, **changes):
+    """Return a study of points on planes and lines of a hexapod."""
+    settings = {
+        "instruments": {"cmm": CMM},
+        "poses": {"held": HELD},
+        "errors": {"small": SMALL},
+        "methods": {"m": method},
+        "replicates": 2,
+        "block": 2,
+        **changes,
+    }
+    return make_study("hexapod-nategh-agheli", **settings)
+
+
+def test_keys_of_blocks_are_those_of_earlier_versions():
+    study = make_study()
+    assert study.compute_key(study.cells[0], 0) == FIRST_KEY
+    changed = make_study(
+        errors={"u": ErrorsLevel(distribution="uniform")},
+        methods={"t": MethodLevel("truncated-svd", keep=3)},
+        poses={"p": PosesLevel(8, "planned", seed=2)},
+        scores=Scores(5, "base"),
+    )
+    assert changed.compute_key(changed.cells[0], 1) == SECOND_KEY
+
+
+def test_raw_rows_without_noise_find_the_machine_and_stop_at_epsilon():
+    exact = InstrumentLevel(("component",), ("x", "y", "z"), sigma_position=1e-12)
+    methods = {
+        "fine": MethodLevel("least-squares", rows="raw"),
+        "coarse": MethodLevel("least-squares", rows="raw", epsilon=0.5),
+        "two": MethodLevel("least-squares", rows="raw", steps=2),
+        "short": MethodLevel("least-squares", rows="raw", epsilon=1e-9, steps=2),
+    }
+    fine, coarse, two, short = compute_cells(
+        make_study(instruments={"i": exact}, methods=methods, poses={"30": PosesLevel(30)})
+    )
+    assert_array_equal(fine["outcome"], 0.0)
+    assert_array_equal(two["outcome"], 0.0)  # a fixed number of steps
+    assert {OUTCOMES[int(code)] for code in short["outcome"]} == {"study.out-of-iterations"}
+    assert_array_equal(two["iterations"], 2.0)
+    assert fine["position"].max() < 1e-9  # [m]
+    assert (coarse["iterations"] < fine["iterations"]).all()
+    assert np.isnan(fine["covered_position"]).all()
+
+
+def test_raw_least_squares_without_rank_detection_diverges_and_truncated_svd_does_not():
+    five = InstrumentLevel(
+        ("component",), ("x", "y", "z", "phi", "theta", "psi"), "tilt-torsion", unused=("psi",)
+    )
+    methods = {
+        "ls": MethodLevel("least-squares", rows="raw"),
+        "tsvd": MethodLevel("truncated-svd", rows="raw", keep=32),
+        "ridge": MethodLevel("ridge", rows="raw", lam=1.0, steps=3),
+    }
+    study = make_study("3-prs", instruments={"5": five}, methods=methods, poses={"36": POSES})
+    ls, tsvd, ridge = compute_cells(replace(study, replicates=2, block=2))
+    assert {OUTCOMES[int(code)] for code in ls["outcome"]} == {"study.diverged"}
+    assert np.isnan(ls["position"]).all()
+    assert_array_equal(tsvd["outcome"], 0.0)
+    assert_array_equal(ridge["iterations"], 3.0)
+
+
+def test_per_leg_trials_are_those_of_identify_per_leg():
+    methods = {
+        "steps": MethodLevel("per-leg", steps=2),
+        "epsilon": MethodLevel("per-leg", epsilon=1e-3),
+    }
+    study = make_study(
+        "hexapod-42",
+        instruments={"pose": POSE},
+        methods=methods,
+        poses={"12": PosesLevel(12)},
+        replicates=2,
+        block=2,
+    )
+    two, rule = calibrate_cells(study)
+    trial = replay_trial(study, 0, 1)
+    fit = identify_per_leg(trial.robot, trial.data, 2)
+    assert_allclose(two.values[1], fit.robot.values, rtol=0, atol=1e-15)
+    assert_array_equal(two.truth[1], trial.truth.values)
+    assert rule.is_converged.all()
+    assert (rule.iterations > 1).all()
+    delta = {"delta": read_robot("linear-delta")}
+    (refused,) = calibrate_cells(replace(study, robots=delta, methods={"m": methods["steps"]}))
+    assert {OUTCOMES[code] for code in refused.outcome} == {"study.refused"}
+
+
+def test_unused_columns_change_no_noise_of_the_others():
+    full, less = (
+        make_study(instruments={"i": InstrumentLevel(("component",), ("x", "y", "z"), unused=u)})
+        for u in ((), ("z",))
+    )
+    (a,), (b,) = calibrate_cells(full), calibrate_cells(less)
+    assert_array_equal(a.measured[0][..., :2], b.measured[0][..., :2])
+    assert np.isnan(b.measured[0][..., 2]).all()
+    assert_array_equal(a.truth, b.truth)
+    assert (compute_cells(less)[0]["rank"] <= compute_cells(full)[0]["rank"]).all()
+
+
+def test_sizes_of_errors_lie_between_the_smallest_and_the_largest():
+    study = make_study(errors={"e": ErrorsLevel(distribution="uniform", smallest=0.5)})
+    (task,) = list_tasks(study)
+    cell = prepare_cell(json.loads(task.content))
+    drawn = draw_machines(cell.robot, cell.errors, 4000, 0) - cell.robot.parameters.nominal
+    tolerance = cell.robot.parameters.tolerance
+    free = np.flatnonzero(cell.robot.parameters.free)
+    scaled = drawn[:, free] / tolerance[free]
+    largest = np.sqrt(3.0 / 1.75)
+    assert 0.5 * largest <= np.abs(scaled).min() < 0.52 * largest
+    assert 0.98 * largest < np.abs(scaled).max() <= largest
+    assert abs(np.sqrt(np.mean(scaled**2)) - 1.0) < 0.01
+    assert abs(np.mean(scaled > 0) - 0.5) < 0.02
+
+
+def test_held_points_leave_nine_motions_and_33_combinations():
+    study = make_held(MethodLevel("least-squares", rows="products"), scores=Scores(5, frame="both"))
+    (scores,) = compute_cells(study)
+    assert_array_equal(scores["outcome"], 0.0)
+    assert_array_equal(scores["rank"], 33.0)
+    assert (scores["position"] < 0.2 * scores["position_before"]).all()
+    assert (scores["position_base"] > 2.0 * scores["position"]).all()
+    content = next(list_tasks(study)).content
+    assert prepare_cell(json.loads(content)).motions.shape == (12, 9)
+
+
+def test_products_of_held_points_equal_fits_with_surfaces_as_unknowns():
+    study = make_held(
+        MethodLevel("map", rows="products"),
+        methods={"p": MethodLevel("map", rows="products"), "s": MethodLevel("map")},
+    )
+    products, surfaces = calibrate_cells(study)
+    assert_array_equal(products.truth, surfaces.truth)
+    size = np.abs(products.values - products.robot.values).max()
+    assert_allclose(products.values, surfaces.values, rtol=0, atol=1e-3 * size)
+
+
+def test_cells_with_held_points_see_the_same_points_and_machines():
+    noises = {"1": CMM, "2": replace(CMM, sigma_position=1e-5)}
+    method = MethodLevel("least-squares", rows="products-printed")
+    a, b = calibrate_cells(make_held(method, instruments=noises))
+    assert_array_equal(a.readings, b.readings)
+    assert_array_equal(a.truth, b.truth)
+
+
+def test_sizes_and_levels_choose_cells():
+    study = set_size(make_study(methods={"a": MethodLevel(), "b": MethodLevel("map")}), 7, 3)
+    assert (study.seed, study.replicates, study.block) == (7, 3, 3)
+    assert find_cells(study, method="b") == (1,)
+
+
+TEXT = """\
+format: 1
+title: t
+replicates: 2
+robots: [hexapod-42]
+instruments:
+  a: {kinds: [pose]}
+poses: [12]
+methods:
+  m: {method: least-squares}
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("method: least-squares", "method: map, rows: raw", 9, "map needs weighted rows"),
+        ("method: least-squares", "method: ridge, rows: raw", 9, "needs lam"),
+        ("method: least-squares", "method: map, epsilon: 1", 9, "rows: raw"),
+        ("method: least-squares", "method: per-leg, epsilon: 0", 9, "must be above 0"),
+        ("method: least-squares", "method: per-leg, steps: 0", 9, "must be 1 to"),
+        ("method: least-squares", "method: per-leg, loss: huber", 9, "has no loss"),
+        ("method: least-squares", "method: per-leg, rows: raw", 9, "remove 'rows'"),
+        ("method: least-squares", "method: map, rows: products", 9, "choice: plane-line"),
+        ("method: least-squares", "method: map, rows: rough", 9, "rows"),
+        ("[12]", "{p: {count: 40, choice: plane-line}}", 7, "kinds: [plane, line]"),
+        ("[12]", "{p: {count: 41, choice: plane-line}}", 7, "equal groups"),
+        ("[12]", "{p: {count: 30, choice: plane-line}}", 7, "at least 4"),
+        ("kinds: [pose]", "kinds: [pose], unused: [w]", 6, "'w' is not measured"),
+        ("poses: [12]", "errors:\n  e: {smallest: 0.5}", 8, "distribution: uniform"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_at_their_line(tmp_path, old, new, line, words):
+    path = tmp_path / "study.yaml"
+    path.write_text(TEXT.replace(old, new), encoding="utf-8")
+    with pytest.raises(FileError) as caught:
+        load_study(path)
+    assert f"study.yaml:{line}:" in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_published_methods_know_no_verdict_and_no_adjusted_intervals(tmp_path):
+    path = tmp_path / "study.yaml"
+    for scores in ("verdict: true", "intervals: adjusted"):
+        text = TEXT.replace("method: least-squares", "method: per-leg")
+        path.write_text(text + f"scores: {{{scores}}}\n", encoding="utf-8")
+        with pytest.raises(FileError, match="neither a verdict nor intervals"):
+            load_study(path)
