@@ -92,7 +92,8 @@ COMMANDS = {
         "plan five-bar --kind position --candidates 20 --poses 7 --hold-out 2 -o F",
     ),
     "papers/writing.py:write_folder": ("STUDY",),
-    "studies/files/template.py:write_template": ("study new --robot five-bar F.yaml",),
+    "studies/files/template.py:write_study_text": ("study new --robot five-bar F.yaml",),
+    "papers/paper_studies.py:write": ("study new --paper hexapod-42 F.yaml",),
     "io/runs/curves_folder.py:write_curves": ("regularize five-bar data.csv -o F",),
     "documents/writing.py:write_report": ("report run -o F.html",),
 }

@@ -31,7 +31,7 @@ FIRST_KEY = "0b5fafce58b8870932723e4bbd43912f1327fd4d97746f316314d4115f572b02"
 SECOND_KEY = "1670e76092db1fe1347edf9692705f423a29dd79adc20c99bc8dd2f4f8dd8368"
 
 CMM = InstrumentLevel(("plane", "line"), sigma_position=1e-6)
-HELD = PosesLevel(50, "plane-line", groups=5, sweeps=0)
+HELD = PosesLevel(100, "plane-line", sweeps=0)
 POSES = PosesLevel(36)
 SMALL = ErrorsLevel(0.1)
 

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study files of the papers: their levels are those of the papers, and other robots fit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.cli import main
+from loopcal.estimate.published_methods.plane_line_products import (
+    Layout,
+    PaperRows,
+    identify_from_rows,
+)
+from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penalize_truncated
+from loopcal.measure import make_random_stream
+from loopcal.papers import PAPERS, cmm_constraint_2011, hexapod_42, tsvd_2016
+from loopcal.papers.cmm_constraint_2011.calibrations import METHODS
+from loopcal.papers.cmm_constraint_2011.published import read_published as read_cmm
+from loopcal.papers.hexapod_42 import noise_study
+from loopcal.papers.hexapod_42.published import MM, load_nominal_machine, to_values
+from loopcal.papers.hexapod_42.published import read_published as read_hexapod
+from loopcal.papers.hexapod_42.study import round_to_degrees
+from loopcal.papers.paper_studies import load_paper_study
+from loopcal.papers.tsvd_2016.machines import (
+    LIMITS,
+    ROBOTS,
+    list_measured_poses,
+    load_machine,
+    measure_machines,
+)
+from loopcal.papers.tsvd_2016.situations import LAMBDAS, SHORT
+from loopcal.papers.tsvd_2016.steps import iterate
+from loopcal.studies import OUTCOMES, StudyResult, list_tasks, load_study
+from loopcal.studies.simulation.block import make_stream
+from loopcal.studies.simulation.calibrated_cells import calibrate_cells, find_cells, set_size
+from loopcal.studies.specification.levels import PosesLevel
+
+
+def test_the_grid_of_cmm_constraint_has_the_printed_sets_and_noises():
+    study, printed = load_paper_study(str(cmm_constraint_2011.__file__)), read_cmm()
+    assert [f"set {given}" for given in printed.sets] == list(study.errors)
+    assert [level.tolerance_factor for level in study.errors.values()] == [
+        float(given) for given in printed.sets
+    ]
+    for given in printed.noises:
+        assert study.instruments[f"{given} mm"].sigma_position == pytest.approx(float(given) * MM)
+    few = {"points": PosesLevel(10, "plane-line", groups=1, sweeps=0)}
+    quick = replace(set_size(study, 0, 2), poses=few)
+    (cell,) = calibrate_cells(quick, find_cells(study, errors="set 1", method="MAP")[:1])
+    assert_allclose(cell.robot.parameters.tolerance, MM)  # sets are standard deviations in mm
+
+
+def test_cells_of_cmm_constraint_are_the_equations_of_the_paper():
+    study = set_size(load_paper_study(str(cmm_constraint_2011.__file__)), 3, 2)
+    poses = {"points": replace(study.poses["100 points"], sweeps=0)}
+    study = replace(study, poses=poses)
+    numbers = find_cells(study, errors="set 1", instrument="0.01 mm")
+    stream = make_stream(3, 0)
+    noise = np.stack([make_random_stream(stream, i).standard_normal((100, 3)) for i in range(2)])
+    for cell in calibrate_cells(study, numbers):
+        coordinates = _find_coordinates(study)
+        layout = Layout(cell.robot, coordinates.reshape(10, 10, 6))
+        q = layout.hold_points(cell.truth, 1e-5 * noise)[1]
+        rows = PaperRows(layout, q, MM, 1e-5)
+        by_hand = identify_from_rows(rows, METHODS[cell.levels["method"]])
+        assert_allclose(cell.values, rows.values(by_hand.deviation), rtol=0, atol=1e-12)
+
+
+def _find_coordinates(study):
+    """Return the points (100, 6) of the only poses of a study."""
+    return np.array(json.loads(next(list_tasks(study, [0])).content)["measured"])
+
+
+def test_the_noise_study_has_the_errors_and_poses_of_the_tables():
+    study, printed = load_paper_study(str(hexapod_42.__file__)), read_hexapod()
+    (poses,) = study.poses.values()
+    assert_allclose(poses.coordinates, round_to_degrees(printed.nominal_poses), atol=1e-15)
+    numbers = find_cells(study, method="MAP")
+    (cell,) = calibrate_cells(set_size(study, 0, 2), numbers[:1])
+    robot = load_nominal_machine()
+    assert_allclose(
+        cell.truth - robot.values, np.tile(to_values(robot, printed.errors.values * MM), (2, 1)),
+        rtol=0, atol=1e-15,
+    )  # fmt: skip
+    for limits in noise_study.LEVELS:
+        level = study.instruments[f"{limits[0]:g} mm and {limits[1]:g} rad"]
+        assert level.distribution == "uniform"
+        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(limits[0] * MM, rel=1e-7)
+        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(limits[1], rel=1e-7)
+    assert {*noise_study.PER_LEG, noise_study.TOGETHER, noise_study.PRIOR} == set(study.methods)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
+    stem = ROBOTS[name].replace("-", "_")
+    study = load_paper_study(str(tsvd_2016.__file__), f"study_{stem}.yaml")
+    robot = load_machine(name)
+    p = len(robot.parameters)
+    (poses,) = study.poses.values()
+    assert_allclose(poses.coordinates, list_measured_poses(robot), rtol=0, atol=1e-8)
+    keeps = [level.keep for level in study.methods.values() if level.keep is not None]
+    assert keeps == list(range(p - 1, p // 3, -1))
+    raw = [level for level in study.methods.values() if level.rows == "raw" and level.lam]
+    assert_allclose([level.lam for level in raw], [*LAMBDAS, *LAMBDAS])
+    assert {level.steps for level in raw} == {None, SHORT}
+    for level in study.instruments.values():
+        assert np.sqrt(3.0) * level.sigma_position == pytest.approx(LIMITS[0])
+        assert np.sqrt(3.0) * level.sigma_angle == pytest.approx(LIMITS[3])
+    assert study.instruments["5-DOF"].unused == ("psi",)
+
+
+def test_cells_of_a_sweep_are_the_batch_of_settings_of_the_reproduction():
+    """The reproduction runs all settings of a machine as one batch, which is faster."""
+    study = set_size(load_paper_study(str(tsvd_2016.__file__), "study_3_prs.yaml"), 1, 2)
+    settings = {"TSVD 22": penalize_truncated(np.array([22]), 33),
+                "RE 1e-3": penalize_ridge(np.array([1e-3]), 33)}  # fmt: skip
+    for instrument in study.instruments:
+        for method, penalty in settings.items():
+            numbers = find_cells(study, instrument=instrument, method=method)
+            (cell,) = calibrate_cells(study, numbers)
+            measured = measure_machines("3-PRS", cell.truth)
+            trials = replace(measured.trials, measured=cell.measured)
+            run = iterate(replace(measured, trials=trials), penalty, np.arange(2))
+            step = np.abs(run.values - measured.robot.values).max()
+            assert_allclose(cell.values, run.values, rtol=0, atol=1e-6 * step)
+            assert abs(cell.iterations - run.count).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("paper", "robot", "replaced", "cell"),
+    [
+        ("cmm-constraint-2011", "hexapod-octahedral", (), {"errors": "set 1", "method": "MAP"}),
+        (
+            "hexapod-42",
+            "hexapod-nategh-agheli",
+            ("poses", "errors"),
+            {"method": "per leg, 3 steps"},
+        ),
+        ("tsvd-2016", "linear-delta-6", ("poses",), {"method": "TSVD 12"}),
+    ],
+)
+def test_another_robot_replaces_that_of_a_paper(tmp_path, capsys, paper, robot, replaced, cell):
+    path = tmp_path / "study.yaml"
+    assert main(["study", "new", str(path), "--paper", paper, "--robot", robot]) == 0
+    printed = capsys.readouterr().out
+    assert all(key in printed for key in replaced)
+    study = set_size(load_study(path), 0, 2)
+    if paper == "cmm-constraint-2011":
+        study = replace(study, poses={"p": replace(study.poses["100 points"], sweeps=0)})
+    assert list(study.robots) == [robot]
+    numbers = find_cells(study, **cell)[-1:]
+    (made,) = calibrate_cells(study, numbers)
+    assert made.is_converged.all(), [OUTCOMES[code] for code in made.outcome]
+    assert np.abs(made.values - made.robot.values).max() > 0.0
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_the_study_of_a_paper_is_written_with_its_poses_and_read(tmp_path, paper):
+    path = tmp_path / "my study.yaml"
+    assert main(["study", "new", str(path), "--paper", paper]) == 0
+    study = load_study(path)
+    assert [robot.source for robot in study.robots.values()] == [next(iter(PAPERS[paper].studies))]
+    assert main(["study", "new", str(path), "--paper", paper]) == 1  # not without --force
+    assert main(["study", "new", str(path), "--paper", paper, "--force"]) == 0
+
+
+def test_a_paper_study_runs_and_is_summarized(tmp_path):
+    path, folder = tmp_path / "study.yaml", tmp_path / "results"
+    words = ["study", "new", str(path), "--paper", "hexapod-42", "--robot", "hexapod-octahedral"]
+    assert main(words) == 0
+    text = path.read_text("utf-8")
+    head, rest = text.split("instruments:")
+    keys = rest[rest.index("\n# The") :] if "\n# The" in rest else rest[rest.index("\nposes") :]
+    path.write_text(f"{head}instruments: {{i: {{kinds: [pose]}}}}\n{keys}", "utf-8")
+    assert main(["study", "run", str(path), "-o", str(folder), "--quick", "--workers", "1"]) == 0
+    (per_leg, *_) = StudyResult(folder).summarize().cells
+    assert per_leg.trials == 5
+
+
+def test_an_unknown_robot_or_paper_is_refused(tmp_path, capsys):
+    path = str(tmp_path / "study.yaml")
+    assert main(["study", "new", path, "--paper", "hexapod"]) == 1
+    assert "hexapod-42" in capsys.readouterr().err
+    assert main(["study", "new", path, "--paper", "hexapod-42", "--robot", "nobody"]) == 1
+    assert "nobody" in capsys.readouterr().err
