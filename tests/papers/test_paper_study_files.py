@@ -106,7 +106,7 @@ def test_the_sweeps_have_the_settings_and_poses_of_the_reproduction(name):
     keeps = [level.keep for level in study.methods.values() if level.keep is not None]
     assert keeps == list(range(p - 1, p // 3, -1))
     raw = [level for level in study.methods.values() if level.rows == "raw" and level.lam]
-    assert_allclose([level.lam for level in raw], [*LAMBDAS, *LAMBDAS])
+    assert_allclose([level.lam or 0.0 for level in raw], [*LAMBDAS, *LAMBDAS])
     assert {level.steps for level in raw} == {None, SHORT}
     for level in study.instruments.values():
         assert np.sqrt(3.0) * level.sigma_position == pytest.approx(LIMITS[0])

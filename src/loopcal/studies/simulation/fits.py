@@ -125,7 +125,7 @@ def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
 def describe_published(cell: PreparedCell, fits: PublishedFits) -> FittedTrials:
     """Return fits of a published method, whose intervals do not exist."""
     t, free = len(fits.values), select_free_parameters(cell.robot)
-    is_known = np.isfinite(fits.values).all(axis=1)
+    is_known = np.asarray(np.isfinite(fits.values).all(axis=1))
     values = np.where(is_known[:, None], fits.values, cell.robot.values)
     state, measured = solve_cell_poses(cell, values)
     outcome = np.where(fits.is_converged, 0, EXHAUSTED)
