@@ -53,7 +53,11 @@ def restore_validation(
     after = errors["after"]
     return Validation(
         poses=tuple(content["poses"]),
-        **errors,
+        before=errors["before"],
+        after=after,
+        commanded_before=errors["commanded_before"],
+        commanded_after=errors["commanded_after"],
+        not_compensable=errors["not_compensable"],
         noise_floor=_restore_floor(content["noise_floor"]),
         unreachable=tuple(content["failed"]),
         limit_position=content["limit_position"],

@@ -26,6 +26,9 @@ from loopcal.report.text_page import Block, format_list
 from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
 from loopcal.workflow import CalibrationReport
 
+WHOLE = 100.0
+"""Degrees of freedom from which they are shown without decimals."""
+
 Hint = Callable[[Finding], str | None]
 """From a finding to advice of the caller, such as a command-line option."""
 
@@ -154,7 +157,9 @@ def _list_details() -> list[tuple[Column, Callable[[Mapping[str, Any]], str]]]:
 
 def _format_degrees(degrees: float) -> str:
     """Return degrees of freedom, which are infinite where no variance was estimated."""
-    return "infinite" if math.isinf(degrees) else format_number(degrees, 3)
+    if math.isinf(degrees):
+        return "infinite"
+    return f"{degrees:.0f}" if degrees >= WHOLE else format_number(degrees, 3)
 
 
 def _note_intervals(fit: Identification) -> list[Block]:

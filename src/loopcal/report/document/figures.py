@@ -30,7 +30,7 @@ MOST_ROWS = 3000
 MOST_PARAMETERS = 120
 """Parameters up to which the report draws them."""
 
-MAP_POSES, SEED = 400, 0
+MAP_POSES, SEED = 200, 0
 """Poses of the accuracy map, and the seed of their draw."""
 
 
