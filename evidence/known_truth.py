@@ -68,9 +68,11 @@ def position_errors(robot: Mechanism, values: Array, truth: Array, q: Array) -> 
 
 
 def evaluate_cell(
-    name: str, noise: tuple[float, float], machines: int = MACHINES
+    name: str, noise: tuple[float, float], machines: int = MACHINES, choices: int = MODEL_CHOICES
 ) -> dict[str, Array]:
-    """Return the errors (t,) [m] before and after each method, for drawn machines."""
+    """Return the errors (t,) [m] before and after each method, for drawn machines, and of the
+    first `choices` of them with a chosen model.
+    """
     robot = load_robot(name)
     coordinates, q = (
         sample_workspace(robot, POSES, SEED).coordinates,
@@ -85,9 +87,9 @@ def evaluate_cell(
         result[title] = position_errors(
             robot, identify_trials(robot, trials, method).values, truth, q
         )
-    few = min(machines, MODEL_CHOICES)
-    chosen = np.array([choose_values(robot, trials.trial(i)) for i in range(few)])
-    result["chosen model"] = position_errors(robot, chosen, truth[:few], q)
+    if choices:
+        chosen = np.array([choose_values(robot, trials.trial(i)) for i in range(choices)])
+        result["chosen model"] = position_errors(robot, chosen, truth[:choices], q)
     return result
 
 
