@@ -61,7 +61,14 @@ SHOWN = 20
     help="Robot file to write, which names the robot; with --profile the measurement file.",
     required=True,
 )
-@file_option("--data", help="Also write the measurements that FILE contains.")
+@file_option("--data", help="Also write the measurements that FILE or --probes contain.")
+@file_option(
+    "--probes",
+    multiple=True,
+    metavar="REPORT",
+    help="What the firmware printed when it probed the bed (marlin: G30, G33 P3 V0, M114; reprap: "
+    "G32 with bed.g, heightmap.csv). May be given several times.",
+)
 @file_option(
     "--corrected", help="Also calibrate with them, and write FILE with the corrected numbers."
 )
@@ -71,7 +78,7 @@ SHOWN = 20
             f"--sigma-{of}", type=POSITIVE_LENGTH, help=f"Noise of {what}.  [default: {default}]"
         )
         for of, what, default in (
-            ("height", "the probe (klipper)", "0.02mm"),
+            ("height", "the probe (klipper, marlin, reprap)", "0.02mm"),
             ("distance", "distances (klipper)", "0.1mm"),
             ("line", "lines (hangprinter)", "1mm"),
             ("position", "known positions (hangprinter)", "1mm"),
@@ -122,6 +129,7 @@ def import_(
       loopcal import printer.cfg -o printer.yaml --data heights.csv
       loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
       loopcal import config-override.g --format reprap -o printer.yaml
+      loopcal import m503.txt --format marlin --probes g30.txt -o printer.yaml --data heights.csv
       loopcal import export.txt --profile tracker.yaml -o measurements.csv
       loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
@@ -144,7 +152,8 @@ def import_(
             "such as --data data.csv"
         )
     beside = file.with_suffix(".yaml") if source.name == "urdf" else None
-    refuse_outputs((output, data), (file, settings["closures"] or beside), force)
+    inputs = (file, settings["closures"] or beside, *settings["probes"])
+    refuse_outputs((output, data), inputs, force)
     refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
     imported = read(file, _make_import_options(source, make_name(output.stem), settings))
     with restore_on_failure((output, data)):
@@ -228,7 +237,7 @@ def _make_import_options(source: Format, name: str, settings: dict[str, Any]) ->
     """Return the options of a format; DataError for one that it does not have."""
     from loopcal.io.formats.program_format import ImportOptions
 
-    stated = {key: value for key, value in settings.items() if value is not None}
+    stated = {key: value for key, value in settings.items() if value not in (None, ())}
     for key in stated:
         if key not in source.read_options:
             raise DataError(

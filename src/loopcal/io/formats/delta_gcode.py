@@ -40,6 +40,7 @@ from loopcal.io.formats.delta_geometry import (
     format_robot,
     get_geometry,
 )
+from loopcal.io.formats.probe_reports import import_probes
 from loopcal.io.formats.program_format import (
     Exported,
     ExportSource,
@@ -224,7 +225,10 @@ class DeltaFirmware:
         findings = (report_finding("files.probe-offset", offset=offset),) if offset else ()
         program = f"M665 and M666 of {self.program}"
         text = format_robot(geometry, options, path, program, has_distances=False)
-        return Imported(text, None, findings)
+        if not options.probes:
+            return Imported(text, None, findings)
+        measurements, finding = import_probes(text, path, options, self.name)
+        return Imported(text, measurements, (*findings, finding))
 
     def write(self, source: ExportSource, into: Path | None) -> Exported:
         """Return the corrected words in an existing file, or two lines of their own."""
@@ -371,7 +375,7 @@ MARLIN = Format(
     (".gcode",),
     MARLIN_FIRMWARE.read,
     MARLIN_FIRMWARE.write,
-    read_options=("sigma_tape",),
+    read_options=("sigma_height", "sigma_tape", "probes"),
 )
 REPRAP = Format(
     "reprap",
@@ -379,5 +383,5 @@ REPRAP = Format(
     (".g",),
     REPRAP_FIRMWARE.read,
     REPRAP_FIRMWARE.write,
-    read_options=("sigma_tape",),
+    read_options=("sigma_height", "sigma_tape", "probes"),
 )

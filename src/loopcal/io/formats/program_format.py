@@ -51,6 +51,7 @@ class ImportOptions:
     home_height : z of the home pose [m].
     closures : file of loop closures, for formats that keep them apart.
     platform : the link that is the platform.
+    probes : files with the heights that a firmware reported, and with their points.
     """
 
     name: str
@@ -64,6 +65,7 @@ class ImportOptions:
     sigma_position: float | None = None
     sigma_tape: float | None = None
     sigma_anchor: float | None = None
+    probes: tuple[Path, ...] = ()
 
     def choose_noise(self, what: str) -> float:
         """Return the noise [m] of a sort of numbers in `ASSUMED_NOISE`: stated or assumed."""

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import ArgumentTypeError, FileError, MechanismError, suggest_names
+from loopcal.findings import report_finding
 from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
@@ -48,6 +49,14 @@ from loopcal.typing import FloatArray
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
 WHAT = "robot file"
+
+PROBED = "--probes REPORT --data heights.csv"
+PROGRAMS = {
+    ".cfg": ("Klipper", "", "--data heights.csv"),
+    ".g": ("RepRapFirmware", "", PROBED),
+    ".gcode": ("Marlin", "", PROBED),
+}
+"""Ending of a printer's configuration -> its firmware, and options with which it is imported."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +198,7 @@ def find_robot_file(source: str | Path) -> Path:
     """
     path = as_path(source, WHAT)
     if path.exists():
+        _refuse_file_of_program(path)
         return path
     shipped = list_shipped_robots()
     if str(source) in shipped:
@@ -196,6 +206,17 @@ def find_robot_file(source: str | Path) -> Path:
     hint, names = suggest_names(str(source), shipped), ", ".join(shipped) or "none"
     act = f"name a file, or one of the shipped robots: {names}"
     raise FileError(f"this robot file does not exist{hint}; {act}", path)
+
+
+def _refuse_file_of_program(path: Path) -> None:
+    """Raise FileError for the configuration of a printer, which must be imported first."""
+    if path.suffix.lower() not in PROGRAMS or not path.is_file():
+        return
+    program, option, data = PROGRAMS[path.suffix.lower()]
+    finding = report_finding(
+        "files.robot-of-program", program=program, file=path.name, option=option, data=data
+    )
+    raise FileError(finding, path)
 
 
 def list_shipped_robots() -> dict[str, Path]:

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heights that Marlin and RepRapFirmware report lead to the true geometry, with the right sign."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+from loopcal.mechanism import forward, inverse
+
+MARLIN = "M665 L220.00 R105.00 H300.00 X0.00 Y0.00 Z0.00\nM666 X-0.10 Y0.00 Z-0.20\n"
+REPRAP = "M665 L220:220:220 R105 H300 X0 Y0 Z0 B85\nM666 X0.1 Y-0.1 Z0\n"
+TRUE = {"radius": 0.5e-3, "tower1.angle": 0.003, "tower2.angle": -0.002, "tower1.stop": -0.2e-3}
+TRUE |= {"tower2.stop": 0.15e-3, "tower3.stop": 0.1e-3}
+"""Deviations of the true printer from what its firmware knows [SI]."""
+
+
+def list_ring(radius: float, first: float) -> list[tuple[float, float]]:
+    """Return six points of a circle [mm], the first one at this angle [deg]."""
+    angles = [math.radians(first + 60.0 * k) for k in range(6)]
+    return [(radius * math.cos(a), radius * math.sin(a)) for a in angles]
+
+
+POINTS = [(0.0, 0.0), *list_ring(35.0, 0.0), *list_ring(70.0, 30.0)]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("m503.gcode").write_text(MARLIN)
+    Path("config.g").write_text(REPRAP)
+    return tmp_path
+
+
+def run(words: str) -> int:
+    return main(words.split())
+
+
+def make_truth(config: str, name: str = "truth.yaml"):
+    """Return the robot of the firmware and the true printer."""
+    assert run(f"import {config} -o {name} --force") == 0
+    robot = lc.load_robot(name)
+    change = np.array([TRUE.get(parameter, 0.0) for parameter in robot.parameters.names])
+    return robot, robot.with_values(robot.values + change)
+
+
+def probe(robot, truth, points, offset=(0.0, 0.0)) -> list[float]:
+    """Return the heights [mm] that a firmware reports: it lowers the nozzle by its own geometry
+    until the nozzle truly touches the bed.
+    """
+    heights = []
+    for x, y in points:
+        height = 0.0
+        for _ in range(30):
+            place = [[1e-3 * (x - offset[0]), 1e-3 * (y - offset[1]), height]]
+            touched = forward(truth, inverse(robot, place).q)
+            height -= float(touched.T[0, 2, 3])
+        heights.append(1e3 * height)
+    return heights
+
+
+def write_g30(points, heights, name: str = "report.txt") -> None:
+    lines = [
+        f"Bed X:{x:.2f} Y:{y:.2f} Z:{h:.3f}\nok\n"
+        f"X:{x:.2f} Y:{y:.2f} Z:10.00 E:0.00 Count X:1 Y:2 Z:3"
+        for (x, y), h in zip(points, heights, strict=True)
+    ]
+    Path(name).write_text("\n".join(lines) + "\n")
+
+
+def calibrate_with(words: str, truth, tolerance: float = 6e-6) -> None:
+    """Import and calibrate; the identified parameters are the true ones."""
+    assert run(f"import {words} -o printer.yaml --data heights.csv --force") == 0
+    assert run("calibrate printer.yaml heights.csv -o run --method ls --force") in (0, 2)
+    robot = lc.load_run("run").robot
+    free = robot.parameters.free
+    errors = np.abs(robot.values - truth.values)[free]
+    sizes = [
+        tolerance if "angle" not in n else 5e-5 for n in np.array(robot.parameters.names)[free]
+    ]
+    assert (errors < sizes).all(), errors
+
+
+def test_g30_of_marlin_leads_to_the_truth() -> None:
+    robot, truth = make_truth("m503.gcode")
+    heights = probe(robot, truth, POINTS)
+    assert np.ptp(heights) > 0.1
+    write_g30(POINTS, heights)
+    calibrate_with("m503.gcode --probes report.txt", truth)
+
+
+def test_a_height_entered_as_z_would_move_the_radius_in_the_wrong_direction() -> None:
+    """Why the import exists: commanded readings with the reported height as z."""
+    robot, truth = make_truth("m503.gcode")
+    heights = np.array(probe(robot, truth, POINTS))
+    write_g30(POINTS, heights)
+    assert run("import m503.gcode --probes report.txt -o printer.yaml --data heights.csv") == 0
+    text = Path("heights.csv").read_text()
+    place = robot.parameters.names.index("radius")
+    results = []
+    for sign in (1.0, -1.0):
+        at_zero = 1e-3 * np.array([[x, y, 0.0] for x, y in POINTS])
+        readings = 1e3 * inverse(robot, at_zero).q
+        head = [line for line in text.splitlines() if line.startswith("#")]
+        rows = [
+            ",".join([str(i), *(f"{q:.5f}" for q in row), f"{sign * h:.4f}"])
+            for i, (row, h) in enumerate(zip(readings, heights, strict=True))
+        ]
+        Path("by-hand.csv").write_text(
+            "\n".join([*head, "pose,q1 [mm],q2 [mm],q3 [mm],z [mm]", *rows])
+        )
+        run("calibrate printer.yaml by-hand.csv -o hand --method ls --force")
+        results.append(lc.load_run("hand").robot.values[place] - robot.values[place])
+    assert results[0] < -0.3e-3  # the wrong direction
+    assert results[1] == pytest.approx(TRUE["radius"], abs=0.05e-3)
+
+
+def test_a_dry_run_of_g33_leads_to_the_truth() -> None:
+    robot, truth = make_truth("m503.gcode")
+    angles = {"c": None, "x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
+    lines = []
+    for radius in (50.0, 80.0):
+        h = {}
+        for name, angle in angles.items():
+            r = 0.0 if angle is None else radius
+            a = math.radians(angle or 0)
+            h[name] = probe(robot, truth, [(r * math.cos(a), r * math.sin(a))])[0]
+        h["c"] += 0.001 * (radius > 60.0)  # repeated to the last digit, it needs --allow-duplicates
+        lines += [
+            "G33 Auto Calibrate",
+            f"Checking... AC at radius:{radius:.2f} (DRY-RUN)",
+            ".Height:300.00  Ex:-0.10  Ey:+0.00  Ez:-0.20  Radius:105.00",
+            ".             Tx:+0.00  Ty:+0.00  Tz:+0.00",
+            f".      c:{h['c']:+.3f}   x:{h['x']:+.3f}   y:{h['y']:+.3f}   z:{h['z']:+.3f}",
+            f".             yz:{h['yz']:+.3f}  zx:{h['zx']:+.3f}  xy:{h['xy']:+.3f}",
+            "End DRY-RUN                                   std dev:0.210",
+        ]
+    Path("g33.txt").write_text("\n".join(lines))
+    calibrate_with("m503.gcode --probes g33.txt", truth)
+
+
+def test_positions_of_m114_are_touches_by_hand() -> None:
+    robot, truth = make_truth("m503.gcode")
+    heights = probe(robot, truth, POINTS)
+    lines = [
+        f"X:{x:.2f} Y:{y:.2f} Z:{h:.3f} E:0.00 Count X:100 Y:200 Z:300"
+        for (x, y), h in zip(POINTS, heights, strict=True)
+    ]
+    Path("m114.txt").write_text("\n".join(lines))
+    calibrate_with("m503.gcode --probes m114.txt", truth)
+
+
+def test_g32_of_reprapfirmware_with_the_points_of_bed_g() -> None:
+    robot, truth = make_truth("config.g")
+    heights = probe(robot, truth, POINTS)
+    Path("report.txt").write_text(
+        "G32 bed probe heights:"
+        + "".join(f" {h:.3f}" for h in heights)
+        + ", mean 0.1, deviation 0.2"
+    )
+    bed = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 ; point" for i, (x, y) in enumerate(POINTS)]
+    Path("bed.g").write_text("M561\n" + "\n".join(bed) + " S6\n")
+    calibrate_with("config.g --probes report.txt --probes bed.g", truth)
+
+
+def test_a_height_map_of_reprapfirmware() -> None:
+    robot, truth = make_truth("config.g")
+    grid = [(-60 + 30 * k, -60 + 30 * j) for j in range(5) for k in range(5)]
+    heights = probe(robot, truth, grid)
+    cells = ["0" if math.hypot(*p) > 75 else f"{h:.3f}" for p, h in zip(grid, heights, strict=True)]
+    rows = [", ".join(cells[5 * j : 5 * j + 5]) for j in range(5)]
+    head = "RepRapFirmware height map file v2 generated at 2026-01-01 10:00, min error 0"
+    for titles, first in (
+        ("axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1", "X,Y,"),
+        ("xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum", ""),
+    ):
+        stated = f"{first}-60.00,60.00,-60.00,60.00,75.00,30.00,30.00,5,5"
+        Path("heightmap.csv").write_text("\n".join([head, titles, stated, *rows]) + "\n")
+        calibrate_with("config.g --probes heightmap.csv", truth)
+        assert lc.load_run("run").result["fit"]["dof"] > 0
+    Path("heightmap.csv").write_text("\n".join([head, titles, stated, *rows[:-1]]))
+    assert run("import config.g --probes heightmap.csv -o p.yaml --data h.csv") == 1
+
+
+def test_a_probe_beside_the_nozzle_is_taken_into_account() -> None:
+    offset = (20.0, -10.0)
+    Path("m503.gcode").write_text(MARLIN + "M851 X20.00 Y-10.00 Z-1.50\n")
+    robot, truth = make_truth("m503.gcode")
+    write_g30(POINTS, probe(robot, truth, POINTS, offset))
+    calibrate_with("m503.gcode --probes report.txt", truth)
+
+
+def test_the_offset_of_a_probe_may_be_in_another_file() -> None:
+    robot, truth = make_truth("config.g")
+    heights = probe(robot, truth, POINTS, (15.0, 5.0))
+    cells = " ".join(f"{h:.3f}" for h in heights)
+    Path("report.txt").write_text(f"G32 bed probe heights: {cells}, mean 0, deviation 0")
+    bed = [f"g30p{i}x{x:.3f}y{y:.3f}z-99999" for i, (x, y) in enumerate(POINTS)]
+    Path("bed.g").write_text("\n".join(bed))
+    Path("probe.g").write_text("G31 P500 X15 Y5 Z2.5 ; inductive probe\n")
+    calibrate_with("config.g --probes report.txt --probes bed.g --probes probe.g", truth)
+
+
+@pytest.mark.parametrize(
+    ("config", "report", "words"),
+    [
+        ("m503.gcode", "ok\nBed X:0 Y:0 Z:0.1\n", "1 probed height; six numbers"),
+        ("m503.gcode", "hello\n", "contains no probe report of Marlin"),
+        ("config.g", "hello\n", "contains no probe report of RepRapFirmware"),
+        ("m503.gcode", "Checking... AC at radius:80.00\n.  c:+0.1\n", "is no dry run"),
+        ("m503.gcode", "Checking... AC (DRY-RUN)\n.  c:+0.1\n", "states no radius"),
+        ("config.g", "G32 bed probe heights: 0.1 not set 0.2, mean 1\n", "a point that was not"),
+        ("config.g", "G32 bed probe heights: 0.1 0.2, mean 1\n", "state no G30 P0"),
+        ("config.g", "RepRapFirmware height map file v2\nx\n", "rows and columns that it states"),
+    ],
+)
+def test_reports_that_cannot_be_used_are_refused(config, report, words, capsys) -> None:
+    Path("report.txt").write_text(report)
+    assert run(f"import {config} --probes report.txt -o p.yaml --data h.csv") == 1
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not Path("p.yaml").exists()
+
+
+def test_a_point_out_of_reach_is_named(capsys) -> None:
+    points = [*POINTS[:-1], (5000.0, 0.0)]
+    write_g30(points, [0.0] * len(points))
+    assert run("import m503.gcode --probes report.txt -o p.yaml --data h.csv") == 1
+    assert f"the probed point {len(points)}" in " ".join(capsys.readouterr().err.split())
+
+
+def test_probes_do_not_belong_to_klipper(capsys) -> None:
+    Path("printer.cfg").write_text("[printer]\nkinematics: delta\n")
+    Path("report.txt").write_text("")
+    assert run("import printer.cfg --probes report.txt -o p.yaml") == 1
+    assert "--probes does not belong to the format klipper" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("printer.cfg", "loopcal import printer.cfg -o"), ("config.g", "--probes REPORT")],
+)
+def test_calibrate_says_what_to_type_for_a_configuration(name, words, capsys) -> None:
+    Path(name).write_text("[printer]\nkinematics: delta\n")
+    assert run(f"calibrate {name} heights.csv -o run") == 1
+    err = " ".join(capsys.readouterr().err.split())
+    assert words in err
+    assert "loopcal calibrate printer.yaml heights.csv -o run" in err
