@@ -242,11 +242,12 @@ def test_probes_do_not_belong_to_klipper(capsys) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("printer.cfg", "loopcal import printer.cfg -o"), ("config.g", "--probes REPORT")],
+    [("printer.cfg", "a configuration file of Klipper"), ("config.g", "of RepRapFirmware")],
 )
 def test_calibrate_says_what_to_type_for_a_configuration(name, words, capsys) -> None:
     Path(name).write_text("[printer]\nkinematics: delta\n")
     assert run(f"calibrate {name} heights.csv -o run") == 1
     err = " ".join(capsys.readouterr().err.split())
     assert words in err
-    assert "loopcal calibrate printer.yaml heights.csv -o run" in err
+    assert "type loopcal import FILE -o printer.yaml --data heights.csv" in err
+    assert "then loopcal calibrate printer.yaml heights.csv -o run" in err

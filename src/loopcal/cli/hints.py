@@ -42,6 +42,11 @@ HINTS = {
     "files.limb-branches": "use --platform LINK",
     "files.no-limbs": "use --platform LINK",
     "files.urdf-needed": "use --into robot.urdf",
+    "files.robot-of-program": "type loopcal import FILE -o printer.yaml --data heights.csv (for "
+    "Marlin and RepRapFirmware with --probes REPORT), then loopcal calibrate printer.yaml "
+    "heights.csv -o run",
+    "files.g32-no-points": "use --probes bed.g beside the report",
+    "files.probes-imported": "state another noise by --sigma-height",
     "files.saved-block": "use --into printer.cfg",
     "files.probe-noise-assumed": "state other values by --sigma-height and --sigma-distance",
     "files.sample-noise-assumed": "state other values by --sigma-line and --sigma-position",
@@ -150,8 +155,10 @@ def is_hint_useless(finding: Finding) -> bool:
 
 
 def _has_options(command: click.Command | None, hint: str) -> bool:
-    """Return whether a command has every option in a hint; True where no command is known."""
-    if command is None:
+    """Return whether a command has every option in a hint; True where no command is known. What
+    follows the word `type` is another command.
+    """
+    if command is None or hint.startswith("type loopcal "):
         return True
     options = {name for parameter in command.params for name in parameter.opts}
     return options.issuperset(OPTION.findall(hint))

@@ -50,13 +50,8 @@ FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
 WHAT = "robot file"
 
-PROBED = "--probes REPORT --data heights.csv"
-PROGRAMS = {
-    ".cfg": ("Klipper", "", "--data heights.csv"),
-    ".g": ("RepRapFirmware", "", PROBED),
-    ".gcode": ("Marlin", "", PROBED),
-}
-"""Ending of a printer's configuration -> its firmware, and options with which it is imported."""
+PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
+"""Ending of a printer's configuration -> its firmware."""
 
 
 @dataclass(frozen=True)
@@ -212,10 +207,8 @@ def _refuse_file_of_program(path: Path) -> None:
     """Raise FileError for the configuration of a printer, which must be imported first."""
     if path.suffix.lower() not in PROGRAMS or not path.is_file():
         return
-    program, option, data = PROGRAMS[path.suffix.lower()]
-    finding = report_finding(
-        "files.robot-of-program", program=program, file=path.name, option=option, data=data
-    )
+    program = PROGRAMS[path.suffix.lower()]
+    finding = report_finding("files.robot-of-program", program=program)
     raise FileError(finding, path)
 
 
