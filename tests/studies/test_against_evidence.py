@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coverage and rank of studies agree with the evidence, which was computed without them."""
+"""Coverage, rank and medians of studies agree with the evidence, which has other code."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from loopcal.studies.specification.levels import (
     MethodLevel,
     MethodName,
     PosesLevel,
+    Scores,
 )
 from tests.studies.studies import make_study
 
@@ -57,3 +58,51 @@ def test_coverage_and_rank_agree(case):
     share = 100.0 * scores["covered_parameters"]
     spread = share.std() * np.sqrt(1.0 / TRIALS + 1.0 / fits)
     assert abs(share.mean() - expected) < 3.5 * spread
+
+
+METHODS = {
+    "least squares": MethodLevel("least-squares"),
+    "MAP": MethodLevel("map"),
+    "default": MethodLevel("auto"),
+}
+MEDIANS = {
+    "hexapod-42": InstrumentLevel(("pose",), sigma_position=1e-5, sigma_angle=5e-5),
+    "3-prs": InstrumentLevel(("pose",), sigma_position=1e-5, sigma_angle=5e-5),
+    "linear-delta": InstrumentLevel(("component",), ("x", "y", "z"), sigma_position=1e-5),
+}
+MEDIAN_TRIALS, MEDIAN_POSES = 200, 25
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("robot", MEDIANS)
+def test_medians_of_errors_agree(robot):
+    """The study has the measured and the held-out poses of the evidence, which follow from the
+    seed, and other machines and noise. Errors are in the base frame; every coordinate is measured.
+
+    The logarithm of the median of n machines scatters by 1.2533 sd(log error) / sqrt(n).
+    """
+    document = json.loads((EVIDENCE.parent / "known_truth.json").read_text("utf-8"))
+    table = document["tables"]["median_error_um"]
+    row = next(r for r in table["rows"] if r[0] == robot and r[1] == "10 um, 50 urad")
+    expected = dict(zip(table["columns"], row, strict=True))
+    assert document["poses"][0] == MEDIAN_POSES
+    study = make_study(
+        robot,
+        seed=document["seed"],
+        replicates=MEDIAN_TRIALS,
+        block=MEDIAN_TRIALS,
+        instruments={"i": MEDIANS[robot]},
+        poses={"25": PosesLevel(MEDIAN_POSES)},
+        methods=METHODS,
+        scores=Scores(held_out=60, frame="base"),
+    )
+    names = [column.name for column in study.columns]
+    errors: dict[str, np.ndarray] = {}
+    for task in list_tasks(study):
+        scores = dict(zip(names, compute_block(task).values.T, strict=True))
+        errors[study.cells[task.cell].levels["method"]] = np.log(1e6 * scores["position"])
+        errors["before"] = np.log(1e6 * scores["position_before"])
+    assert set(errors) == {"before", *METHODS}
+    for name, values in errors.items():
+        spread = 1.2533 * values.std() * np.sqrt(1.0 / MEDIAN_TRIALS + 1.0 / document["machines"])
+        assert abs(np.median(values) - np.log(expected[name])) < 3.5 * spread

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.results.summary_view import FRAMES
+from loopcal.studies.results.summary_view import FRAMES, view_summary
 from loopcal.studies.specification.cells import Cell
 from loopcal.studies.specification.levels import MethodLevel, NoiseLevel, PosesLevel, Question
 from loopcal.studies.specification.levels import Scores as ScoreSettings
@@ -75,6 +75,14 @@ def test_the_title_states_score_and_frame_and_a_line_the_limit_of_the_question(
     other = result.draw("condition")
     assert "frame" not in other.get_suptitle()
     assert not any(np.array_equal(line.get_xdata(), [0, 1]) for line in other.axes[0].lines)
+
+
+def test_scores_of_both_frames_have_the_frame_of_each_in_their_title(tmp_path: Path) -> None:
+    result = store(tmp_path, scores=ScoreSettings(frame="both"))
+    for score, frame in (("position", "fitted"), ("position_base", "base")):
+        assert FRAMES[frame] in " ".join(result.draw(score).get_suptitle().splitlines())
+    page = view_summary(result.study, result.summarize(), ("position_base",))
+    assert FRAMES["both"] in str(page[1])
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from loopcal.studies.results.figure_layout import Layout, choose_layout, list_co
 from loopcal.studies.results.study_result import find_columns
 from loopcal.studies.results.summary import CellSummary, Interval, StudySummary
 from loopcal.studies.results.summary_view import FRAMES, UNITS
-from loopcal.studies.specification.scores import ScoreColumn, check_question
+from loopcal.studies.specification.scores import BASE_COLUMNS, ScoreColumn, check_question
 from loopcal.studies.specification.study import Study
 from loopcal.units import Unit
 
@@ -271,5 +271,8 @@ def _list_titles(study: Study, summary: StudySummary, drawing: Drawing, columns:
     trials = f"{low}" if low == high else f"{low} to {high}"
     lines = [summary.title, column.meaning[0].upper() + column.meaning[1:]]
     if column.name.startswith(IN_FRAME):
-        lines += textwrap.wrap(FRAMES[study.scores.frame], 70 * columns)
+        frame = study.scores.frame
+        if frame == "both":
+            frame = "base" if column in BASE_COLUMNS else "fitted"
+        lines += textwrap.wrap(FRAMES[frame], 70 * columns)
     return [*lines, f"n = {trials} converged trials of each cell; bars are 95 % intervals"]

@@ -34,6 +34,8 @@ NOTE = (
 FRAMES = {
     "fitted": "Pose errors are stated without motions of frames that the measurements do not fix.",
     "base": "Pose errors are in the base frame.",
+    "both": "Pose errors are stated without motions of frames that the measurements do not fix; "
+    "those whose names contain 'base' are in the base frame.",
 }
 """Frame of the scores of a study -> what the page says about it."""
 
