@@ -138,6 +138,7 @@ if TYPE_CHECKING:
     from loopcal.planning import SurfacePlan as SurfacePlan
     from loopcal.planning import plan as plan
     from loopcal.planning import plan_surfaces as plan_surfaces
+    from loopcal.progress_bar import ProgressBar as ProgressBar
     from loopcal.sampling import Bootstrap as Bootstrap
     from loopcal.sampling import Intervals as Intervals
     from loopcal.sampling import JointRegion as JointRegion
@@ -206,6 +207,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
             Constraints LineOfSight Plan PlanOptions SurfaceOptions SurfacePlan plan
             plan_surfaces
         """,
+        "loopcal.progress_bar": "ProgressBar",
         "loopcal.sampling": """
             Bootstrap Intervals JointRegion PosteriorSample SimultaneousIntervals bootstrap
             compute_joint_region compute_simultaneous_intervals sample_posterior

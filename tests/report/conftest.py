@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small calibration of each sort, made once."""
 
 from dataclasses import dataclass

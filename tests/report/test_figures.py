@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures contain all data, have units on their axes, and have the same bytes each time."""
 
 import warnings

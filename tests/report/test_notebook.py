@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every public result is shown in notebooks, and gives tables of pandas and xarray."""
 
 import builtins
