@@ -18,6 +18,7 @@ MOST_ROWS = 30
 STYLE = (
     "<style>.loopcal pre{white-space:pre-wrap;margin:0.3em 0}"
     ".loopcal caption{text-align:left;font-weight:bold}"
+    ".loopcal th,.loopcal td{padding:0 0.5em}"
     ".loopcal .words{text-align:left}.loopcal .numbers{text-align:right}</style>"
 )
 """Left for words, right for numbers; colors are those of the notebook."""
