@@ -35,6 +35,7 @@ from loopcal.measure import Measurements, check_actuators
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_chi_square_quantile
+from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 
 TAIL = 0.025
@@ -121,7 +122,7 @@ class VisitedPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Repeatability:
+class Repeatability(HtmlResult):
     """Pose accuracy and repeatability of a machine.
 
     Attributes

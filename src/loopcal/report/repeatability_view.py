@@ -8,14 +8,14 @@ from loopcal.mechanism import Mechanism
 from loopcal.report.numbers import format_number, units_of
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block, format_list
-from loopcal.units import Dimension, Unit
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
 DIMENSIONS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
 
 
-def view_repeatability(result: Repeatability, robot: Mechanism) -> list[Block]:
-    """Return the page of pose accuracy and repeatability."""
-    units = units_of(robot)
+def view_repeatability(result: Repeatability, robot: Mechanism | None = None) -> list[Block]:
+    """Return the page of pose accuracy and repeatability, in the units of a robot's file."""
+    units = DISPLAY_UNITS if robot is None else units_of(robot)
     blocks: list[Block] = []
     for quantity, poses in result.poses.items():
         unit = units[DIMENSIONS[quantity]]

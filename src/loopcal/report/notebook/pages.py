@@ -13,6 +13,7 @@ from loopcal.apply import (
     RunComparison,
     Validation,
 )
+from loopcal.apply.repeatability import Repeatability
 from loopcal.diagnose import (
     CrossValidation,
     FitExamination,
@@ -31,6 +32,7 @@ from loopcal.report.notebook.html import render_html
 from loopcal.report.notebook.records import collect_records
 from loopcal.report.notebook.tables import build_main_table
 from loopcal.report.regularization_view import view_regularization
+from loopcal.report.repeatability_view import view_repeatability
 from loopcal.report.run_comparison_view import find_error_units, view_comparison
 from loopcal.report.sampling_view import view_bootstrap, view_posterior
 from loopcal.report.text_page import Block
@@ -168,3 +170,9 @@ def write_conformity(result: Conformity) -> list[Block]:
     error = f"error {result.estimate:.4g} (95 %: {result.low:.4g} to {result.high:.4g})"
     decision = f"{result.decision.value} with a probability of {100.0 * result.probability:.3g} %"
     return [f"{error} against a limit of {result.limit:.4g}, all in m or rad: {decision}"]
+
+
+@write_page.register
+def write_repeatability(result: Repeatability) -> list[Block]:
+    """Return the page that the command line prints, in mm and deg."""
+    return view_repeatability(result)
