@@ -37,7 +37,7 @@ from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
 
 Array = NDArray[np.float64]
 
-SEED, MACHINES, POSES, HELD_OUT, MODEL_CHOICES = 5, 40, 25, 60, 20
+SEED, MACHINES, POSES, HELD_OUT, MODEL_CHOICES = 5, 40, 25, 60, 10
 ROBOTS = ("hexapod-42", "3-prs", "ru-pus-prs", "linear-delta")
 NOISE = {
     "1 um, 5 urad": (1e-6, 5e-6),
@@ -106,10 +106,14 @@ def collect() -> dict:
         for title, noise in NOISE.items():
             result = evaluate_cell(name, noise)
             worse = int((result["default"] > result["before"]).sum())
-            rows.append([name, title, *(1e6 * float(np.median(e)) for e in result.values()), worse])
-    columns = ["robot", "noise", "before", *METHODS, f"chosen model ({MODEL_CHOICES} machines)"]
+            chosen = result.pop("chosen model")
+            ratio = float(np.median(chosen / result["default"][: len(chosen)]))
+            medians = [1e6 * float(np.median(e)) for e in result.values()]
+            rows.append([name, title, *medians, ratio, worse])
+    columns = ["robot", "noise", "before", *METHODS]
+    columns.append(f"chosen model / default ({MODEL_CHOICES} machines)")
     columns.append(f"default worse than before, of {MACHINES}")
-    formats = ["", "", *[".3g"] * (2 + len(METHODS)), "d"]
+    formats = ["", "", *[".3g"] * (1 + len(METHODS)), ".2f", "d"]
     return {
         "seed": SEED,
         "machines": MACHINES,
