@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_workers_that_are_not_reached_later_leave_the_stored_blocks(tmp_path) ->
 class RefusesSecondBlock:
     """Workers that end with an error of the library at the second block."""
 
-    def map_blocks(self, function, tasks):
+    def map_blocks(self, function, tasks) -> Any:
         for task in tasks:
             if isinstance(task, BlockTask) and task.block == 1:
                 raise StudyError("the cluster was shut down")

@@ -65,7 +65,7 @@ def test_blocks_are_read_back_to_the_last_bit_in_the_order_of_their_numbers(fold
         assert (store.count_cell(A).blocks, store.count_cell(A).trials) == (3, 12)
         assert store.count_cell(A).seconds == pytest.approx(1.5)
         assert store.count_blocks(A, range(1, 9, 2)) == 1
-        assert store.list_keys(B) == {"other"}
+        assert store.list_keys(B, range(10)) == {"other"}
         assert store.count_cell({"robot": "unknown"}).blocks == 0
         assert store.read_scores({"robot": "unknown"}, [0]).shape == (0, 1)
 
@@ -219,6 +219,23 @@ MOUNTS = """\
 32 22 0:41 / /mnt/share rw - fuse.sshfs me@host:/ rw
 33 22 0:42 / /mnt/share rw - cifs //host/share rw
 """
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("specification", "CAST(x'7ba6' AS TEXT)"),  # no UTF-8
+        ("columns", "'7'"),
+        ("columns", "'{'"),
+        ("versions", "'[]'"),
+        ("versions", "CAST(x'ff' AS TEXT)"),
+    ],
+)
+def test_header_that_was_damaged_gives_a_sentence(folder, name, value) -> None:
+    with open_store(folder) as store, store.connection:
+        store.connection.execute(f"UPDATE study SET value = {value} WHERE name = '{name}'")
+    with expect_refusal("store.damaged", FileError), read_store(folder) as store:
+        assert store.header
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,13 @@ from random import Random
 
 import pytest
 
+from loopcal.cli.commands.study_commands import study
 from tools.fuzz.campaign import join_ranges
 from tools.fuzz.cases import Case, Maker
-from tools.fuzz.commands import draw_options, list_commands
+from tools.fuzz.commands import describe, draw_options, list_commands, name_command
 from tools.fuzz.corpus import build_corpus
 from tools.fuzz.execution import Outcome
+from tools.fuzz.study_corpus import LINES
 from tools.fuzz.verdict import find_place, judge
 
 
@@ -109,16 +111,26 @@ def test_ranges_of_seeds_are_joined() -> None:
     assert join_ranges([[5, 6], [1, 2], [3, 4], [9, 9]]) == [[1, 6], [9, 9]]
 
 
+def test_every_command_of_studies_has_its_turn() -> None:
+    words = [line.split()[1:] for line in LINES.strip().splitlines()]
+    assert {word for _, word, *_ in words} == set(study.commands)
+    commands = list_commands()
+    assert name_command(["study", "run", "x"], commands) == "study run"
+    assert name_command(["study", "rnu", "x"], commands) == "(none)"
+    assert describe(["study", "run", "x", "--quick", "-x"], commands) == ["study run --quick"]
+
+
 @pytest.mark.slow
-def test_three_hundred_random_inputs_have_their_answers(root) -> None:
+@pytest.mark.parametrize(("count", "options"), [(300, []), (25, ["--studies"])])
+def test_random_inputs_have_their_answers(root, count, options) -> None:
     """In a process of its own, because the workers are forks."""
-    command = [sys.executable, "-m", "tools.fuzz", "--count", "300", "--seed", "1"]
+    command = [sys.executable, "-m", "tools.fuzz", "--count", str(count), "--seed", "1", *options]
     environment = os.environ | {"PYTHONPATH": f"{root / 'src'}{os.pathsep}{root}"}
     done = subprocess.run(
         command, cwd=root, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "300 inputs" in done.stdout
+    assert f"{count} inputs" in done.stdout
 
 
 @pytest.mark.evidence

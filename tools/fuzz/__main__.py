@@ -3,6 +3,7 @@
 
     python -m tools.fuzz --count 1000                 the seeds 1 to 1000
     python -m tools.fuzz --count 1000 --add fuzz.json  the next 1000, counted with the earlier ones
+    python -m tools.fuzz --count 1000 --studies       the same for study files and folders
     python -m tools.fuzz --replay 4711                one input: its files, command line and answer
 
 The exit code is 1 where something is wrong.
@@ -20,6 +21,7 @@ from tools.fuzz.campaign import Summary, run_campaign
 from tools.fuzz.cases import Maker
 from tools.fuzz.corpus import build_corpus
 from tools.fuzz.execution import prepare_worker, run_case
+from tools.fuzz.study_corpus import build_study_corpus
 from tools.fuzz.verdict import judge
 
 
@@ -35,8 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--add", type=Path, help="JSON file of counts to write, and to go on from")
     parser.add_argument("--replay", type=int, metavar="SEED", help="run one input and show it")
     parser.add_argument("--keep", type=Path, help="with --replay: folder for its files")
+    parser.add_argument("--studies", action="store_true", help="inputs of `loopcal study`")
     options = parser.parse_args(arguments)
-    maker = Maker(build_corpus())
+    maker = Maker(build_study_corpus() if options.studies else build_corpus())
     if options.replay is not None:
         return replay(maker, options.replay, options.keep)
     summary = Summary()

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.fuzz.cases import Case, Maker
-from tools.fuzz.commands import describe
+from tools.fuzz.commands import describe, name_command
 from tools.fuzz.execution import CPU_LIMIT, Outcome, prepare_worker, run_case
 from tools.fuzz.verdict import Find, judge
 
@@ -122,7 +122,7 @@ def _make_answer(case: Case, maker: Maker, outcome: Outcome, finds: list[Find]) 
     return {
         "seed": case.seed,
         "cpu": round(outcome.cpu, 4),
-        "commands": [case.words[0] if case.words and case.words[0] in maker.commands else "(none)"],
+        "commands": [name_command(case.words, maker.commands)],
         "options": describe(case.words, maker.commands),
         "damage": sorted(set(case.damage)) or ["(none)"],
         "exit_codes": [str(outcome.code)],

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from tools.fuzz.arrays import mutate_arrays
-from tools.fuzz.commands import draw_options, draw_value, list_commands
+from tools.fuzz.commands import draw_options, draw_value, find_group_command, list_commands
 from tools.fuzz.corpus import Machine, parse_yaml
 from tools.fuzz.tables import Table, mutate_table, read_table, write_table
 from tools.fuzz.texts import mutate_text
@@ -85,11 +85,12 @@ class Maker:
 
     def _mutate_options(self, case: Case, machine: Machine, rng: Random) -> None:
         """Add options, drop a word, or replace one."""
-        command = self.commands[case.words[0]]
+        command = self.commands.get(case.words[0]) or find_group_command(case.words)
+        assert command is not None, case.words
         files = [*machine.files, "run", "plan"]
         kind = rng.choices(["add", "drop", "replace", "command"], [12, 1, 2, 0.4])[0]
         if kind == "add":
-            case.words += draw_options(command, rng, machine.words, files)
+            case.words += draw_options(command, rng, machine.words, files, machine.left_out)
         elif kind == "drop":
             del case.words[rng.randrange(len(case.words))]
         elif kind == "replace":

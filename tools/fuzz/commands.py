@@ -5,13 +5,14 @@ that a new command or option is included without a change here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from random import Random
 from typing import Any
 
 import click
 
 from loopcal.cli import entry_point
+from loopcal.cli.entry_point import find_command
 from tools.fuzz.values import NAMES
 
 COUNTS = ("1", "2", "3", "4", "5", "8", "12", "20")
@@ -49,7 +50,7 @@ PATHS = (
 
 
 def list_commands() -> dict[str, click.Command]:
-    """Return every command by name, but for groups, whose commands take minutes."""
+    """Return every command by name, but for those of groups, which have a corpus of their own."""
     names = [name for members in entry_point.MODULES.values() for name in members]
     group, context = entry_point.command_line, click.Context(entry_point.command_line)
     commands = {name: group.get_command(context, name) for name in names}
@@ -60,16 +61,31 @@ def list_commands() -> dict[str, click.Command]:
     }
 
 
+def find_group_command(words: Sequence[str]) -> click.Command | None:
+    """Return the command of words such as `study run`; None where they name none of a group."""
+    if not words or (group := find_command(words[0])) is None:
+        return None
+    if not isinstance(group, click.Group) or len(words) < 2:
+        return None
+    return group.get_command(click.Context(group), words[1])
+
+
 def draw_options(
-    command: click.Command, rng: Random, words: Sequence[str], files: Sequence[str]
+    command: click.Command,
+    rng: Random,
+    words: Sequence[str],
+    files: Sequence[str],
+    left_out: Container[str] = (),
 ) -> list[str]:
     """Return a few options of a command, with values.
 
     Parameters
     ----------
-    words : that mean something to the machine. files : that exist.
+    words : that mean something to the machine. files : that exist. left_out : options not to draw.
     """
-    options = [p for p in command.params if isinstance(p, click.Option)]
+    options = [
+        p for p in command.params if isinstance(p, click.Option) and p.opts[0] not in left_out
+    ]
     if not options:
         return []
     drawn: list[str] = []
@@ -129,14 +145,20 @@ KNOWN = (
 """Words of which text options expect some."""
 
 
+def name_command(words: Sequence[str], commands: Container[str]) -> str:
+    """Return the name of the command of a command line; "(none)" where there is none."""
+    if words and words[0] in commands:
+        return words[0]
+    return "(none)" if find_group_command(words) is None else " ".join(words[:2])
+
+
 def describe(words: Sequence[str], commands: dict[str, click.Command]) -> list[str]:
     """Return the options of a command line, as `command --option`."""
-    command = commands.get(words[0]) if words else None
+    command = (commands.get(words[0]) or find_group_command(words)) if words else None
     known = (
         {opt for p in command.params for opt in (*p.opts, *p.secondary_opts)}
         if command
         else set[Any]()
     )
-    return sorted(
-        {f"{words[0]} {word}" for word in words[1:] if word in known and word.startswith("-")}
-    )
+    name = name_command(words, commands)
+    return sorted({f"{name} {word}" for word in words[1:] if word in known and word[0] == "-"})

@@ -43,6 +43,8 @@ class Machine:
     words: list[str] = field(default_factory=list)
     trees: dict[str, Any] = field(default_factory=dict)
     """Files by name, parsed: YAML and JSON."""
+    left_out: frozenset[str] = frozenset()
+    """Options that are not added to its command lines."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def build_corpus() -> list[Machine]:
         return [*(_build_machine(recipe) for recipe in RECIPES), *_build_sources()]
 
 
-def _run(command: str, is_needed: bool = True) -> bool:
+def run_command(command: str, is_needed: bool = True) -> bool:
     """Run a command silently and return whether it succeeded; RuntimeError where it must."""
     with (
         contextlib.redirect_stdout(io.StringIO()),
@@ -118,7 +120,7 @@ def _run(command: str, is_needed: bool = True) -> bool:
     return code == 0
 
 
-def _collect(machine: Machine, folder: str) -> Machine:
+def collect_files(machine: Machine, folder: str) -> Machine:
     """Take the files of a folder into a machine, and what they contain."""
     for path in sorted(Path(folder).rglob("*")):
         if path.is_file() and path.suffix not in (".png", ".pdf", ".svg"):
@@ -138,7 +140,7 @@ def parse_yaml(text: str) -> Any:
 
 
 @contextlib.contextmanager
-def _folder(name: str) -> Iterator[str]:
+def work_in_folder(name: str) -> Iterator[str]:
     """Work in a folder of this name."""
     Path(name).mkdir()
     with contextlib.chdir(name):
@@ -149,24 +151,26 @@ def _build_machine(recipe: Recipe) -> Machine:
     """Make a robot, its data, its run and its plan, and the lines that use them."""
     name = recipe.robot
     machine = Machine(name, words=[*recipe.words.split(), "a", "1", "2", "fitted", "base", name])
-    with _folder(name):
+    with work_in_folder(name):
         shutil.copy(ROOT / "src" / "loopcal" / "robots" / f"{name}.yaml", "robot.yaml")
         seen = f"simulate robot.yaml --draw-errors {recipe.instrument}"
         draw = 30 if name == "hexapod-octahedral" else 14
-        _run(f"{seen} --draw {draw} --seed 2 -o data.csv --truth truth.yaml")
-        _run(f"simulate truth.yaml {recipe.instrument} --draw 7 --seed 3 -o more.csv")
-        _run("calibrate robot.yaml data.csv -o run --hold-out 0.3")
+        run_command(f"{seen} --draw {draw} --seed 2 -o data.csv --truth truth.yaml")
+        run_command(f"simulate truth.yaml {recipe.instrument} --draw 7 --seed 3 -o more.csv")
+        run_command("calibrate robot.yaml data.csv -o run --hold-out 0.3")
         Path("targets.csv").write_text(recipe.targets, "utf-8")
         planned = "--poses 8 --hold-out 2 --candidates 16"
         if name in PLANNED:
-            _run(f"plan robot.yaml -o plan {planned} {_planning_options(recipe)}")
+            run_command(f"plan robot.yaml -o plan {planned} {_planning_options(recipe)}")
         _split_readings()
         for kind in recipe.kinds:
-            _run(f"simulate robot.yaml --kind {kind} --draw 8 -o {kind}.csv", is_needed=False)
+            run_command(
+                f"simulate robot.yaml --kind {kind} --draw 8 -o {kind}.csv", is_needed=False
+            )
         for ending in recipe.formats:
-            _run(f"export robot.yaml --format {ending} -o {ending}.cfg", is_needed=False)
+            run_command(f"export robot.yaml --format {ending} -o {ending}.cfg", is_needed=False)
         machine.lines = [*_list_lines(recipe)]
-    return _collect(machine, name)
+    return collect_files(machine, name)
 
 
 def _planning_options(recipe: Recipe) -> str:
@@ -261,7 +265,7 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
 
 def _build_sources() -> Iterator[Machine]:
     """Yield the machines that come from files of other programs, and commands without a machine."""
-    with _folder("exports"):
+    with work_in_folder("exports"):
         for path in sorted((EXAMPLES / "exports").iterdir()):
             if path.suffix != ".md":
                 shutil.copy(path, path.name)
@@ -274,8 +278,8 @@ def _build_sources() -> Iterator[Machine]:
             Line(("import", file, "--profile", f"{profile}.yaml", "-o", "out.csv"), 3)
             for file, profile in pairs
         ]
-    yield _collect(Machine("exports", lines=lines, words=["SMR1", "1"]), "exports")
-    with _folder("programs"):
+    yield collect_files(Machine("exports", lines=lines, words=["SMR1", "1"]), "exports")
+    with work_in_folder("programs"):
         for name, text in SOURCES.items():
             Path(name).write_text(text, "utf-8")
         shutil.copy(EXAMPLES / "cable-robot" / "samples.json", "samples.json")
@@ -301,4 +305,4 @@ def _build_sources() -> Iterator[Machine]:
             for line in table.strip().splitlines()
         ]
     words = ["base", "tip", "platform", *KINDS, "linear-delta", "3-prs", "hexapod-42", "tsvd-2016"]
-    yield _collect(Machine("programs", lines=lines, words=words), "programs")
+    yield collect_files(Machine("programs", lines=lines, words=words), "programs")

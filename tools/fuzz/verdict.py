@@ -25,8 +25,10 @@ NO_NUMBER = re.compile(r"\b(?:unknown|unbounded|nan|-?inf) (?:[mun]?m|deg|[mu]?r
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 FRAME = re.compile(r'File "[^"]*?/src/(loopcal/[^"]+)", line (\d+), in (\S+)')
 MESSAGE = re.compile(r"^(loopcal: |Hint: |  )")
-ARCHIVES_AND_PICTURES = (b"\x89PNG", b"%PDF", b"PK")
+ARCHIVES_AND_PICTURES = (b"\x89PNG", b"%PDF", b"PK", b"SQLite format 3")
 """First bytes of files that are no text."""
+LOGS = (".sqlite-shm", ".sqlite-wal")
+"""Files that SQLite makes beside a store, also to read it."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def normalize(text: str) -> str:
 
 def _judge_files(case: Case, outcome: Outcome) -> Iterator[Find]:
     """Check that a command that failed left all files as they were."""
-    new = sorted(set(outcome.after) - set(outcome.before))
+    new = sorted(n for n in set(outcome.after) - set(outcome.before) if not n.endswith(LOGS))
     gone = sorted(set(outcome.before) - set(outcome.after))
     changed = [
         n for n in outcome.before if n in outcome.after and outcome.before[n] != outcome.after[n]
@@ -136,14 +138,20 @@ def _judge_success(case: Case, outcome: Outcome, folder: Path) -> Iterator[Find]
     for name in sorted(outcome.before):
         if name not in outcome.after and not name.startswith(tuple(_outputs(case))):
             yield Find("deleted-file", command, name)
+    copies = _list_copies(outcome)
     for name, content in outcome.after.items():
-        if isinstance(content, bytes) and content != outcome.before.get(name):
+        if isinstance(content, bytes) and content not in copies and not name.endswith(LOGS):
             yield from _judge_output(case, name, content, may_name)
     if outcome.code == 0 and "--help" not in case.words and "-h" not in case.words:
         for name in _outputs(case)[:1]:
             if not (folder / name).exists():
                 yield Find("missing-output", command, name)
     yield from judge_readable(case, outcome, folder)
+
+
+def _list_copies(outcome: Outcome) -> set[bytes | str]:
+    """Return the content of all inputs, which an output may repeat as it is."""
+    return set(outcome.before.values())
 
 
 def _outputs(case: Case) -> list[str]:
@@ -186,6 +194,7 @@ def judge_readable(case: Case, outcome: Outcome, folder: Path) -> Iterator[Find]
     """Check that loopcal reads every robot file, measurement file and run that it wrote."""
     from tools.fuzz.reading import read_back
 
-    new = {n for n, content in outcome.after.items() if content != outcome.before.get(n)}
+    copies = _list_copies(outcome)
+    new = {n for n, content in outcome.after.items() if content not in copies}
     for name, sentence, place in read_back(case, new, outcome.after, folder):
         yield Find("unreadable", f"{case.words[0]}: {place}", f"{name}: {sentence}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from collections.abc import Set as AbstractSet
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -23,6 +22,9 @@ from loopcal.typing import Progress, report_no_progress
 
 MOST_NAMED = 5
 """Blocks that were given up and are named in a finding."""
+
+LISTED = 200
+"""Blocks whose keys are read at once, so that memory does not grow with the number of blocks."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +160,16 @@ def _list_missing(study: Study, store: StudyStore, share: Share) -> Iterator[Blo
     blocks = share.select_blocks(study)
     for cell in share.select_cells(study):
         if store.count_blocks(cell.levels, blocks) < len(blocks):
-            yield _list_blocks(study, cell, blocks, store.list_keys(cell.levels))
+            yield _list_blocks(study, store, cell, blocks)
 
 
-def _list_blocks(study: Study, cell: Cell, blocks: range, stored: AbstractSet[str]) -> Blocks:
-    """Yield the blocks of a cell whose keys are not stored."""
-    for block in blocks:
-        content = describe_block(study, cell, block)
-        key = compute_key(content)
-        if key not in stored:
-            yield MissingBlock(key, cell.number, content)
+def _list_blocks(study: Study, store: StudyStore, cell: Cell, blocks: range) -> Blocks:
+    """Yield the blocks of a cell that are not stored."""
+    for first in range(0, len(blocks), LISTED):
+        listed = blocks[first : first + LISTED]
+        stored = store.list_keys(cell.levels, listed)
+        for block in listed:
+            content = describe_block(study, cell, block)
+            key = compute_key(content)
+            if key not in stored:
+                yield MissingBlock(key, cell.number, content)

@@ -100,8 +100,10 @@ class StudyStore:
             rows = dict(self.connection.execute("SELECT name, value FROM study"))
         try:
             columns, versions = json.loads(rows["columns"]), json.loads(rows["versions"])
+            if not isinstance(columns, list) or not isinstance(versions, dict):
+                raise ValueError("other types")
             return StoreHeader(rows["specification"], tuple(columns), versions)
-        except (KeyError, ValueError):
+        except (KeyError, TypeError, ValueError):
             raise FileError(report_finding("store.damaged"), self.path) from None
 
     @cached_property
@@ -148,12 +150,15 @@ class StudyStore:
         with _report_errors(self.path):
             return self.connection.execute("SELECT 1 FROM blocks LIMIT 1").fetchone() is not None
 
-    def list_keys(self, levels: Levels) -> frozenset[str]:
-        """Return the keys of the stored blocks of a cell."""
-        question = "SELECT key FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?)"
+    def list_keys(self, levels: Levels, blocks: range) -> frozenset[str]:
+        """Return the keys of the stored blocks of a cell with these numbers."""
+        question = (
+            "SELECT key FROM blocks WHERE cell = (SELECT id FROM cells WHERE levels = ?) "
+            "AND block >= ? AND block < ?"
+        )
+        row = (_name_cell(levels), blocks.start, blocks.stop)
         with _report_errors(self.path):
-            rows = self.connection.execute(question, (_name_cell(levels),))
-            return frozenset(key for (key,) in rows)
+            return frozenset(key for (key,) in self.connection.execute(question, row))
 
     def count_cell(self, levels: Levels) -> CellCount:
         """Return how much of a cell is stored."""
@@ -353,6 +358,8 @@ def _report_errors(path: Path) -> Iterator[None]:
     """Raise FileError in place of every error of SQLite."""
     try:
         yield
+    except UnicodeDecodeError as error:
+        raise FileError(report_finding("store.damaged"), path) from error
     except sqlite3.Error as error:
         number = getattr(error, "sqlite_errorcode", 0) & 0xFF
         reason = str(error)
