@@ -3,6 +3,7 @@
 
 import pytest
 
+from loopcal.report.calibration_view import build_parameter_table
 from loopcal.report.numbers import format_number, format_uncertainty, format_with_uncertainty
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import render_text, wrap_text
@@ -97,3 +98,26 @@ def test_formats_of_uncertainties_and_numbers_cover_nan_infinity_and_zero():
     assert format_uncertainty(0.0) == "0"
     assert format_number(float("nan")) == "-"
     assert format_number(4.9e-15) == "0"
+
+
+def test_complete_table_of_parameters_has_the_terms_of_the_gum():
+    row = {"name": "a", "nominal": 1.0, "estimate": 1.5, "sd": 0.1, "plus_minus": 0.2, "unit": "mm"}
+    rows = [
+        {**row, "tolerance": 0.25, "degrees": degrees}
+        for degrees in (4.567, 163.6, 484063690.0, float("inf"))
+    ]
+    table = build_parameter_table("Parameters", rows, is_complete=True)
+    headings = [column.heading for column in table.columns]
+    assert headings[3:] == [
+        "shift [tolerances]",
+        "u",
+        "degrees of freedom",
+        "k",
+        "U (95 %)",
+        "unit",
+    ]
+    assert table.rows[0][3:] == ("+2.00", "0.100", "4.57", "2", "0.200", "mm")
+    assert [cells[5] for cells in table.rows] == ["4.57", "164", "over 10000", "infinite"]
+    unknown = {**rows[0], "sd": float("inf"), "plus_minus": float("inf")}
+    (cells,) = build_parameter_table("Parameters", [unknown], is_complete=True).rows
+    assert cells[4:8] == ("unknown", "4.57", "-", "unknown")

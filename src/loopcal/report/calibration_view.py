@@ -26,8 +26,10 @@ from loopcal.report.text_page import Block, format_list
 from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
 from loopcal.workflow import CalibrationReport
 
-WHOLE = 100.0
-"""Degrees of freedom from which they are shown without decimals."""
+WHOLE, MANY = 100.0, 10_000.0
+"""Degrees of freedom from which they are shown without decimals, and from which they no longer
+matter.
+"""
 
 Hint = Callable[[Finding], str | None]
 """From a finding to advice of the caller, such as a command-line option."""
@@ -159,6 +161,8 @@ def _format_degrees(degrees: float) -> str:
     """Return degrees of freedom, which are infinite where no variance was estimated."""
     if math.isinf(degrees):
         return "infinite"
+    if degrees > MANY:
+        return f"over {MANY:.0f}"
     return f"{degrees:.0f}" if degrees >= WHOLE else format_number(degrees, 3)
 
 

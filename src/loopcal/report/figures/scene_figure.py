@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal.mechanism import Mechanism, forward
 from loopcal.report.figures.robot_figure import draw_robot
-from loopcal.report.figures.style import show_names
+from loopcal.report.figures.style import finish_figure
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -53,11 +53,8 @@ def draw_scene(robot: Mechanism, initial: Mechanism, readings: FloatArray) -> tu
         if is_space and len(points):
             _include(axes, lines)
     count = f"{len(tool)} measured {'pose' if len(tool) == 1 else 'poses'}"
-    figure.suptitle(
-        f"{robot.name} at home, {count}; errors before calibration, x {magnification:g}",
-        fontsize=10,
-    )
-    return show_names(figure), magnification
+    title = f"{robot.name} at home, {count}; errors before calibration, x {magnification:g}"
+    return finish_figure(figure, title), magnification
 
 
 def _choose_magnification(error: FloatArray, size: float) -> float:

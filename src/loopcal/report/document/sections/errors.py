@@ -14,8 +14,8 @@ from loopcal.report.validation_view import describe_improvements, view_error_sta
 
 BASELINE = (
     "Before: the geometry before calibration, with frames, targets, surfaces and offsets fitted to "
-    "the same rows. After: the calibrated geometry. Noise floor: the error that the stated "
-    "measurement noise alone causes."
+    "the rows of the calibration. After: the calibrated geometry. Noise floor: the error that the "
+    "stated measurement noise alone causes."
 )
 NOT_HELD_OUT = (
     "No pose was held out of this fit, so the report states no error at poses that were not fitted."

@@ -17,8 +17,8 @@ MOST = 3000
 """Labels of poses that the report lists."""
 
 EVERYWHERE = (
-    "The command loopcal export writes these values to a file, and as csv or json the parameters "
-    "of every robot."
+    "The command loopcal export writes the parameters to a file: of every robot as csv or json, "
+    "and in the formats of controllers that can express it."
 )
 NO_CONTROLLER = "No format of a controller that loopcal writes can express this robot."
 FAILED = "The calibration failed, so the report states no values for a controller."
