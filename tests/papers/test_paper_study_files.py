@@ -182,6 +182,30 @@ def test_a_paper_study_runs_and_is_summarized(tmp_path):
     assert per_leg.trials == 5
 
 
+def test_errors_in_both_frames_are_summarized(tmp_path, capsys):
+    path, folder = tmp_path / "study.yaml", tmp_path / "results"
+    assert main(["study", "new", str(path), "--paper", "cmm-constraint-2011"]) == 0
+    text = (
+        path.read_text("utf-8")
+        .replace("sweeps: 3", "sweeps: 0")
+        .replace("held_out: 100", "held_out: 5")
+    )
+    text = text.replace("quick: {replicates: 5,", "quick: {errors: {s: 1}, replicates: 2,")
+    path.write_text(text, "utf-8")
+    assert main(["study", "run", str(path), "-o", str(folder), "--quick", "--workers", "1"]) == 0
+    capsys.readouterr()
+    assert main(["study", "summary", str(folder)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "are in the base frame" in printed
+    cell = StudyResult(folder).summarize().cells[0]
+    fitted, base = (cell.find_score(name) for name in ("position", "position_base"))
+    assert fitted is not None
+    assert base is not None
+    assert fitted.median is not None
+    assert base.median is not None
+    assert fitted.median.value < base.median.value
+
+
 def test_an_unknown_robot_or_paper_is_refused(tmp_path, capsys):
     path = str(tmp_path / "study.yaml")
     assert main(["study", "new", path, "--paper", "hexapod"]) == 1

@@ -4,7 +4,7 @@ computed ones.
 
 One folder a paper: `published.yaml` (the printed numbers and statements, with their place),
 `text.yaml` (claims, captions, sentences), `study.yaml` (its simulation as a study file, see
-`loopcal study new --paper`), `steps.py` (what the paper does) and `study.py` with
+paper_studies.py), `steps.py` (what the paper does) and `study.py` with
 
     compute(seed, trials, progress) -> results, with `results.printed` as read from published.yaml
     present(results, seed) -> comparisons, tables, verdicts, figures

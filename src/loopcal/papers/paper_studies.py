@@ -32,7 +32,7 @@ def load_paper_study(module: str, name: str = FILE) -> Study:
 
 @dataclass(frozen=True)
 class PaperStudyFile:
-    """What `loopcal study new --paper` writes.
+    """A study file to write, and the poses beside it.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ FRAMES = {
 }
 """Frame of the scores of a study -> what the page says about it."""
 
-SHOWN = ("position", "orientation", "covered_parameters")
+SHOWN = ("position", "orientation", "position_base", "covered_parameters")
 """Scores of the table on the screen by default."""
 
 UNITS = {"m": find_unit("mm"), "rad": find_unit("mrad"), "1": find_unit("1")}
