@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Digital calibration certificates: elements and order of DCC 3.3.0, SI values, hostile names."""
+
+import json
+import math
+from xml.etree import ElementTree
+
+import pytest
+
+import loopcal as lc
+from loopcal.cli.entry_point import main
+from loopcal.errors import DataError, FileError
+from loopcal.io.runs.certificate import format_certificate
+from loopcal.io.runs.certificate_settings import TEMPLATE, load_administration
+from loopcal.io.runs.run_folder import load_run_or_robot
+from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
+
+CONTACT = "name eMail? phone? fax? link? location?"
+RULES = {
+    "digitalCalibrationCertificate": "administrativeData measurementResults",
+    "administrativeData": "dccSoftware coreData items calibrationLaboratory respPersons customer",
+    "dccSoftware": "software+",
+    "usedSoftware": "software+",
+    "software": "name release",
+    "coreData": "countryCodeISO3166_1 usedLangCodeISO639_1+ mandatoryLangCodeISO639_1+ "
+    "uniqueIdentifier identifications? receiptDate? beginPerformanceDate endPerformanceDate "
+    "performanceLocation issueDate?",
+    "items": "item+",
+    "item": "name manufacturer? model? identifications",
+    "identifications": "identification+",
+    "identification": "issuer value name?",
+    "calibrationLaboratory": "contact",
+    "respPersons": "respPerson+",
+    "respPerson": "person role? mainSigner?",
+    **dict.fromkeys(("contact", "customer"), CONTACT.replace("location?", "location")),
+    **dict.fromkeys(("person", "manufacturer"), CONTACT),
+    "measurementResults": "measurementResult+",
+    "measurementResult": "name usedMethods? usedSoftware? measuringEquipments? results "
+    "measurementMetaData?",
+    "usedMethods": "usedMethod+",
+    "usedMethod": "name norm*",
+    "measuringEquipments": "measuringEquipment+",
+    "measuringEquipment": "name description? manufacturer? model? identifications?",
+    "results": "result+",
+    "result": "name data",
+    "data": "quantity+",
+    "quantity": "name noQuantity? real?",
+    "real": "value unit measurementUncertaintyUnivariate?",
+    "measurementUncertaintyUnivariate": "expandedMU",
+    "expandedMU": "valueExpandedMU coverageFactor coverageProbability",
+    "measurementMetaData": "metaData+",
+    "metaData": "name norm* declaration? conformity?",
+    **dict.fromkeys(("name", "description", "declaration", "noQuantity"), "content+"),
+}
+"""Children of each element that is written, in the order of the schema."""
+
+HOSTILE = '<script>alert("1")</script> & ]]> \N{SNOWMAN}'
+
+
+def check_rules(element: ElementTree.Element) -> None:
+    """Assert that an element and all below it follow the rules."""
+    tag = element.tag.rpartition("}")[2]
+    children = [child.tag.rpartition("}")[2] for child in element]
+    if tag == "location":
+        assert children
+        return
+    if tag not in RULES:
+        assert not children, tag
+        assert element.text.strip(), tag
+        return
+    left = list(children)
+    for rule in RULES[tag].split():
+        name, sign = (rule[:-1], rule[-1]) if rule[-1] in "?+*" else (rule, "")
+        count = 0
+        while left and left[0] == name and (count == 0 or sign in "+*"):
+            left.pop(0)
+            count += 1
+        assert count or sign in ("?", "*"), (tag, name, children)
+    assert left == [], (tag, children)
+    for child in element:
+        check_rules(child)
+
+
+@pytest.fixture
+def run(tmp_path, robot, data):  # noqa: F811
+    """Return the folder of a run with an instrument and a limit."""
+    measured = with_instrument(data, FACTS | {"laboratory": HOSTILE})
+    options = lc.CalibrationOptions(hold_out=0.25, limit_position=1e-3)
+    lc.save_run(tmp_path / "run", lc.calibrate(robot, measured, options))
+    return tmp_path / "run"
+
+
+def write_facts(folder, name="A", **changed):
+    """Write administrative data, filled in, with some lines changed."""
+    text = TEMPLATE.replace('name: ""', f"name: {json.dumps(name)}")
+    text = text.replace('serial_number: ""', 'serial_number: "0017"')
+    for old, new in changed.values():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "facts.yaml").write_text(text, "utf-8")
+    return folder / "facts.yaml"
+
+
+def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> None:
+    text = format_certificate(lc.load_run(run), load_administration(write_facts(tmp_path, HOSTILE)))
+    root = ElementTree.fromstring(text)
+    check_rules(root)
+    names = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
+    assert root.get("schemaVersion") == "3.3.0"
+    assert root.find(".//dcc:item/dcc:name/dcc:content", names).text == HOSTILE
+    assert HOSTILE in root.find(".//dcc:measuringEquipment/dcc:description/*", names).text
+    assert "<script>" not in text
+    numbers = [e.text for e in root.findall(".//dcc:identification/dcc:value", names)]
+    assert numbers == ["0017", "0750123", "D-K-15123-01"]
+    rows = json.loads((run / "result.json").read_text("utf-8"))["fit"]["parameters"]
+    factor = {"mm": 1e-3, "deg": math.pi / 180.0}
+    quantities = root.findall(".//dcc:quantity", names)
+    for row, quantity in zip(rows, quantities, strict=False):
+        assert quantity.find("dcc:name/dcc:content", names).text == row["name"]
+        value = float(quantity.find("si:real/si:value", names).text)
+        assert value == pytest.approx(row["estimate"] * factor[row["unit"]], rel=1e-12)
+        expanded = float(quantity.find(".//si:valueExpandedMU", names).text)
+        assert expanded == pytest.approx(row["plus_minus"] * factor[row["unit"]], rel=1e-12)
+        unit = r"\metre" if row["unit"] == "mm" else r"\radian"
+        assert quantity.find("si:real/si:unit", names).text == unit
+    assert root.find(".//dcc:metaData/dcc:conformity", names).text == "pass"
+
+
+def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
+    facts = write_facts(tmp_path, "a\u0001b\ufffec")
+    try:
+        text = format_certificate(lc.load_run(run), load_administration(facts))
+    except FileError:  # the file is refused
+        return
+    name = ElementTree.fromstring(text).find(".//{*}item/{*}name/{*}content").text
+    assert "\u0001" not in name
+    assert name.startswith("a")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("country: DE   ", "country: Germany"), r"'country' is 'Germany'; write two capital"),
+        (("begin: 2026-01-31", "begin: 2026-02-31"), "date|day is out of range|valid YAML"),
+        (("end: 2026-01-31", "end: 2025-01-31"), r"end is 2025-01-31, before begin"),
+        (("place: laboratory ", "place: cellar "), "'place' is 'cellar'.*allowed"),
+        (('serial_number: "0017"', 'serial_number: ""'), r"facts.yaml:9: .*serial_number' is"),
+        (("machine:", "robot:"), "unknown key 'robot'|no key 'machine'"),
+    ],
+)
+def test_wrong_facts_are_refused_at_their_line(tmp_path, change, message) -> None:
+    with pytest.raises(FileError, match=message):
+        load_administration(write_facts(tmp_path, change=change))
+
+
+def test_template_must_be_filled_in(tmp_path) -> None:
+    (tmp_path / "facts.yaml").write_text(TEMPLATE, "utf-8")
+    with pytest.raises(FileError, match=r"'machine\.name' is empty; fill it in"):
+        load_administration(tmp_path / "facts.yaml")
+
+
+def test_robot_files_have_no_certificate(tmp_path, robot) -> None:  # noqa: F811
+    lc.save_robot(robot, tmp_path / "robot.yaml")
+    facts = load_administration(write_facts(tmp_path))
+    run = load_run_or_robot(tmp_path / "robot.yaml")
+    with pytest.raises(DataError, match="states no result; give a run folder"):
+        format_certificate(run, facts)
+
+
+def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
+    assert main(["certificate", "--new"]) == 0
+    assert capsys.readouterr().out == TEMPLATE
+    facts = str(write_facts(tmp_path))
+    assert main(["certificate", str(run), facts]) == 0
+    check_rules(ElementTree.fromstring(capsys.readouterr().out.encode()))
+    assert main(["certificate", str(run)]) == 1
+    assert "loopcal certificate --new" in capsys.readouterr().err
