@@ -173,5 +173,7 @@ def test_commands_print_facts_and_certificate(tmp_path, run, capsys) -> None:
     facts = str(write_facts(tmp_path))
     assert main(["certificate", str(run), facts]) == 0
     check_rules(ElementTree.fromstring(capsys.readouterr().out.encode()))
+    assert main(["certificate", str(run), facts, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["certificate"].startswith("<?xml")
     assert main(["certificate", str(run)]) == 1
     assert "loopcal certificate --new" in capsys.readouterr().err

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from loopcal.cli.options.shared_options import FILE, flag_option
+from loopcal.cli import terminal
+from loopcal.cli.options.shared_options import FILE, flag_option, json_option
 from loopcal.errors import DataError
 
 
@@ -15,7 +16,8 @@ from loopcal.errors import DataError
 @click.argument("run", metavar="[RUN]", type=FILE, required=False)
 @click.argument("facts", metavar="[FACTS]", type=FILE, required=False)
 @flag_option("--new", help="Print a file FACTS to fill in.")
-def certificate(run: Path | None, facts: Path | None, new: bool) -> int:
+@json_option
+def certificate(run: Path | None, facts: Path | None, new: bool, as_json: bool) -> int:
     """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
 
     FACTS is a YAML file with what a run does not know: laboratory, customer, dates, serial number.
@@ -33,9 +35,17 @@ def certificate(run: Path | None, facts: Path | None, new: bool) -> int:
     if new:
         if run is not None:
             raise DataError("--new prints a file to fill in; leave out RUN and FACTS")
-        click.echo(TEMPLATE, nl=False)
-        return 0
+        return _print("facts", TEMPLATE, as_json)
     if run is None or facts is None:
         raise DataError("RUN and FACTS are needed; loopcal certificate --new prints a file FACTS")
-    click.echo(format_certificate(load_run_or_robot(run), load_administration(facts)), nl=False)
+    text = format_certificate(load_run_or_robot(run), load_administration(facts))
+    return _print("certificate", text, as_json)
+
+
+def _print(name: str, text: str, as_json: bool) -> int:
+    """Print a text, or a JSON object that holds it, and return the exit code."""
+    if as_json:
+        terminal.print_json({name: text})
+    else:
+        click.echo(text, nl=False)
     return 0
