@@ -46,6 +46,11 @@ class Find:
 
 
 FINDS = {
+    "study of a robot file that cannot be read": Find(
+        "study new study.yaml --robot mine.yaml",
+        {"mine.yaml": "format: 1\nfamily: none\n"},
+        says="loopcal: mine.yaml",
+    ),
     "kind that is a list": Find(
         "identifiability linear-delta d.csv",
         {"d.csv": POSITION.replace("kind: position", "kind: [position]") + ROWS},

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.text_file import read_text, write_text
-from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots
+from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
 from loopcal.studies.files.study_file import load_study
 
 PLACE = "ROBOT"
@@ -26,8 +26,9 @@ def write_template(path: Path, robot: str) -> None:
 
     Raises
     ------
-    FileError : there is no such robot, or the file cannot be written.
+    FileError : there is no such robot, it cannot be read, or the file cannot be written.
     """
+    load_robot(robot)
     text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
     write_study_text(path, text.replace(f"[{PLACE}]", f"[{quote_robot(path, robot)}]"))
 
