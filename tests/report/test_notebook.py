@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# Classes are looked up by name.
 """Every public result is shown in notebooks, and gives tables of pandas and xarray."""
 
 import builtins
