@@ -179,7 +179,10 @@ def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:
     )
     arrays = {**record.arrays, "poses": np.array(many.poses)}
     arrays["frames_readings"] = np.tile(record.arrays["frames_readings"], (times, 1))
-    text = render_html(build(replace(record, residuals=(many,), arrays=arrays), "residual", "pose"))
+    lengthened = replace(record, residuals=(many,), arrays=arrays)
+    text = render_html(build(lengthened, "residual", "pose", "workspace"))
+    assert "The figure shows 3,000 of 120,000 fitted poses." in text
+    assert "than every measured pose of the 3,000 that are compared." in text
     assert "The figure shows 3,000 of 120,000 rows." in text
     assert "120,000 fitted poses, of which the first 3,000 are listed" in text
     assert len(text) < 5e6

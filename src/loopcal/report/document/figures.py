@@ -23,6 +23,7 @@ from loopcal.report.figures import (
     draw_scene,
     draw_validation,
 )
+from loopcal.typing import FloatArray
 
 MOST_ROWS = 3000
 """Rows that the figures of a report show."""
@@ -96,10 +97,10 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     if readings is None or not len(readings):
         yield "The run does not contain the readings of its poses, so they are not drawn."
         return
-    kept = np.unique(np.linspace(0, len(readings) - 1, MOST_ROWS).astype(np.intp))
+    kept = _thin_readings(readings)
     if len(kept) < len(readings):
         yield f"The figure shows {len(kept):,} of {len(readings):,} fitted poses."
-    figure, magnification = draw_scene(record.robot, record.initial, readings[kept])
+    figure, magnification = draw_scene(record.robot, record.initial, kept)
     yield make_picture(
         figure,
         "scene-figure",
@@ -111,6 +112,17 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     )
 
 
+def _thin_readings(readings: FloatArray) -> FloatArray:
+    """Return at most MOST_ROWS rows of readings, evenly spread."""
+    return readings[np.unique(np.linspace(0, len(readings) - 1, MOST_ROWS).astype(np.intp))]
+
+
+def _describe_count(readings: FloatArray) -> str:
+    """Return how many of the measured poses are compared, where these are not all."""
+    count = len(readings)
+    return f" of the {MOST_ROWS:,} that are compared" if count > MOST_ROWS else ""
+
+
 def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the uncertainty of poses over the workspace, and the sentence that sums it up."""
     budget, readings = record.result.get("expected_error"), record.readings
@@ -119,7 +131,11 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
         return
     try:
         accuracy = accuracy_map(
-            record.posterior, readings, MAP_POSES, SEED, frame=budget.get("frame", "fitted")
+            record.posterior,
+            _thin_readings(readings),
+            MAP_POSES,
+            SEED,
+            frame=budget.get("frame", "fitted"),
         )
     except LoopcalError as error:
         yield f"The accuracy over the workspace cannot be computed: {error}"
@@ -128,7 +144,7 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
     yield (
         f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
         f"of the workspace, {accuracy.uncertainty.frame}. {less} of these poses are less certain "
-        "than every measured pose."
+        f"than every measured pose{_describe_count(readings)}."
     )
     yield make_picture(
         draw_accuracy_map(accuracy),
