@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.estimate import MAP, LeastSquares, identify_trials
-from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.filtered_step import penalize
 from loopcal.io import load_robot

@@ -20,7 +20,7 @@ from loopcal.apply import PoseUncertainty, compute_error_budget, pose_uncertaint
 from loopcal.diagnose import estimate_calibration_gain
 from loopcal.diagnose.error_frames import fit_frames, fit_unfixed_frames
 from loopcal.estimate import identify, identify_trials
-from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.inference.measured_frames import MeasuredFrames
 from loopcal.estimate.inference.posterior import Posterior, compute_posterior
 from loopcal.estimate.trial_posteriors import compute_trial_posterior

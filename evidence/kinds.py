@@ -27,7 +27,7 @@ from loopcal.estimate import (
     identify,
     identify_trials,
 )
-from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.nuisance.estimate import estimate_nuisance
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.geometry.alignment import align_point_sets, solve_hand_eye

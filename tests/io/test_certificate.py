@@ -57,6 +57,16 @@ RULES = {
 HOSTILE = '<script>alert("1")</script> & ]]> \N{SNOWMAN}'
 
 
+NAMES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
+
+
+def read_text(element: ElementTree.Element, path: str) -> str:
+    """Return the text of the first element of a path."""
+    text = element.findtext(path, namespaces=NAMES)
+    assert text is not None, path
+    return text
+
+
 def check_rules(element: ElementTree.Element) -> None:
     """Assert that an element and all below it follow the rules."""
     tag = element.tag.rpartition("}")[2]
@@ -66,7 +76,7 @@ def check_rules(element: ElementTree.Element) -> None:
         return
     if tag not in RULES:
         assert not children, tag
-        assert element.text.strip(), tag
+        assert (element.text or "").strip(), tag
         return
     left = list(children)
     for rule in RULES[tag].split():
@@ -105,25 +115,24 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     text = format_certificate(lc.load_run(run), load_administration(write_facts(tmp_path, HOSTILE)))
     root = ElementTree.fromstring(text)
     check_rules(root)
-    names = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
     assert root.get("schemaVersion") == "3.3.0"
-    assert root.find(".//dcc:item/dcc:name/dcc:content", names).text == HOSTILE
-    assert HOSTILE in root.find(".//dcc:measuringEquipment/dcc:description/*", names).text
+    assert read_text(root, ".//dcc:item/dcc:name/dcc:content") == HOSTILE
+    assert HOSTILE in read_text(root, ".//dcc:measuringEquipment/dcc:description/*")
     assert "<script>" not in text
-    numbers = [e.text for e in root.findall(".//dcc:identification/dcc:value", names)]
+    numbers = [e.text for e in root.findall(".//dcc:identification/dcc:value", NAMES)]
     assert numbers == ["0017", "0750123", "D-K-15123-01"]
     rows = json.loads((run / "result.json").read_text("utf-8"))["fit"]["parameters"]
     factor = {"mm": 1e-3, "deg": math.pi / 180.0}
-    quantities = root.findall(".//dcc:quantity", names)
+    quantities = root.findall(".//dcc:quantity", NAMES)
     for row, quantity in zip(rows, quantities, strict=False):
-        assert quantity.find("dcc:name/dcc:content", names).text == row["name"]
-        value = float(quantity.find("si:real/si:value", names).text)
+        assert read_text(quantity, "dcc:name/dcc:content") == row["name"]
+        value = float(read_text(quantity, "si:real/si:value"))
         assert value == pytest.approx(row["estimate"] * factor[row["unit"]], rel=1e-12)
-        expanded = float(quantity.find(".//si:valueExpandedMU", names).text)
+        expanded = float(read_text(quantity, ".//si:valueExpandedMU"))
         assert expanded == pytest.approx(row["plus_minus"] * factor[row["unit"]], rel=1e-12)
         unit = r"\metre" if row["unit"] == "mm" else r"\radian"
-        assert quantity.find("si:real/si:unit", names).text == unit
-    assert root.find(".//dcc:metaData/dcc:conformity", names).text == "pass"
+        assert read_text(quantity, "si:real/si:unit") == unit
+    assert read_text(root, ".//dcc:metaData/dcc:conformity") == "pass"
 
 
 def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
@@ -132,7 +141,7 @@ def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:
         text = format_certificate(lc.load_run(run), load_administration(facts))
     except FileError:  # the file is refused
         return
-    name = ElementTree.fromstring(text).find(".//{*}item/{*}name/{*}content").text
+    name = read_text(ElementTree.fromstring(text), ".//dcc:item/dcc:name/dcc:content")
     assert "\u0001" not in name
     assert name.startswith("a")
 

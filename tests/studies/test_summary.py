@@ -16,6 +16,7 @@ from loopcal.errors import DataError
 from loopcal.report.pictures import render_figure
 from loopcal.report.text_page import render_text
 from loopcal.studies.files.store import read_store
+from loopcal.studies.results.figure_layout import choose_layout
 from loopcal.studies.results.study_result import StudyResult
 from loopcal.studies.results.summary import (
     MEMORY,
@@ -25,7 +26,7 @@ from loopcal.studies.results.summary import (
     estimate_share,
     summarize_study,
 )
-from loopcal.studies.results.summary_drawing import choose_layout, render_figures
+from loopcal.studies.results.summary_drawing import render_figures
 from loopcal.studies.results.summary_view import list_shown, view_summary, write_summary
 from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.specification.cells import Cell

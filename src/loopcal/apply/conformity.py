@@ -22,6 +22,7 @@ distribution of a chi-square with the same first three moments (Imhof, Biometrik
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -225,7 +226,7 @@ def report_conformity(
             findings.append(report_finding("conformity.noise-not-stated", quantity=quantity))
             continue
         result, unit = judged[quantity], units[quantity]
-        values = {
+        values: dict[str, Any] = {
             name: Quantity(float(getattr(result, name)) / unit.factor_to_si, unit.symbol)
             for name in ("estimate", "expanded", "limit", "guard_band", "acceptance_limit")
         }
@@ -342,17 +343,20 @@ def _weigh_scales(errors: FloatArray, noise: FloatArray) -> tuple[FloatArray, Fl
     largest = 10.0 * (float(np.abs(errors).max()) + typical)
     if typical == 0.0 or largest == 0.0:
         return np.array([max(largest, 1.0)]), np.ones(1)
-    low, high = np.log(1e-3 * typical), np.log(largest)
     is_present = ~np.isnan(noise)
     squares, variances = errors[is_present] ** 2, noise[is_present]
-    for _ in range(2):
+
+    def weigh(low: float, high: float) -> tuple[FloatArray, FloatArray]:
+        """Return logarithms of tau from low to high, and densities relative to the largest."""
         nodes = np.linspace(low, high, NODES)
         total = variances + np.exp(2.0 * nodes)[:, None]
         density = nodes - 0.5 * (np.log(total) + squares / total).sum(axis=1)  # uniform in tau
-        weight = np.exp(density - density.max())
-        chosen = np.flatnonzero(weight > NEGLIGIBLE)
-        low = nodes[max(chosen[0] - 1, 0)]
-        high = nodes[min(chosen[-1] + 1, NODES - 1)]
+        return nodes, np.exp(density - density.max())
+
+    nodes, weight = weigh(math.log(1e-3 * typical), math.log(largest))
+    chosen = np.flatnonzero(weight > NEGLIGIBLE)
+    first, last = max(chosen[0] - 1, 0), min(chosen[-1] + 1, NODES - 1)
+    nodes, weight = weigh(float(nodes[first]), float(nodes[last]))
     kept = weight > NEGLIGIBLE
     return np.exp(nodes[kept]), weight[kept] / weight[kept].sum()
 

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from loopcal.cli.time_limit import TimeLimitError
 
 DELAY = 0.01
-"""From a lost interrupt to the next one [s], so that the callback has ended and a wait has begun."""
+"""From a lost interrupt to its repetition [s]; by then the callback has ended."""
 
 
 @contextmanager
