@@ -29,6 +29,11 @@ WORKERS = 2
 LONGEST_WAIT = 120.0
 """Seconds within which a driver stores a new block."""
 
+PAUSE = 0.25
+"""Longest time between a new block and the kill, as a share of the time of the blocks between two
+kills: fast computers do not finish the study before its last kill.
+"""
+
 STUDY = """\
 format: 1
 title: A study that is interrupted
@@ -65,16 +70,17 @@ def examine(place: Path, replicates: int, block: int, kills: int, seed: int = 5)
     _start(file, whole).communicate()
     counts = {"driver_kills": 0, "worker_kills": 0}
     share = len(read_contents(whole)) // (kills + 1)
+    longest = PAUSE * share * measure_block(whole)
     for kill in range(kills):
         with _start(file, folder) as driver:
-            _wait_for_blocks(folder, count_blocks(folder) + rng.randint(1, max(share, 1)))
-            time.sleep(rng.uniform(0.0, 0.3))
+            _wait_for_blocks(driver, folder, count_blocks(folder) + rng.randint(1, max(share, 1)))
+            time.sleep(rng.uniform(0.0, longest))
             workers = list_workers(driver.pid) if kill % 2 else []
-            victim = rng.choice(workers or [driver.pid])
-            counts["worker_kills" if workers else "driver_kills"] += 1
-            os.kill(victim, signal.SIGKILL)
-            if workers:
-                _wait_for_blocks(folder, count_blocks(folder) + 1)
+            if workers and _kill(rng.choice(workers)):
+                counts["worker_kills"] += 1
+                _wait_for_blocks(driver, folder, count_blocks(folder) + 1)
+            elif driver.poll() is None:
+                counts["driver_kills"] += 1
             driver.kill()
     out, _ = _start(file, folder).communicate()
     expected, got = read_contents(whole), read_contents(folder)
@@ -106,11 +112,34 @@ def count_blocks(folder: Path) -> int:
         return int(store.connection.execute("SELECT count(*) FROM blocks").fetchone()[0])
 
 
+def measure_block(folder: Path) -> float:
+    """Return the mean time of the computation of a stored block [s]."""
+    with read_store(folder) as store:
+        return float(store.connection.execute("SELECT avg(seconds) FROM blocks").fetchone()[0])
+
+
 def list_workers(driver: int) -> list[int]:
     """Return the worker processes of a driver, without what else Python starts."""
-    children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
-    names = {int(child): Path(f"/proc/{child}/cmdline") for child in children}
-    return [child for child, name in names.items() if b"spawn_main" in name.read_bytes()]
+    children = _read_process(f"{driver}/task/{driver}/children").split()
+    names = {int(child): _read_process(f"{int(child)}/cmdline") for child in children}
+    return [child for child, name in names.items() if b"spawn_main" in name]
+
+
+def _read_process(name: str) -> bytes:
+    """Return a file of /proc; empty where the process has ended meanwhile."""
+    try:
+        return Path("/proc", name).read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
+
+
+def _kill(process: int) -> bool:
+    """Kill a process; return whether it had not ended before."""
+    try:
+        os.kill(process, signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def _start(file: Path, folder: Path) -> subprocess.Popen[str]:
@@ -120,10 +149,10 @@ def _start(file: Path, folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True)
 
 
-def _wait_for_blocks(folder: Path, count: int) -> None:
-    """Wait until a number of blocks is stored, or all."""
+def _wait_for_blocks(driver: subprocess.Popen[str], folder: Path, count: int) -> None:
+    """Wait until a number of blocks is stored, or the driver has stored all and ended."""
     end, before = time.monotonic() + LONGEST_WAIT, -1
-    while (stored := count_blocks(folder)) < count:
+    while (stored := count_blocks(folder)) < count and driver.poll() is None:
         if stored > before:
             end, before = time.monotonic() + LONGEST_WAIT, stored
         assert time.monotonic() < end, "no new block"

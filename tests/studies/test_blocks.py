@@ -126,6 +126,15 @@ def test_more_poses_are_the_same_poses_and_further_ones():
     assert many[:12] == few
 
 
+@pytest.mark.parametrize("choice", ["random", "planned"])
+def test_measured_poses_are_never_the_held_out_ones(choice):
+    levels = {str(seed): PosesLevel(20, choice, seed=seed) for seed in range(6)}
+    for task in list_tasks(make_study(poses=levels)):
+        content = json.loads(task.content)
+        distance = np.array(content["measured"])[:, None] - np.array(content["held_out"])
+        assert np.abs(distance).max(axis=2).min() > 1e-6
+
+
 def test_planned_poses_are_better_than_random_ones():
     levels = {"random": PosesLevel(8), "planned": PosesLevel(8, "planned")}
     random, planned = compute_cells(make_study(poses=levels, replicates=30, block=30))

@@ -28,7 +28,13 @@ from loopcal.studies.files.store import (
 )
 from loopcal.studies.specification.changes import list_conflicts
 from loopcal.studies.specification.keys import dump_json
-from loopcal.studies.specification.levels import ErrorsLevel, MethodLevel, NoiseLevel, Robot
+from loopcal.studies.specification.levels import (
+    ErrorsLevel,
+    MethodLevel,
+    NoiseLevel,
+    PosesLevel,
+    Robot,
+)
 from loopcal.studies.specification.study import Study
 from tests.findings.expectations import expect_refusal
 
@@ -359,3 +365,16 @@ def test_more_replicates_and_further_levels_keep_finished_blocks(changed) -> Non
 )
 def test_other_changes_are_named(changed, sentence) -> None:
     assert list_conflicts(dump_json(STUDY), dump_json(changed)) == (sentence,)
+
+
+def test_other_names_of_files_with_the_same_content_keep_finished_blocks() -> None:
+    old, new = (
+        replace(
+            STUDY,
+            robots={"r": Robot(f"{name}.yaml", "text of the robot")},
+            poses={"p": PosesLevel(1, file=f"{name}.csv", coordinates=((0.1, 0.2),))},
+        )
+        for name in ("old", "new")
+    )
+    assert old.compute_key(old.cells[0], 0) == new.compute_key(new.cells[0], 0)
+    assert list_conflicts(dump_json(old), dump_json(new)) == ()

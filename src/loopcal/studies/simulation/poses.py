@@ -67,26 +67,38 @@ def compute_poses(description: Mapping[str, Any]) -> CellPoses:
     level, seed = read_record(PosesLevel, description["poses"]), description["seed"]
     robot = build_robot_of(description["robot"])
     held_out = sample_workspace(robot.nominal, description["held_out"], seed + 1).coordinates
-    seed = seed if level.seed is None else level.seed
+    chosen_seed = seed if level.seed is None else level.seed
+    stream = choose_stream(chosen_seed, seed + 1)
     if level.coordinates:
         measured = np.array(level.coordinates)
     elif level.is_on_surfaces:
-        measured = plan_plane_line_points(robot.nominal, level, seed)
+        measured = plan_plane_line_points(robot.nominal, level, stream)
     elif not is_planned(level):
-        measured = sample_workspace(robot.nominal, level.count, seed).coordinates
+        measured = sample_workspace(robot.nominal, level.count, stream).coordinates
     else:
         errors = read_record(ErrorsLevel, description["errors"])
         instrument = make_instrument(
             read_record(InstrumentLevel, description["instrument"]),
             read_record(NoiseLevel, description["noise"]),
         )
-        options = PlanOptions(n_poses=level.count, hold_out=0, seed=seed)
+        options = PlanOptions(n_poses=level.count, hold_out=0, seed=chosen_seed)
         chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)
         measured = chosen.poses.coordinates
     return CellPoses(measured.tolist(), held_out.tolist())
 
 
-def plan_plane_line_points(robot: Mechanism, level: PosesLevel, seed: int) -> FloatArray:
+def choose_stream(seed: int, held_out: int) -> int | np.random.Generator:
+    """Return the seed of drawn poses, or another stream in place of the seed of the held-out poses:
+    with the same one, the measured poses would be the held-out ones.
+    """
+    if seed != held_out:
+        return seed
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+
+
+def plan_plane_line_points(
+    robot: Mechanism, level: PosesLevel, seed: int | np.random.Generator
+) -> FloatArray:
     """Return coordinates (n, c) of points on planes and perpendicular lines; cells that differ in
     tolerances, noise or method have the same points.
     """

@@ -12,6 +12,9 @@ from loopcal.studies.specification.levels import FACTORS
 FREE = frozenset({"title", "order", "questions"})
 """Keys that change no number."""
 
+NAMES_OF_FILES = {"robots": "source", "poses": "file"}
+"""Factor -> setting that says where a level was read; its content counts, not its name."""
+
 LONGEST = 40
 """Characters of a value that is shown."""
 
@@ -19,7 +22,8 @@ LONGEST = 40
 def list_conflicts(old: str, new: str) -> tuple[str, ...]:
     """Return the changes by which finished blocks of a study would not belong to it any more.
 
-    More replicates, further levels, and another title, order or question are none.
+    More replicates, further levels, other names of files with the same content, and another title,
+    order or question are none.
 
     Parameters
     ----------
@@ -46,9 +50,15 @@ def _compare(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
                 if level not in after:
                     yield f"{key}/{level}: removed"
                 else:
-                    yield from _compare_values(f"{key}/{level}", before[level], after[level])
+                    values = (_drop_file_name(key, levels[level]) for levels in (before, after))
+                    yield from _compare_values(f"{key}/{level}", *values)
         else:
             yield from _compare_values(key, before, after)
+
+
+def _drop_file_name(factor: str, level: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a level without the name of the file in which they were read."""
+    return {key: value for key, value in level.items() if key != NAMES_OF_FILES.get(factor)}
 
 
 def _compare_values(path: str, old: Any, new: Any) -> Iterator[str]:
