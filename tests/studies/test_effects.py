@@ -77,6 +77,14 @@ def test_the_stated_share_of_rows_is_far_off():
     assert_allclose(distance[distance > 0], 30.0)
 
 
+def test_a_share_of_less_than_one_row_is_off_in_as_many_trials():
+    noise = AlteredNoise(Gaussian(SIGMA), EffectsLevel(outliers=Outliers(0.05, 1000.0)))
+    streams = [make_random_stream(1, trial) for trial in range(2000)]
+    sizes = np.array([np.abs(noise.draw(stream, 6) / SIGMA).max(axis=1) for stream in streams])
+    assert set((sizes > 100.0).sum(axis=1)) == {0, 1}
+    assert abs(np.mean(sizes > 100.0) - 0.05) < 0.008
+
+
 def test_drift_and_jump_have_the_stated_size_and_no_mean():
     drift = draw_motion(EffectsLevel(drift=1e-4), 5, POSES, 1)
     assert_allclose(np.linalg.norm(drift[:, -1] - drift[:, 0], axis=1), 1e-4)

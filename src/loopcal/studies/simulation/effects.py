@@ -61,7 +61,8 @@ class AlteredNoise(Noise):
             for i in range(1, n):
                 noise[i] = effects.correlation * noise[i - 1] + share * noise[i]
         if effects.outliers is not None:
-            wrong = generator.permutation(n)[: round(effects.outliers.share * n)]
+            count = effects.outliers.share * n
+            wrong = generator.permutation(n)[: round(count) or int(generator.random() < count)]
             direction = generator.standard_normal((len(wrong), shape[1]))
             length = np.linalg.norm(direction, axis=1, keepdims=True)
             noise[wrong] += effects.outliers.size * direction / length

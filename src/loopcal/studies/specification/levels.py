@@ -256,7 +256,10 @@ class MethodLevel:
 
 @dataclass(frozen=True)
 class Outliers:
-    """`share` of the rows lie `size` sigmas off, in a random direction."""
+    """`share` of the rows lie `size` sigmas off, in a random direction.
+
+    It is rounded to whole rows; where that is none, one row is off in as many of the trials.
+    """
 
     share: float = 0.05
     size: float = 20.0
