@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.cli import main
 from loopcal.documents.sources import load_record
 from loopcal.errors import ArgumentTypeError, FileError
 from loopcal.report.document.calibration_document import SECTIONS, build_document
@@ -197,3 +198,25 @@ def test_limits_of_calls_are_sentences(calibration, tmp_path) -> None:
     with pytest.raises(FileError, match="does not exist"):
         lc.write_report(tmp_path / "nowhere" / "report.html", calibration)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_report_of_a_cable_robot_names_its_repeatability_and_judges_no_sigma_by_residuals(
+    tmp_path, monkeypatch
+) -> None:
+    """83 % of the expected error is the repeatability of the motors: no instrument reduces it."""
+    monkeypatch.chdir(tmp_path)
+    simulated = ["simulate", "cable-4", "--draw", "32", "--draw-errors", "--seed", "3"]
+    assert main([*simulated, "-o", "data.csv"]) == 0
+    limit = ["--hold-out", "0.25", "--limit-position", "0.05mm"]
+    assert main(["calibrate", "cable-4", "data.csv", "-o", "run", *limit]) == 2
+    record = load_record(lc.load_run("run"))
+    text = render_html(build(record, "verdict", "residual"))
+    assert "no calibration reduces it" in text
+    assert "better instrument" not in text
+    assert "every pose is estimated too" in text
+
+
+def test_report_explains_the_stated_frame_and_small_residuals(page) -> None:
+    text = page.read_text("utf-8")
+    assert "The stated frame is the one in which the measurement files state" in text
+    assert "every pose is estimated too" not in text

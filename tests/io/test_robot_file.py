@@ -166,3 +166,14 @@ def test_unknown_robot_name_is_refused_with_the_shipped_ones() -> None:
         FileError, match=r"does not exist .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42"
     ):
         load_robot("hexapod-43")
+
+
+def test_folder_with_the_name_of_a_shipped_robot_does_not_hide_it(tmp_path, monkeypatch) -> None:
+    """`loopcal example hexapod-42` makes such a folder."""
+    monkeypatch.chdir(tmp_path)
+    shipped = find_robot_file("hexapod-42")
+    (tmp_path / "hexapod-42").mkdir()
+    assert find_robot_file("hexapod-42") == shipped
+    own = tmp_path / "linear-delta"
+    own.write_text(HEXAPOD)
+    assert find_robot_file("linear-delta").resolve() == own.resolve()

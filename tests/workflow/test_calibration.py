@@ -337,3 +337,21 @@ def test_suggestions_use_the_rank_tolerance_of_the_fit(robot, data) -> None:
 def test_unknown_frame_of_errors_is_refused_before_the_fit(robot, data):
     with pytest.raises(EstimationError, match=r"frame is 'laser'.*'fitted', 'base', 'relative'"):
         calibrate(robot, data, CalibrationOptions(frame="laser"))
+
+
+def test_next_step_after_an_exceeded_limit_names_repeatability_that_no_calibration_reduces():
+    sizes = {"error": Quantity(0.24, "mm"), "limit": Quantity(0.05, "mm")}
+    failure = report_finding(
+        "gates.limit-exceeded", quantity="position", pose="32", target="", **sizes
+    )
+
+    def step(findings, shares):
+        return choose_next_step(Verdict.NOT_CALIBRATED, findings, (), shares)
+
+    chosen = step((failure,), {"position": 0.83, "orientation": 0.0})
+    assert chosen.code == "workflow.next-improve-machine"
+    assert "83 % of the variance of the expected position error" in str(chosen)
+    for shares in ({"position": 0.4, "orientation": 0.9}, {}):
+        assert step((failure,), shares).code == "workflow.next-measure-more"
+    grown = report_finding("gates.errors-grew", quantity="position", times=1.4)
+    assert step((failure, grown), {"position": 0.83}).code == "workflow.next-measure-more"

@@ -156,7 +156,15 @@ class CalibrationReport(TableResult):
     def next_step(self) -> Finding:
         """The step that helps most now."""
         outliers = () if self.examination is None else self.examination.outliers.names
-        return choose_next_step(self.verdict, self.findings, outliers)
+        repeatability = {}
+        if self.budget is not None and self.states_expected_error:
+            sources = {"position": self.budget.position, "orientation": self.budget.orientation}
+            repeatability = {
+                quantity: errors.repeatability / sum(errors)
+                for quantity, errors in sources.items()
+                if sum(errors) > 0.0
+            }
+        return choose_next_step(self.verdict, self.findings, outliers, repeatability)
 
     @property
     def states_expected_error(self) -> bool:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 
 from loopcal.findings import Finding, Severity, report_finding
@@ -21,6 +21,9 @@ BLUNDERS = ("validation.blunder", "validation.blunders-dominate")
 TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDERS[1])
 """Findings that leave the verdict open."""
 
+
+LIMIT_EXCEEDED = "gates.limit-exceeded"
+"""Finding that an error is above a stated limit."""
 
 DEPENDENT = (
     "residuals.drift",
@@ -76,13 +79,17 @@ def decide_verdict(findings: Iterable[Finding]) -> Verdict:
 
 
 def choose_next_step(
-    verdict: Verdict, findings: Sequence[Finding], outliers: Sequence[str]
+    verdict: Verdict,
+    findings: Sequence[Finding],
+    outliers: Sequence[str],
+    repeatability: Mapping[str, float] | None = None,
 ) -> Finding:
     """Return the step that helps most now, as a suggestion.
 
     Parameters
     ----------
     findings : of the calibration. outliers : labels of poses that do not fit the others.
+    repeatability : its share of the variance of the expected error, by quantity.
     """
     if verdict is Verdict.CALIBRATED:
         return report_finding("workflow.next-use-result")
@@ -109,4 +116,9 @@ def choose_next_step(
         if any(finding.code in DEPENDENT for finding in findings):
             return report_finding("workflow.next-check-residuals")
         return report_finding("workflow.next-check-noise")
+    for finding in findings:
+        quantity = str(finding.data.get("quantity", ""))
+        share = (repeatability or {}).get(quantity, 0.0)
+        if failed == {finding.code} == {LIMIT_EXCEEDED} and share > 0.5:
+            return report_finding("workflow.next-improve-machine", share=share, quantity=quantity)
     return report_finding("workflow.next-measure-more")

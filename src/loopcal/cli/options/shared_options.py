@@ -145,7 +145,10 @@ def flag_option(*names: str, help: str) -> Decorator:  # noqa: A002
 
 def force_option(what: str, more: str = "") -> Decorator:
     """Return the option that lets a command replace what exists, and `more`."""
-    return flag_option("--force", help=f"Replace {what} if it exists{more}.")
+    return flag_option(
+        "--force",
+        help=f"Replace {what} if {'they exist' if what.endswith('files') else 'it exists'}{more}.",
+    )
 
 
 def seed_option(what: str) -> Decorator:

@@ -191,13 +191,13 @@ def find_robot_file(source: str | Path) -> Path:
     ------
     FileError : neither of them.
     """
-    path = as_path(source, WHAT)
+    path, shipped = as_path(source, WHAT), list_shipped_robots()
+    # a folder is no robot file: `loopcal example hexapod-42` makes one with the name of a robot
+    if str(source) in shipped and not path.is_file():
+        return shipped[str(source)]
     if path.exists():
         _refuse_file_of_program(path)
         return path
-    shipped = list_shipped_robots()
-    if str(source) in shipped:
-        return shipped[str(source)]
     hint, names = suggest_names(str(source), shipped), ", ".join(shipped) or "none"
     act = f"name a file, or one of the shipped robots: {names}"
     raise FileError(f"this robot file does not exist{hint}; {act}", path)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from loopcal.apply import accuracy_map
 from loopcal.errors import LoopcalError
 from loopcal.estimate.residuals import KindResiduals
+from loopcal.measure.kinds.joints.actuator_readings import ActuatorReadings
 from loopcal.report.document.elements import Element
 from loopcal.report.document.inline_svg import make_picture
 from loopcal.report.document.record import CalibrationRecord
@@ -48,8 +49,19 @@ def draw_residual_picture(record: CalibrationRecord) -> Iterator[Element]:
         "Residuals of the fitted rows.",
         "The panels show the residuals in the order of the poses, by component, as a histogram and "
         "normal plot, and against actuator readings and recorded quantities. Whitened residuals "
-        "are divided by their sigma; 95 % of them lie between the dashed lines if the stated noise "
-        "is right.",
+        "are divided by their sigma; of errors with the stated noise 95 % lie between the dashed "
+        f"lines. {_describe_shrinkage(record.residuals)}",
+    )
+
+
+def _describe_shrinkage(residuals: Sequence[KindResiduals]) -> str:
+    """Return why fitted residuals are smaller than the noise, and what to judge the noise by."""
+    if all(rows.kind != ActuatorReadings.name for rows in residuals):
+        return "The fit follows its data, so residuals of few rows are smaller than their errors."
+    return (
+        "The actuator readings are uncertain, so every pose is estimated too and follows its "
+        "measured values: residuals far below one sigma do not show that sigma is too large. "
+        "Chi-square above allows for that."
     )
 
 
@@ -150,8 +162,8 @@ def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
         draw_accuracy_map(accuracy),
         "accuracy-figure",
         "Standard uncertainty of poses over the workspace.",
-        "Slices of the workspace show the standard uncertainty of position and orientation by "
-        "color.",
+        "Slices of the workspace show the standard uncertainty of the pose by color. Circles mark "
+        "extrapolated poses, which are less certain than every measured pose.",
     )
 
 

@@ -215,7 +215,10 @@ def _draw_against(
     name: str,
 ) -> None:
     """Draw the residuals over sigma against a recorded quantity."""
+    from matplotlib.ticker import MaxNLocator
+
     factor, symbol = find_quantity_unit(robot, name)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
     for s in series:
         if name in s.quantities:
             axes.plot(

@@ -17,6 +17,8 @@ BASELINE = (
     "the rows of the calibration. After: the calibrated geometry. Noise floor: the error that the "
     "stated measurement noise alone causes."
 )
+STATED_FRAME = "The stated frame is the one in which the measurement files state their values."
+
 NOT_HELD_OUT = (
     "No pose was held out of this fit, so the report states no error at poses that were not fitted."
 )
@@ -35,7 +37,8 @@ def build_error_section(record: CalibrationRecord) -> Section:
         if record.held_out_labels and stored is None:
             reason = "The errors at the held-out poses could not be computed; see the findings."
         return Section("errors", "Errors at held-out poses", (reason,))
-    elements: list[Element] = [BASELINE, *view_errors(errors, "held-out")]
+    explained = f"{BASELINE} {STATED_FRAME}" if "stated frame" in errors.frame else BASELINE
+    elements: list[Element] = [explained, *view_errors(errors, "held-out")]
     elements += [" ".join(describe_improvements(errors)), *draw_validation_picture(record)]
     elements += [table for table in view_error_statistics(errors) if not isinstance(table, str)]
     return Section("errors", "Errors at held-out poses", tuple(e for e in elements if e))
