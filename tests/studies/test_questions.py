@@ -117,7 +117,7 @@ def test_a_study_without_trials_has_no_answer(tmp_path: Path) -> None:
         pass
     (answered,) = StudyResult(tmp_path / "study").answer_questions()
     assert {a.certainty for a in answered.answers} == {"unknown"}
-    assert "no trials stored" in render_text(view_answers([answered]), 100)
+    assert "no trials with this score" in render_text(view_answers([answered]), 200)
 
 
 def test_the_page_states_level_share_interval_and_what_is_not_known(result: StudyResult) -> None:
@@ -222,3 +222,19 @@ def test_effects_are_ordered_by_an_inner_number() -> None:
     }
     (chain,) = list_chains(replace(make_study(), effects=effects), "effects")
     assert (chain.quantity, chain.levels) == ("outliers share", ("few", "many"))
+
+
+def test_score_that_the_robot_does_not_have_is_unknown_and_not_missed(tmp_path: Path) -> None:
+    def compute(cell: Cell) -> Scores:
+        outcome = np.where(np.arange(400) < 7, 1.0, 0.0)
+        is_defined = cell.levels["noise"] == "2" and cell.levels["method"] == "map"
+        return {"orientation": np.full(400, 1e-4 if is_defined else np.nan), "outcome": outcome}
+
+    result = store_scores(tmp_path / "study", make_study(), compute)
+    answered = result.find_smallest("poses", "orientation", "1 mrad")
+    certainties = {tuple(a.levels.values()): a.certainty for a in answered.answers}
+    assert certainties.pop(("2", "map")) == "certain"
+    assert set(certainties.values()) == {"unknown"}
+    unknown = next(a for a in answered.answers if a.certainty == "unknown")
+    assert {(share.reached, share.trials) for share in unknown.shares} == {(0, 0)}
+    assert "10: no trials" in render_text(view_answers([answered]), 200)

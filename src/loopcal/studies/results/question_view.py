@@ -70,7 +70,7 @@ def say_answer(answer: Answer, wanted: str) -> str:
     names = answer.candidates
     first = answer.shares[0 if wanted == "smallest" else -1].level
     if answer.certainty == "unknown":
-        return "no trials stored"
+        return "no trials with this score"
     if answer.certainty == "none":
         return "no level"
     if answer.certainty == "certain":

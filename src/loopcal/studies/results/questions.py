@@ -16,6 +16,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import find_columns, iterate_trials
 from loopcal.studies.results.summary import LEVEL, Interval, compute_binomial_interval
@@ -35,7 +37,7 @@ class LevelShare:
     Attributes
     ----------
     level : its name. value : its number [SI], None without one.
-    reached, trials : machines within the limit, and all.
+    reached, trials : machines within the limit, and all; 0 where none has the score.
     share : of the machines within the limit. state : whether this share is at least the demanded
         one: "yes" or "no" for certain, else "open".
     """
@@ -57,7 +59,7 @@ class Answer:
     levels : the other varied factors -> level. chain : what distinguishes the levels that were
         compared; empty where all were. quantity, unit : of the numbers of the levels.
     certainty : "certain": `best` is the answer. "between": it is one of `candidates`. "none": no
-        level reaches the limit. "unknown": no trial is stored.
+        level reaches the limit. "unknown": no stored trial has the score.
     best : the smallest (or largest) level that reaches the limit for certain; None without one.
     candidates : levels that may be the answer. may_be_none : whether it is possible that no level
         reaches the limit.
@@ -203,10 +205,13 @@ def _group_cells(study: Study, factor: str) -> Iterator[tuple[dict[str, str], di
 def _count_reached(
     study: Study, store: StudyStore, cell: Cell, place: int, limit: float
 ) -> tuple[int, int]:
-    """Return how many converged trials of a cell have a score up to the limit, and all trials."""
-    reached = trials = 0
+    """Return how many converged trials of a cell have a score up to the limit, and all trials; none
+    where no converged trial has the score, such as a rotation error of a platform that only moves.
+    """
+    reached = trials = converged = defined = 0
     for _, scores in iterate_trials(study, store, cell):
-        is_good = scores[:, 0] == 0.0
-        reached += int((is_good & (scores[:, place] <= limit)).sum())
-        trials += len(scores)
-    return reached, trials
+        values = scores[scores[:, 0] == 0.0, place]
+        reached += int((values <= limit).sum())
+        defined += int((~np.isnan(values)).sum())
+        trials, converged = trials + len(scores), converged + len(values)
+    return (0, 0) if converged and not defined else (reached, trials)
