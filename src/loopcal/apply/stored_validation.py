@@ -117,7 +117,12 @@ def _restore_kinds(content: list[Mapping[str, Any]]) -> tuple[KindErrors, ...]:
     """Return the whitened errors of each kind."""
     keys = ("before", "after", "noise_floor")
     return tuple(
-        KindErrors(kind["kind"], kind["count"], *(_number(kind[key]) for key in keys))
+        KindErrors(
+            kind["kind"],
+            kind["count"],
+            *(_number(kind[key]) for key in keys),
+            change=_number(kind.get("change")),
+        )
         for kind in content
     )
 

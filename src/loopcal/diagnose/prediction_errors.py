@@ -154,7 +154,11 @@ class PredictionComparison:
             return kinds
         errors = (*kinds[:-1], self.readings)
         return summarize_kinds(
-            {k.kind: np.array([1.0, k.before**2, k.after**2]) * k.count for k in errors if k.count}
+            {
+                k.kind: np.array([1.0, k.before**2, k.after**2, k.change**2]) * k.count
+                for k in errors
+                if k.count
+            }
         )
 
 
@@ -303,7 +307,8 @@ def _compare_readings(
     """Return the whitened errors of redundant readings of two geometries, at usable poses."""
     if first is None or last is None:
         return None
-    squares = [(fit.reading_residuals[usable] ** 2).sum() for fit in (first, last)]
+    residuals = [fit.reading_residuals[usable] for fit in (first, last)]
+    squares = [(r**2).sum() for r in (*residuals, residuals[0] - residuals[1])]
     count = int(last.left[usable].sum())
     return summarize_kinds({READINGS: np.array([count, *squares])})[0]
 

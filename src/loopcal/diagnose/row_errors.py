@@ -195,6 +195,8 @@ class KindErrors:
     kind : its name; "all" for all kinds. count : measured components over all its rows.
     before, after : root mean square of the whitened residuals [sigma].
     noise_floor : the value for an exact geometry [sigma].
+    change : root mean square of their difference, which is that of the two predictions [sigma]; NaN
+        where it was not stored.
     """
 
     kind: str
@@ -202,6 +204,21 @@ class KindErrors:
     before: float
     after: float
     noise_floor: float = 1.0
+    change: float = np.nan
+
+    @property
+    def gain(self) -> float:
+        """How clearly the geometry after calibration is the better one [standard deviations].
+
+        With the whitened residuals b of the geometry before and the change d = b - a: b.d / |d|.
+        Where the geometry before is the truth, b is noise, and this has the standard normal
+        distribution, if d was estimated from other rows. Where the one after is the truth, the mean
+        is |d|. 0 where the predictions are equal.
+        """
+        if self.change == 0.0:
+            return 0.0
+        product = 0.5 * (self.before**2 - self.after**2 + self.change**2)
+        return float(np.sqrt(self.count) * product / self.change)
 
     @property
     def improvement(self) -> float:
@@ -273,9 +290,10 @@ def compute_kind_errors(
     totals: dict[str, FloatArray] = {}
     for o, *residuals in zip(observations, before, after, strict=True):
         squares = [
-            ((o.whitener @ np.where(o.present, r, 0.0)[..., None]) ** 2).sum() for r in residuals
+            ((o.whitener @ np.where(o.present, r, 0.0)[..., None]) ** 2).sum()
+            for r in (*residuals, residuals[0] - residuals[1])
         ]
-        total = totals.setdefault(o.kind.name, np.zeros(3))
+        total = totals.setdefault(o.kind.name, np.zeros(4))
         total += [o.present.sum(), *squares]
     return summarize_kinds(totals)
 
@@ -283,15 +301,14 @@ def compute_kind_errors(
 def summarize_kinds(totals: Mapping[str, FloatArray]) -> tuple[KindErrors, ...]:
     """Return the errors of each kind and, last, of all kinds.
 
-    `totals` are (count, sum of squares before, sum of squares after) of each kind.
+    `totals` are the count and the sums of squares before, after and of the change, of each kind.
     """
-    every = {**totals, "all": np.sum([np.zeros(3), *totals.values()], axis=0)}
-    return tuple(
-        KindErrors(
-            name, int(n), *(float(np.sqrt(square / n)) if n else np.nan for square in squares)
-        )
-        for name, (n, *squares) in every.items()
-    )
+    every = {**totals, "all": np.sum([np.zeros(4), *totals.values()], axis=0)}
+    kinds = []
+    for name, (n, *squares) in every.items():
+        roots = [float(np.sqrt(square / n)) if n else np.nan for square in squares]
+        kinds.append(KindErrors(name, int(n), roots[0], roots[1], change=roots[2]))
+    return tuple(kinds)
 
 
 def compute_noise_floor(observations: Sequence[Observations]) -> NoiseFloor:

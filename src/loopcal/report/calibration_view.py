@@ -51,7 +51,8 @@ def view_calibration(
     """Return the page of a calibration.
 
     Verdict, expected error and its sources, errors with the noise floor, the most important
-    findings, the next step, and the parameters. With `verbose` also every finding and table.
+    findings, the recommendation, the next step, and the parameters. With `verbose` also every
+    finding and table.
     """
     fit = report.identification
     rows = fit.to_dict()
@@ -65,7 +66,7 @@ def view_calibration(
         blocks.append(f"  {fit.regularization.finding}")
     if report.comparison is not None:
         blocks += ["", str(report.comparison.outcome)]
-    blocks += ["", f"Next: {report.next_step}"]
+    blocks += ["", f"Recommendation: {report.recommendation}", f"Next: {report.next_step}"]
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")
     if fit.converged:

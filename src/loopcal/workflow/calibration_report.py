@@ -31,6 +31,7 @@ from loopcal.presentation import TableResult
 from loopcal.serialization import to_json
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
+from loopcal.workflow.recommendation import recommend_values
 from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
 
 TOP = 3
@@ -166,6 +167,12 @@ class CalibrationReport(TableResult):
             }
         return choose_next_step(self.verdict, self.findings, outliers, repeatability)
 
+    @cached_property
+    def recommendation(self) -> Finding:
+        """Whether to apply the identified values or to keep the current ones."""
+        test = self.identification.residual_test
+        return recommend_values(self.verdict, self.start, test, self.validation)
+
     @property
     def states_expected_error(self) -> bool:
         """Whether the budget is the expected error of the machine: not where the residuals
@@ -186,13 +193,14 @@ class CalibrationReport(TableResult):
         )
 
     def __str__(self) -> str:
-        """Return verdict, expected and validated errors, important findings and the next step."""
+        """Return verdict, expected and validated errors, findings, recommendation and next step."""
         errors = self.validation or self.fitted_errors
         lines = [self.headline, *([str(self.budget)] if self.states_expected_error else [])]
         if errors is not None:
             lines += str(errors).splitlines()[:1] if self.validation else [FITTED_ERRORS]
             lines += errors.describe_rms()
         lines += [f"{finding.severity.value}: {finding}" for finding in self.top_findings]
+        lines.append(f"Recommendation: {self.recommendation}")
         return "\n".join([*lines, f"Next: {self.next_step}"])
 
     __repr__ = __str__
@@ -233,6 +241,7 @@ class CalibrationReport(TableResult):
             "headline": self.headline,
             "states_expected_error": self.states_expected_error,
             "findings": self.findings,
+            "recommendation": self.recommendation,
             "next_step": self.next_step,
             "passed": not self.failures,
             "reasons": [str(finding) for finding in self.failures],

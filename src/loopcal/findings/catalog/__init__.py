@@ -28,6 +28,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "workflow": ("gates", "workflow"),
     "fit": ("fit", "prior", "poses", "setup"),
     "residuals": ("noise", "residuals"),
+    "values": ("values",),
     "comparison": ("comparison",),
     "run_comparison": ("runs",),
     "identifiability": ("identifiability", "model"),

@@ -55,6 +55,9 @@ def build_verdict_section(record: CalibrationRecord) -> Section:
     important = [f for f in select_important(record.findings) if f not in judged]
     if important:
         elements.append(list_findings(important))
+    recommendation = result.get("recommendation")  # absent in runs of earlier versions
+    if recommendation:
+        elements.append(f"Recommendation: {recommendation['text']}")
     next_step = result.get("next_step")
     if next_step:
         elements.append(f"Next: {next_step['text']}")

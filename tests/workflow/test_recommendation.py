@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Current values that are right are kept, and wrong ones are replaced."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.diagnose import compute_kind_errors
+from loopcal.measure import Measurements, Observations
+from loopcal.measure.kinds import Component
+from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.workflow import Verdict
+from loopcal.workflow.recommendation import recommend_values
+
+SIGMA = 20e-6
+"""Noise of the probe [m]."""
+RINGS = ((1, 0.0, 0.0), (6, 35e-3, 0.0), (6, 70e-3, 30.0))
+"""Number of points, radius [m] and first angle [deg]: the thirteen points of the page on deltas."""
+TIMES = 2
+"""Each ring is probed at so many first angles: 25 points leave enough to hold out."""
+WRONG = {
+    "radius by 0.5 mm": {"radius": 0.5e-3},
+    "a stop by 0.1 mm": {"tower1.stop": 0.1e-3},
+    "two stops by 0.2 mm": {"tower1.stop": 0.2e-3, "tower3.stop": -0.2e-3},
+    "stop and radius by 0.3 mm": {"tower2.stop": 0.3e-3, "radius": -0.3e-3},
+}
+
+
+@pytest.fixture(scope="module")
+def printer(root) -> Mechanism:
+    return lc.load_robot(root / "examples" / "delta-printer" / "printer.yaml")
+
+
+def list_points() -> np.ndarray:
+    """Return the probed points (25, 3) [m]."""
+    points = []
+    for count, radius, first in RINGS:
+        many = count if count == 1 else TIMES * count
+        angles = np.deg2rad(first) + 2.0 * np.pi / many * np.arange(many)
+        points += [(radius * np.cos(a), radius * np.sin(a), 0.0) for a in angles]
+    return np.array(points)
+
+
+def probe(
+    printer: Mechanism, errors: dict[str, float], seed: int, stated: float = SIGMA
+) -> Measurements:
+    """Return heights of a printer that differs from its stored values by `errors` [SI]."""
+    change = np.array([errors.get(name, 0.0) for name in printer.parameters.names])
+    q = inverse(printer, list_points()).q
+    heights = forward(printer.with_values(printer.values + change), q).T[:, 2, 3]
+    noise = SIGMA * np.random.default_rng(seed).standard_normal(len(heights))
+    rows = np.arange(len(heights))
+    kind = Component(("z",)).with_tool(printer.tool)
+    observed = Observations.from_sigma(kind, rows, (heights + noise)[:, None], stated)
+    return Measurements(printer.name, q, (observed,))
+
+
+def recommend(printer: Mechanism, data: Measurements, hold_out: float, seed: int = 1) -> str:
+    options = lc.CalibrationOptions(hold_out=hold_out, seed=seed, check_conventions=False)
+    return lc.calibrate(printer, data, options).recommendation.code
+
+
+@pytest.mark.parametrize("hold_out", [0.0, 0.25])
+def test_right_values_are_kept(printer, hold_out) -> None:
+    codes = [recommend(printer, probe(printer, {}, seed), hold_out, seed) for seed in range(6)]
+    assert all(code.startswith("values.keep") for code in codes), codes
+
+
+@pytest.mark.parametrize("hold_out", [0.0, 0.25])
+@pytest.mark.parametrize("errors", WRONG.values(), ids=WRONG)
+def test_wrong_values_are_replaced(printer, errors, hold_out) -> None:
+    expected = "values.apply" if hold_out else "values.apply-fitted"
+    codes = [recommend(printer, probe(printer, errors, seed), hold_out, seed) for seed in (1, 2)]
+    assert set(codes) == {expected}
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("hold_out", [0.0, 0.25])
+def test_right_values_are_kept_in_95_percent_of_printers(printer, hold_out) -> None:
+    codes = [recommend(printer, probe(printer, {}, seed), hold_out, seed) for seed in range(300)]
+    # 5 % of 300 is 15, with a standard deviation of 3.8: what is allowed is the 5 % itself
+    assert sum(not code.startswith("values.keep") for code in codes) <= 15
+
+
+def test_wrong_values_are_replaced_in_the_same_printer_with_a_guessed_noise(printer) -> None:
+    data = probe(printer, WRONG["radius by 0.5 mm"], 3, stated=60e-6)
+    options = lc.CalibrationOptions(hold_out=0.25, fit=lc.FitOptions(noise="estimated"))
+    report = lc.calibrate(printer, data, options)
+    assert report.recommendation.code == "values.apply"
+    assert report.to_dict()["recommendation"]["code"] == "values.apply"
+    assert f"Recommendation: {report.recommendation}" in str(report)
+
+
+def test_gain_is_standard_normal_where_the_values_before_are_right(printer) -> None:
+    rng = np.random.default_rng(5)
+    rows = np.arange(8)
+    kind = Component(("z",)).with_tool(printer.tool)
+    observed = Observations.from_sigma(kind, rows, np.zeros((8, 1)), SIGMA)
+    change = SIGMA * rng.standard_normal((8, 1))
+    gains = []
+    for noise in SIGMA * rng.standard_normal((2000, 8, 1)):
+        kinds = compute_kind_errors([observed], [noise], [noise - change])
+        gains.append(kinds[-1].gain)
+    assert np.mean(gains) == pytest.approx(0.0, abs=4.0 / np.sqrt(2000))
+    assert np.std(gains) == pytest.approx(1.0, abs=4.0 / np.sqrt(4000))
+    size = float(np.linalg.norm(change)) / SIGMA
+    right_after = [
+        compute_kind_errors([observed], [noise + change], [noise])[-1].gain
+        for noise in SIGMA * rng.standard_normal((2000, 8, 1))
+    ]
+    assert np.mean(right_after) == pytest.approx(size, abs=4.0 / np.sqrt(2000))
+    assert compute_kind_errors([observed], [change], [change])[-1].gain == 0.0
+
+
+def test_values_that_held_out_poses_do_not_confirm_are_kept(printer) -> None:
+    """The held-out points are those of the printer with the current values."""
+    fitted = lc.calibrate(printer, probe(printer, WRONG["radius by 0.5 mm"], 4))
+    others = lc.validate(fitted.identification, probe(printer, {}, 5))
+    test = fitted.identification.residual_test
+    finding = recommend_values(Verdict.CALIBRATED, fitted.start, test, others)
+    assert finding.code == "values.keep-not-confirmed"
+    failed = recommend_values(Verdict.NOT_CALIBRATED, fitted.start, test, others)
+    assert failed.code == "values.keep-not-calibrated"
