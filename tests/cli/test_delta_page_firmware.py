@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/delta-printers.md: the commands for Marlin and RepRapFirmware, on simulated reports."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_g30
+
+NOISE = 0.02
+"""Of the simulated probe [mm], as the command for Marlin states it."""
+
+
+@pytest.fixture
+def commands(root, tmp_path, monkeypatch) -> list[str]:
+    """Work in an empty folder; return the commands of the section, without the program's name."""
+    monkeypatch.chdir(tmp_path)
+    page = (root / "docs" / "delta-printers.md").read_text("utf-8")
+    section = page.split("## From probe reports of Marlin")[1].split("\n## ")[0]
+    found = re.findall(r"^loopcal (.*)$", section, re.MULTILINE)
+    assert len(found) == 3
+    return found
+
+
+def add_noise(heights: list[float]) -> list[float]:
+    noise = NOISE * np.random.default_rng(7).standard_normal(len(heights))
+    return list(np.add(heights, noise))
+
+
+def check_recommendation(truth, code: str) -> None:
+    """Check that the run recommends new values, and that they are the true ones."""
+    result = json.loads(Path("run/result.json").read_text())
+    assert result["recommendation"]["code"] == code
+    fit = lc.load_run("run").robot
+    place = fit.parameters.names.index("radius")
+    assert fit.values[place] == pytest.approx(truth.values[place], abs=0.2e-3)
+
+
+def test_commands_for_marlin_lead_to_a_recommendation(commands) -> None:
+    Path("m503.gcode").write_text(MARLIN)
+    robot, truth = make_truth("m503.gcode")
+    write_g30(POINTS, add_noise(probe(robot, truth, POINTS)), "g30.txt")
+    importing, calibrating = commands[:2]
+    assert importing.startswith("import m503.gcode")
+    assert main(importing.split()) == 0
+    assert main(calibrating.split()) == 0
+    check_recommendation(truth, "values.apply")  # five of 13 points are held out
+
+
+def test_commands_for_reprapfirmware_lead_to_a_recommendation(commands) -> None:
+    Path("config-override.g").write_text(REPRAP)
+    robot, truth = make_truth("config-override.g")
+    cells = " ".join(f"{h:.3f}" for h in add_noise(probe(robot, truth, POINTS)))
+    Path("g32.txt").write_text(f"G32 bed probe heights: {cells}, mean 0, deviation 0")
+    bed = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999" for i, (x, y) in enumerate(POINTS)]
+    Path("bed.g").write_text("\n".join(bed) + " S-1\n")
+    assert main(commands[2].split()) == 0
+    assert main(commands[1].split()) == 0
+    check_recommendation(truth, "values.apply")
