@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from loopcal.apply import Decision, judge_estimate, judge_largest_error, validate
-from loopcal.apply.conformity import judge_limits
+from loopcal.apply.conformity import judge_limits, report_conformity
 from loopcal.errors import EstimationError
 from loopcal.estimate import identify
 from loopcal.findings import Severity
@@ -18,6 +18,7 @@ from loopcal.io.core.json_text import to_json
 from loopcal.measure import Component, Instrument, Sensor, sample_truth, simulate
 from loopcal.mechanism import Mechanism
 from loopcal.report.validation_view import view_validation
+from loopcal.units import find_unit
 from tests.estimate.problems import UM, noise
 
 
@@ -173,11 +174,33 @@ def test_validation_states_conformity_on_the_page_and_in_the_result(held_out) ->
     result = validate(*held_out, limit_position=0.2e-3)
     text = str(view_validation(result, True, False))
     assert "Largest position error of 10, without the noise of the measurement: 0.0" in text
-    assert "mm (95 %) against the limit 0.2 mm: conforms with more than 99.9 % probability" in text
+    assert " against the limit 0.2 mm: conforms with more than 99.9 % probability" in text
     stored = json.loads(to_json(result.to_dict()))["conformity"]["position"]
     assert stored["decision"] == "conforms"
     assert stored["acceptance_limit"] < stored["limit"] == 0.2e-3
     assert "orientation" not in result.conformity
+
+
+def test_interval_that_is_not_centered_is_stated_by_its_bounds(held_out) -> None:
+    """Estimate -/+ half the interval would state errors below zero, and too low an upper bound."""
+    fit, data = held_out
+    quiet, limit = np.zeros((8, 3)), 3e-5
+    quiet[:, 0] = 1e-5
+    skewed = judge_largest_error(quiet, isotropic(1e-5, 8), limit)
+    assert skewed.estimate < skewed.expanded
+    assert skewed.high > 1.1 * (skewed.estimate + skewed.expanded)
+
+    def state(judged) -> str:
+        limits = {"position": limit}
+        errors = validate(fit, data).after
+        units = {"position": find_unit("mm")}
+        return str(report_conformity({"position": judged}, limits, errors, units)[0])
+
+    low, high = (f"{1e3 * bound:.4f} mm" for bound in (skewed.low, skewed.high))
+    assert f"(95 % interval {low} to {high})" in state(skewed)
+    assert "+/-" not in state(skewed)
+    centered = judge_estimate(12 * UM, 1.5 * UM, limit)
+    assert "0.0120 mm +/- 0.0029 mm (95 %)" in state(centered)
 
 
 def test_limit_that_noise_leaves_open_is_a_warning(held_out) -> None:

@@ -165,6 +165,8 @@ def test_failed_fit_has_no_values_for_a_machine(run) -> None:
     assert "the report states no values for a controller" in text
     assert "A quality gate is not met. Do not write these values to a machine." in text
     assert "Where the iteration ended (no estimates)" in text
+    assert "no calibrated geometry to draw" in text
+    assert "that of the calibrated geometry at the same readings" not in text
 
 
 def test_many_rows_are_thinned_and_the_report_says_so(run) -> None:

@@ -46,6 +46,9 @@ LEVEL = 0.95
 INTERVAL = (0.025, 0.5, 0.975)
 """Probabilities of the bounds of an interval, and of the estimate between them."""
 
+INTERVAL_NAMES = ("estimate", "expanded", "low", "high")
+"""Fields that findings state of an estimate with its interval."""
+
 NODES = 32
 """Values of tau in each of the two searches."""
 
@@ -228,7 +231,7 @@ def report_conformity(
         result, unit = judged[quantity], units[quantity]
         values: dict[str, Any] = {
             name: Quantity(float(getattr(result, name)) / unit.factor_to_si, unit.symbol)
-            for name in ("estimate", "expanded", "limit", "guard_band", "acceptance_limit")
+            for name in (*INTERVAL_NAMES, "limit", "guard_band", "acceptance_limit")
         }
         finding = report_finding(
             codes[result.decision],

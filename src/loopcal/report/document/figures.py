@@ -106,6 +106,9 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
 def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     """Yield the robot at home with the measured poses and the errors that calibration removes."""
     readings = record.readings
+    if not record.converged:
+        yield "The fit did not converge, so there is no calibrated geometry to draw."
+        return
     if readings is None or not len(readings):
         yield "The run does not contain the readings of its poses, so they are not drawn."
         return
