@@ -19,6 +19,7 @@ from loopcal.diagnose.fit_checks.cluster_covariance import choose_clusters, comp
 from loopcal.diagnose.fit_checks.independent_units import Clusters
 from loopcal.diagnose.residuals.residual_rows import ResidualRows
 from loopcal.estimate import identify
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.observation_rows import list_block_labels
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.core.csv_table import read_table
@@ -185,11 +186,12 @@ def test_an_even_choice_of_clusters_stands_for_all(monkeypatch) -> None:
     _, data = measure("linear-delta", "component", draw_errors(240, 3, 4), 4)
     fit = identify(ROBOTS["linear-delta"], data)
     clusters = Clusters("pose", np.arange(240), 240)
-    whole = compute_robust_spread(fit, data, clusters)
+    linear = linearize_fit(fit, data)
+    whole = compute_robust_spread(fit, clusters, linear)
     monkeypatch.setattr(cluster_covariance, "MOST_CLUSTERS", 80)
     chosen, times = choose_clusters(clusters)
     assert (chosen.count, times, int((chosen.member >= 0).sum())) == (80, 3.0, 80)
-    part = compute_robust_spread(fit, data, clusters)
+    part = compute_robust_spread(fit, clusters, linear)
     effect = np.eye(len(fit.names))
     all_ratio, ratio = whole.compare(effect), part.compare(effect)
     assert len(part.scores) == 80

@@ -21,6 +21,7 @@ from evidence.assumptions.simulation import Array, BoolArray, Simulation, simula
 from loopcal.apply import pose_uncertainty
 from loopcal.diagnose import adjust_uncertainty, check_clusters, check_heavy_tails, find_outliers
 from loopcal.estimate import FitOptions, LeastSquares, identify, identify_trials
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.findings import Severity
 from loopcal.io import load_robot
 from loopcal.mechanism import Mechanism, forward, forward_trials
@@ -74,12 +75,15 @@ def evaluate_fit(
         method=LeastSquares() if case.least_squares else None,
         noise="estimated" if case.estimated else "given",
     )
-    fit = adjust_uncertainty(identify(robot, data, options=options), data)
+    fit = identify(robot, data, options=options)
+    linear = linearize_fit(fit, data) if fit.converged else None
+    fit = adjust_uncertainty(fit, data, linear)
     examination = None
     if is_examined and fit.converged:
         outliers = find_outliers(fit, data)
-        tails = check_heavy_tails(fit, data, outliers.suspects)
-        findings = (*outliers.findings, *tails.findings, check_clusters(fit, data).finding)
+        tails = check_heavy_tails(fit, data, outliers.suspects, linear)
+        clusters = check_clusters(fit, data, linear=linear)
+        findings = (*outliers.findings, *tails.findings, clusters.finding)
         examination = {finding.code: finding.severity for finding in findings}
     truth = simulation.trials.truth[i][fit.free_parameters.places]
     predicted = forward(fit.robot, simulation.q)

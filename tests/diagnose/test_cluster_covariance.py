@@ -20,8 +20,10 @@ from loopcal.diagnose.fit_checks.cluster_covariance import (
     compute_robust_spread,
 )
 from loopcal.diagnose.fit_checks.independent_units import Clusters, divide_into_clusters
+from loopcal.diagnose.residuals.heavy_tails import check_heavy_tails
 from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
 from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Instrument, Measurements, Pose, Position, Sensor, simulate
 from tests import zoo
@@ -135,7 +137,8 @@ def test_covariance_and_degrees_equal_a_dense_computation(sensor, sessions, meth
     sessions = abs(sessions)
     fit = identify(hexapod(), data, method, options=FitOptions(sigma_uncertainty=0.0))
     member = np.arange(24) * sessions // 24 if sessions else np.arange(24)
-    spread = compute_robust_spread(fit, data, Clusters("pose", member, int(member.max()) + 1))
+    clusters = Clusters("pose", member, int(member.max()) + 1)
+    spread = compute_robust_spread(fit, clusters, linearize_fit(fit, data))
     J, r = stack_rows(fit, data)
     U, p = len(fit.nuisance), len(fit.names)
     prior = np.r_[np.zeros(U), np.full(p, 1.0 if isinstance(method, MAP) else 0.0)]
@@ -248,3 +251,15 @@ def test_too_few_poses_and_fits_without_intervals_are_named():
     _, check = fit_and_check(data.take(np.arange(7)), noise="estimated")
     assert check.finding.code == "residuals.clusters-without-intervals"
     assert np.isnan(check.position.ratio)
+
+
+def test_checks_with_a_given_linearization_equal_those_without_it():
+    data = measure(THREE_TARGETS, 24, 5, 6)
+    fit = identify(hexapod(), data)
+    linear = linearize_fit(fit, data)
+    adjusted = adjust_uncertainty(fit, data)
+    shared = adjust_uncertainty(fit, data, linear)
+    np.testing.assert_array_equal(shared.covariance, adjusted.covariance)
+    alone, together = (check_clusters(adjusted, data, linear=value) for value in (None, linear))
+    assert together.to_dict() == alone.to_dict()
+    assert check_heavy_tails(adjusted, data, (), linear) == check_heavy_tails(adjusted, data)

@@ -259,7 +259,7 @@ def bootstrap(
         linear=nominal + unit_of * kept.linear,
         sd=unit_of * kept.sd * noise,
         failed=count - len(kept.deviation),
-        scatter=describe_scatter(fit, data, blocks, linear),
+        scatter=describe_scatter(fit, blocks, linear),
     )
 
 

@@ -18,7 +18,6 @@ from loopcal.diagnose.fit_checks.independent_units import Clusters
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Measurements
 from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.sampling.intervals import NAMED, OFF
 from loopcal.typing import BoolArray, FloatArray
@@ -78,7 +77,7 @@ class BlockScatter:
 
 
 def describe_scatter(
-    fit: Identification, data: Measurements, blocks: Clusters, linear: FitLinearization
+    fit: Identification, blocks: Clusters, linear: FitLinearization
 ) -> BlockScatter:
     """Return the scatter of blocks of a fit; without intervals its degrees are blocks - 1."""
     p = len(fit.names)
@@ -90,7 +89,7 @@ def describe_scatter(
     if not fit.residual_test.intervals:
         few = np.full(p, float(blocks.count - 1))
         return BlockScatter(nan, few, few, nan, unit_sd, noise)
-    spread = compute_robust_spread(fit, data, blocks)
+    spread = compute_robust_spread(fit, blocks, linear)
     ratio, degrees, share, tail = nan.copy(), nan.copy(), nan.copy(), nan.copy()
     parts = spread.parts * spread.is_tested[:, None, :]
     total = (spread.root**2).sum(axis=1)

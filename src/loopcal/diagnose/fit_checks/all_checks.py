@@ -14,10 +14,11 @@ from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimat
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck, find_outliers
 from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit, check_lack_of_fit
 from loopcal.diagnose.residuals.heavy_tails import HeavyTails, check_heavy_tails
-from loopcal.estimate.fit_input import check_fitted_data
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import linearize_fit
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.presentation import HtmlResult
 from loopcal.typing import Progress, report_no_progress
 
@@ -85,11 +86,15 @@ def examine_fit(
     check_fitted_data(fit, data)
     outliers = find_outliers(fit, data, progress=progress)
     progress(0, 1, "testing for common errors and heavy tails")
+    linear = None
+    if fit.converged and fit.residual_test.intervals:
+        filled = fill_in_reading_sigma(fit.robot, data)
+        linear = linearize_fit(fit, exclude_poses(filled, fit.options.excluded_poses))
     return FitExamination(
         outliers,
         check_lack_of_fit(fit, data),
-        check_clusters(fit, data, frame),
+        check_clusters(fit, data, frame, linear),
         find_correlated_groups(fit),
         estimate_calibration_gain(fit, data, frame),
-        check_heavy_tails(fit, data, outliers.suspects),
+        check_heavy_tails(fit, data, outliers.suspects, linear),
     )

@@ -31,7 +31,7 @@ from loopcal.diagnose.fit_checks.independent_units import (
 from loopcal.diagnose.fit_checks.influence import TESTABLE
 from loopcal.diagnose.tool_errors import MOST_POSES, linearize_tool_errors, locate_measured_poses
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
-from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.problem import Problem
@@ -123,7 +123,12 @@ class ClusterCheck:
         }
 
 
-def check_clusters(fit: Identification, data: Measurements, frame: str = FITTED) -> ClusterCheck:
+def check_clusters(
+    fit: Identification,
+    data: Measurements,
+    frame: str = FITTED,
+    linear: FitLinearization | None = None,
+) -> ClusterCheck:
     """Compare the stated uncertainty with one that allows common errors within clusters of poses.
 
     The clusters are the largest independent units of which there are enough, see
@@ -134,6 +139,7 @@ def check_clusters(fit: Identification, data: Measurements, frame: str = FITTED)
     fit : an identification. data : the measurements it was made from.
     frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means
         relative to the home pose.
+    linear : of both, where the caller has it, see `linearize_fit`.
     """
     check_fitted_data(fit, data)
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
@@ -142,7 +148,8 @@ def check_clusters(fit: Identification, data: Measurements, frame: str = FITTED)
         return _not_compared("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
     if not fit.residual_test.intervals:
         return _not_compared("residuals.clusters-without-intervals")
-    checks = (_compare(fit, data, clusters, frame) for clusters in units)
+    linear = linearize_fit(fit, data) if linear is None else linear
+    checks = (_compare(fit, data, clusters, frame, linear) for clusters in units)
     judged = (check for check in checks if check is not None)
     return next(judged, _not_compared("residuals.clusters-not-judged"))
 
@@ -234,18 +241,16 @@ class RobustSpread:
 
 
 def compute_robust_spread(
-    fit: Identification, data: Measurements, clusters: Clusters
+    fit: Identification, clusters: Clusters, linear: FitLinearization
 ) -> RobustSpread:
     """Return the cluster-robust covariance of a fit, beside the stated one.
 
     Parameters
     ----------
-    fit : with intervals. data : its measurements, with the sigma of their readings, without
-        excluded poses. clusters : the cluster of each pose; of more than `MOST_CLUSTERS`, an even
-        choice stands for all.
+    fit : with intervals. clusters : the cluster of each pose; of more than `MOST_CLUSTERS`, an
+        even choice stands for all. linear : of the fit and its data, see `linearize_fit`.
     """
     clusters, times = choose_clusters(clusters)
-    linear = linearize_fit(fit, data)
     problem, d, p = linear.problem, linear.decomposition, len(fit.names)
     used = linear.is_estimated
     V = d.scale[:, None] * d.directions[0][:, used]
@@ -305,10 +310,14 @@ def _fold_clusters(
 
 
 def _compare(
-    fit: Identification, data: Measurements, clusters: Clusters, frame: str
+    fit: Identification,
+    data: Measurements,
+    clusters: Clusters,
+    frame: str,
+    linear: FitLinearization,
 ) -> ClusterCheck | None:
     """Return the comparison for clusters; None where residuals cannot judge the poses."""
-    spread = compute_robust_spread(fit, data, clusters)
+    spread = compute_robust_spread(fit, clusters, linear)
     effects = _list_pose_effects(fit, data, frame)
     angle, position = (spread.compare(each.by_parameters, each.added) for each in effects)
     sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]

@@ -51,7 +51,9 @@ TOO_SMALL = "noise.residuals-too-small"
 """Code of the finding that independent errors would mean that sigma is too large."""
 
 
-def adjust_uncertainty(fit: Identification, data: Measurements) -> Identification:
+def adjust_uncertainty(
+    fit: Identification, data: Measurements, linear: FitLinearization | None = None
+) -> Identification:
     """Return a fit whose covariance allows for what the residuals show, and says why.
 
     Estimates stay. No variance becomes smaller. A fit that did not converge, has no intervals, or
@@ -60,6 +62,7 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
     Parameters
     ----------
     fit : an identification. data : the measurements it was made from.
+    linear : of both, where the caller has it, see `linearize_fit`.
 
     Raises
     ------
@@ -69,7 +72,7 @@ def adjust_uncertainty(fit: Identification, data: Measurements) -> Identificatio
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
         return fit
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    linear = linearize_fit(fit, data)
+    linear = linearize_fit(fit, data) if linear is None else linear
     rows = collect_residual_rows(fit, data, linear)
     slow = find_slow_errors(fit, data, linear, _place_measured_poses(fit, data, linear))
     if rows is not None:

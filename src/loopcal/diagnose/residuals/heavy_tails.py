@@ -24,7 +24,7 @@ import numpy as np
 
 from loopcal.diagnose.residuals.residual_rows import ResidualRows, collect_residual_rows
 from loopcal.estimate.fit_input import exclude_poses
-from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.inference.residual_test import choose_severity
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
@@ -91,7 +91,10 @@ class HeavyTails:
 
 
 def check_heavy_tails(
-    fit: Identification, data: Measurements, outliers: Sequence[str] = ()
+    fit: Identification,
+    data: Measurements,
+    outliers: Sequence[str] = (),
+    linear: FitLinearization | None = None,
 ) -> HeavyTails:
     """Test whether large residuals are more frequent than normal noise makes them.
 
@@ -102,6 +105,7 @@ def check_heavy_tails(
     ----------
     fit : an identification. data : the measurements it was made from.
     outliers : labels of poses that are known to be wrong, such as those of `find_outliers`.
+    linear : of both, where the caller has it, see `linearize_fit`.
     """
     nothing = _untested(0)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
@@ -110,7 +114,8 @@ def check_heavy_tails(
     if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
         return nothing
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
-    rows = collect_residual_rows(fit, data, linearize_fit(fit, data))
+    linear = linearize_fit(fit, data) if linear is None else linear
+    rows = collect_residual_rows(fit, data, linear)
     if rows is None:
         return nothing
     wrong = np.flatnonzero(_belong_to(rows, data, outliers))
