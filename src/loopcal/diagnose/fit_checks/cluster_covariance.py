@@ -33,7 +33,6 @@ from loopcal.diagnose.tool_errors import MOST_POSES, linearize_tool_errors, loca
 from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
 from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
 from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -257,10 +256,7 @@ def compute_robust_spread(
     total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
     sd = np.sqrt(linear.variance[used])
     sigma = fit.residual_test.sigma_scale
-    rows = (
-        _fold_clusters(problem, linear.linearization, clusters)
-        / np.r_[np.ones(_width(problem)), np.ones(p), sigma]
-    )
+    rows = _fold_clusters(linear, clusters) / np.r_[np.ones(_width(problem)), np.ones(p), sigma]
     nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
     half = np.concatenate([nuisance, (A @ V) / np.sqrt(total)], axis=2)
     P = (A @ V) * (sigma / (total * sd))
@@ -293,13 +289,12 @@ def _width(problem: Problem) -> int:
     return 0 if problem.nuisance is None else len(problem.nuisance)
 
 
-def _fold_clusters(
-    problem: Problem, linearization: Linearization, clusters: Clusters
-) -> FloatArray:
+def _fold_clusters(linear: FitLinearization, clusters: Clusters) -> FloatArray:
     """Return the rows (G, h, U + p + 1) of each cluster, folded."""
+    problem = linear.problem
     width = _width(problem) + problem.parameters + 1
     factor = np.zeros((1, clusters.count, 0, width))
-    for rows_of_block in problem.leverage_rows(linearization):
+    for rows_of_block in problem.leverage_rows(linear.linearization, linear.solution):
         for part in rows_of_block:
             member = clusters.member[part.poses]
             rows, m = part.rows[member >= 0], part.rows.shape[1]

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.estimate.linearization import LeverageRows, Linearization
+from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -66,6 +67,7 @@ def compute_influence(
     decomposition: Decomposition,
     fits: Sequence[tuple[FloatArray, FloatArray]],
     weight: FloatArray,
+    solution: PoseSolution | None = None,
 ) -> list[Influence]:
     """Return the influence of every block (one trial) on fits of the same rows, in one pass.
 
@@ -76,6 +78,7 @@ def compute_influence(
     fits : the penalty of each fit, and the deviation (1, p) at which its residuals are evaluated,
         to first order.
     weight : (u,) weight of each block in the fits.
+    solution : poses and nuisance parameters of the rows, see `Problem.leverage_rows`.
     """
     d, u, p = decomposition, len(weight), len(decomposition.scale)
     roots, changes = [], []
@@ -86,7 +89,7 @@ def compute_influence(
         changes.append((solved - linearization.deviation)[0])
     results = [_make_empty(u) for _ in fits]
     total = problem.count_leverage_rows(member, u)
-    rows = problem.leverage_rows(linearization)
+    rows = problem.leverage_rows(linearization, solution)
     for blocks, columns, r in iterate_blocks(rows, member, total):
         # nuisance parameters come first, in units of their standard deviation
         A, nuisance = columns[..., -p:], columns[..., :-p]

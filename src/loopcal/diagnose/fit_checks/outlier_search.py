@@ -181,11 +181,15 @@ def fit_without(
     noise : "given", or "estimated" from the fitted blocks.
     """
     weight = (~excluded).astype(np.float64)
-    kept = problem.weighted(weight[member]).linearize(deviation, start)
+    weighted = problem.weighted(weight[member])
+    solution = weighted.solve(deviation, start, derivatives=True)
+    kept = weighted.linearize_at(deviation, start, solution)
     d = decompose_for(fit.method, kept.factor, kept.equations, deviation, fit.spectrum.tolerance)
     penalty = np.array(fit.method.penalty(d), dtype=np.float64)
     fits = [(q, d.deviation(d.solution(q))) for q in (penalty, np.where(d.used, 0.0, np.inf))]
-    influence, plain = compute_influence(problem, kept, member, d, fits, weight)
+    # poses that are estimated depend on the excluded rows, which the influence needs
+    shared = None if problem.is_uncertain else solution
+    influence, plain = compute_influence(problem, kept, member, d, fits, weight, shared)
     left, is_given = float(d.rows[0] - d.rank[0]), noise == "given"
     judging = judge_noise(float(d.unexplained[0]), left, plain, excluded, is_given)
     scale, directions = 1.0 if is_given else np.nan, int(np.isfinite(penalty).sum())
