@@ -175,7 +175,7 @@ def test_workers_end_when_their_driver_is_killed(tmp_path) -> None:
         while len(workers) < 2:
             workers.add(int(driver.stdout.readline()))
         driver.send_signal(signal.SIGKILL)
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + 60.0
     while any(is_running(worker) for worker in workers):
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -192,13 +192,13 @@ def test_dask_without_scheduler_or_workers_is_refused() -> None:
     with expect_refusal("workers.cluster-not-reached", StudyError):
         list(Dask("tcp://127.0.0.1:1", patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
     with make_cluster(0) as empty, expect_refusal("workers.cluster-without-workers", StudyError):
-        address = empty.scheduler_address
-        list(Dask(address, patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
+        address = empty.scheduler_address  # which a busy computer reaches within the patience
+        list(Dask(address, patience=3.0).map_blocks(draw_numbers, list_tasks(1)))
 
 
 def test_scheduler_that_ends_is_reported() -> None:
     cluster = make_cluster(1)
-    workers = Dask(cluster.scheduler_address, patience=2.0)  # also to wait for it to come back
+    workers = Dask(cluster.scheduler_address, patience=5.0)  # also to wait for it to come back
     answers = workers.map_blocks(draw_numbers, list_tasks(500, pause=0.05))
     next(answers)
     cluster.close()

@@ -128,6 +128,16 @@ def test_robots_are_shipped_ones_or_files_beside_the_study(write, tmp_path):
     assert study.robots["shop"].source == "mine.yaml"
 
 
+def test_common_errors_have_no_smallest_size(write, tmp_path):
+    text = read_robot("rotary-delta").text
+    common = "{name: batch of rods, of: [arm*.length], length: {sd: 0.6}}"
+    (tmp_path / "mine.yaml").write_text(f"{text}\ncommon_errors:\n  - {common}\n")
+    study = "format: 1\ntitle: t\nrobots: [mine.yaml]\nerrors:\n  e: {distribution: uniform}\n"
+    assert load_study(write(study)).errors["e"].distribution == "uniform"
+    with pytest.raises(FileError, match=r"study.yaml:5: .*in common.*remove 'smallest'"):
+        load_study(write(study.replace("uniform}", "uniform, smallest: 0.5}")))
+
+
 def test_poses_may_be_those_of_a_file(write, tmp_path):
     poses = "pose,x [mm],y [mm],z [mm]\na,10,20,30\nb,-10,5,40\n"
     (tmp_path / "poses.csv").write_text(poses, encoding="utf-8")

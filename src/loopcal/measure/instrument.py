@@ -121,7 +121,8 @@ def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Ge
     trial : int
         Counted from 0. A trial gets the same numbers for any number of trials.
     purpose : int
-        Separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3 effects.
+        Separates what one trial draws: 0 noise, 1 true values, 2 noise of readings, 3 effects, 4
+        errors of the readings of held-out poses.
 
     Returns
     -------

@@ -308,7 +308,14 @@ def _check_method(level: MethodLevel, study: Study) -> None:
 
 
 def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:
-    """Raise DataError where a robot has no parameter of a name, or one of another dimension."""
+    """Raise DataError where a robot has no parameter of a name, or one of another dimension, or has
+    common errors, whose sizes have no lower bound.
+    """
     for robot in robots.values():
+        if level.smallest and robot.parameters.common:
+            raise DataError(
+                f"{robot.name} has errors that several parameters have in common, whose sum has no "
+                "smallest size; remove 'smallest'"
+            )
         resolve_patterns(robot.parameters, level.tolerances)
         resolve_patterns(robot.parameters, level.deviations)
