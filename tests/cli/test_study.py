@@ -266,3 +266,55 @@ def test_share_of_a_job_and_scores_of_the_summary_are_chosen(run, tmp_path) -> N
     assert (code, "condition" in out, "position" in out) == (0, True, False)
     code, _, err = run("summary whole --score positon")
     assert (code, "did you mean 'position'" in err) == (1, True)
+
+
+PER_LEG = """\
+format: 1
+title: Leg by leg
+replicates: {replicates}
+block: {block}
+robots: [{robot}]
+methods: [per-leg]
+scores: {{held_out: 3}}
+"""
+
+
+def test_failed_trials_lead_to_the_reason_in_check_summary_and_replay(run, tmp_path) -> None:
+    file = write_study(tmp_path, 4, 2, PER_LEG.replace("{robot}", "linear-delta")).name
+    code, out, _ = run(f"check {file}")
+    assert (code, "1 cell, 4 trials" in out) == (0, True)
+    advice = "Replay one of these trials to see the reason."
+    assert "Failed trials: 2 of 2. The trial was refused" in " ".join(out.split())
+    assert advice in " ".join(out.split())
+    run(f"run {file} -o f {ONE}")
+    assert advice in " ".join(run("summary f")[1].split())
+    code, _, err = run("replay f 0/1 -o trial")
+    assert (code, "linear-delta has 3 actuators" in err) == (1, True)
+    assert not (tmp_path / "trial").exists()
+
+
+def test_replay_says_where_the_method_of_the_trial_is_not_that_of_the_calibration(
+    run, tmp_path
+) -> None:
+    file = write_study(tmp_path, 2, 2, PER_LEG.replace("{robot}", "hexapod-42")).name
+    run(f"run {file} -o f {ONE}")
+    code, out, err = run("replay f 0/1 -o trial")
+    assert code in (0, 2), err
+    assert "fitted by per-leg, a published method" in " ".join((out + err).split())
+
+
+def test_joined_folders_of_two_studies_are_both_named(run, tmp_path) -> None:
+    for name, replicates in (("small", 4), ("large", 6)):
+        text = (tmp_path / write_study(tmp_path, replicates, 2).name).read_text()
+        seed = "seed: 3" if name == "small" else "seed: 4"
+        (tmp_path / "s.yaml").write_text(text.replace("seed: 3", seed))
+        run(f"run s.yaml -o {name} {ONE} --cells 1/4")
+    code, _, err = run("merge small large -o both")
+    assert (code, "small: the study of this folder differs from that of large" in err) == (1, True)
+
+
+def test_durations_have_two_digits_in_the_unit_that_is_printed() -> None:
+    from loopcal.cli.options.study_options import round_duration
+
+    words = [round_duration(seconds) for seconds in (0.0123, 19.4, 340.0, 7000.0, 500000.0)]
+    assert words == ["0.012 s", "19 s", "5.7 min", "1.9 h", "140 h"]

@@ -238,3 +238,13 @@ def test_score_that_the_robot_does_not_have_is_unknown_and_not_missed(tmp_path: 
     unknown = next(a for a in answered.answers if a.certainty == "unknown")
     assert {(share.reached, share.trials) for share in unknown.shares} == {(0, 0)}
     assert "10: no trials" in render_text(view_answers([answered]), 200)
+
+
+def test_only_answers_that_are_not_certain_lead_to_more_machines(tmp_path: Path) -> None:
+    question = Question("poses", "position", "10 um", 0.99)
+    for trials, is_open in ((100, True), (2000, False)):
+        study = make_study(trials, {"all": question})
+        folder = tmp_path / str(trials)
+        kept = store_scores(folder, study, lambda _: {"position": np.full(2000, 9e-6)})
+        page = render_text(view_answers(kept.answer_questions()), 100)
+        assert ("not certain: " in page, "loopcal study extend" in page) == (is_open, is_open)

@@ -240,6 +240,7 @@ DAMAGES = {
     "seed": ("seed: 5", "seed: -5", 3, "'seed' is -5"),
     "replicates": ("replicates: 130", "replicates: 0", 4, "'replicates' is 0"),
     "decimal": ("replicates: 130", "replicates: 13.5", 4, "a whole number is needed"),
+    "exponent": ("replicates: 130", "replicates: 1e3", 4, "without an exponent"),
     "no robot": ("robots: [linear-delta, five-bar]\n", "", None, "robots: [hexapod-42]"),
     "wrong robot": ("five-bar]", "five-baar]", 6, "five-bar"),
     "outside": ("five-bar]", "../robot.yaml]", 6, "folder"),

@@ -68,10 +68,11 @@ class Duration(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  
         return seconds
 
 
-def format_duration(seconds: float) -> str:
-    """Return seconds in the largest unit in which they are at least one."""
+def format_duration(seconds: float, digits: int = 6) -> str:
+    """Return seconds in the largest unit in which they are at least one, to some digits."""
     unit = next((u for u in ("h", "min") if seconds >= SECONDS[u]), "s")
-    return f"{seconds / SECONDS[unit]:.6g} {unit}"
+    rounded = float(f"{seconds / SECONDS[unit]:.{digits}g}")
+    return f"{rounded:.6g} {unit}"
 
 
 @contextmanager

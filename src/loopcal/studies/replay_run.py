@@ -15,6 +15,7 @@ from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.robot.robot_file import format_robot
 from loopcal.io.runs.run_folder import build_document, refuse_run_folder, save_run
 from loopcal.studies.files.study_folder import read_study
+from loopcal.studies.simulation.published_fits import refuse_per_leg
 from loopcal.studies.simulation.replay import replay_trial
 from loopcal.studies.specification.levels import FACTORS
 from loopcal.typing import Progress, report_no_progress
@@ -36,13 +37,14 @@ class Replay:
     Attributes
     ----------
     report, document : of the calibration, and of its run folder. inputs : folder of its inputs.
-    finding : that its robot file states other tolerances than the cell; None where it does not.
+    findings : that the files state other tolerances than the cell, or that the calibration has
+        another method than the cell.
     """
 
     report: CalibrationReport
     document: dict[str, Any]
     inputs: Path
-    finding: Finding | None
+    findings: tuple[Finding, ...]
 
 
 def calibrate_trial(
@@ -71,6 +73,8 @@ def calibrate_trial(
     """
     study = read_study(folder)
     simulated = replay_trial(study, cell, trial)
+    if simulated.method.method == "per-leg":
+        refuse_per_leg(simulated.method, simulated.robot, simulated.data)
     levels, limits = study.cells[cell].levels, study.scores
     options = CalibrationOptions(
         fit=simulated.options, limit_position=limits.limit_position, limit_angle=limits.limit_angle
@@ -92,8 +96,11 @@ def calibrate_trial(
     save_run(output, report, paths, command, force)
     errors = study.errors[levels[FACTORS["errors"]]]
     is_changed = errors.tolerance_factor != 1.0 or bool(errors.tolerances)
-    finding = report_finding("store.replay-tolerances", file=ROBOT) if is_changed else None
-    return Replay(report, build_document(report, paths, command), place, finding)
+    findings = [report_finding("store.replay-tolerances", file=ROBOT)] if is_changed else []
+    if simulated.method.is_published:
+        level = levels[FACTORS["methods"]]
+        findings.append(report_finding("store.replay-method", method=level))
+    return Replay(report, build_document(report, paths, command), place, tuple(findings))
 
 
 def _read_inputs(folder: Path) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from loopcal.report.text_page import Block
+from loopcal.studies.results.summary_view import explain_failures
+from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.tasks import compute_block, list_tasks
 from loopcal.studies.specification.cells import Cell, list_factors
 from loopcal.studies.specification.study import Study
@@ -31,6 +33,7 @@ class TimeEstimate:
     seconds_per_block : mean of these blocks. worker_seconds : of the study, by one worker.
     workers : processors of this computer. seconds : of the study by as many processes.
     bytes : of its store. failed : share of the trials of these blocks that failed.
+    computed : trials of these blocks. failures : code -> trials of these blocks.
     """
 
     cells: int
@@ -43,6 +46,8 @@ class TimeEstimate:
     seconds: float
     bytes: int
     failed: float
+    computed: int
+    failures: Mapping[str, int]
 
 
 def estimate_time(
@@ -55,13 +60,16 @@ def estimate_time(
     LoopcalError : one of these cells cannot be computed; the text names it.
     """
     chosen = _spread(study.cells, MOST_BLOCKS)
-    seconds, failed, trials = [], 0, 0
+    seconds, trials = [], 0
+    failures: dict[str, int] = {}
     for i, cell in enumerate(chosen):
         progress(i, len(chosen), "computing a block")
         begin = time.perf_counter()
         result = compute_block(next(list_tasks(study, [cell.number])))
         seconds.append(time.perf_counter() - begin)
-        failed, trials = failed + int((result.values[:, 0] != 0).sum()), trials + len(result.values)
+        trials += len(result.values)
+        for code in (OUTCOMES[int(number)] for number in result.values[:, 0] if number):
+            failures[code] = failures.get(code, 0) + 1
         if sum(seconds) > LONGEST:
             break
     blocks = study.blocks * len(study.cells)
@@ -76,7 +84,9 @@ def estimate_time(
         workers,
         each * math.ceil(blocks / workers),
         blocks * study.block * len(study.columns) * 8,
-        failed / trials,
+        sum(failures.values()) / trials,
+        trials,
+        failures,
     )
 
 
@@ -84,7 +94,8 @@ def view_estimate(
     study: Study, estimate: TimeEstimate, format_duration: Callable[[float], str]
 ) -> list[Block]:
     """Return the page of an estimate."""
-    lines = [f"{study.title}: {estimate.cells} cells, {estimate.trials} trials"]
+    cells = f"{estimate.cells} cell{'s' if estimate.cells > 1 else ''}"
+    lines: list[Block] = [f"{study.title}: {cells}, {estimate.trials} trials"]
     for name in list_factors(study):
         levels = dict.fromkeys(cell.levels[name] for cell in study.cells)
         lines.append(f"  {name:<12}{', '.join(levels)}")
@@ -95,9 +106,7 @@ def view_estimate(
         f"takes about {total} with {estimate.workers} process{plural}, and "
         f"{max(estimate.bytes / 1e6, 0.1):.1f} MB"
     )
-    if estimate.failed:
-        lines.append(f"{estimate.failed:.0%} of the trials of these blocks failed")
-    return list(lines)
+    return [*lines, *explain_failures(estimate.failures, estimate.computed)]
 
 
 def _spread(cells: tuple[Cell, ...], count: int) -> list[Cell]:

@@ -393,8 +393,8 @@ def replay(folder: Path, trial: str, output: Path, force: bool, as_json: bool) -
     if as_json:
         terminal.print_json(done.document)
     else:
-        if done.finding is not None:
-            terminal.print_note(str(done.finding))
+        for finding in done.findings:
+            terminal.print_note(str(finding))
         page = view_calibration(done.report, False, hint_for)
         terminal.print_page([*page, "", f"Written to {output}, and its inputs to {done.inputs}"])
     return done.report.exit_code

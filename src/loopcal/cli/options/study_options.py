@@ -114,7 +114,7 @@ def _make_executor(workers: int | None, dask: str | None, ray: bool) -> Executor
 
 def round_duration(seconds: float) -> str:
     """Return a duration to two digits."""
-    return format_duration(float(f"{seconds:.2g}"))
+    return format_duration(seconds, digits=2)
 
 
 def count_processors() -> int:

@@ -287,6 +287,8 @@ def _word(complaint: Any, location: Location, node: Any, needed: int) -> tuple[s
         return f"{name} has {len(node)} values, but {bound} are needed", act
     if kind in NUMBERS:
         act = "; write a number"
+        if kind.startswith("int") and isinstance(node, float):
+            act = "; write it without a decimal point and without an exponent"
         if isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
             act = "; write the number without quotes and without a unit"
             act = "; write a decimal point, not a comma" if "," in node else act

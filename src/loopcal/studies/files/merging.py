@@ -34,11 +34,11 @@ def merge_studies(
     FileError : a part is of another study, or a folder cannot be used.
     """
     studies = [read_study(part) for part in parts]
-    largest = max(studies, key=lambda study: study.replicates)
+    first, largest = max(enumerate(studies), key=lambda item: item[1].replicates)
     for part, study in zip(parts, studies, strict=True):
         if changes := list_conflicts(study.to_json(), largest.to_json()):
             code = "store.part-of-other-study"
-            raise FileError(report_finding(code, other=str(parts[0]), changes=changes), part)
+            raise FileError(report_finding(code, other=str(parts[first]), changes=changes), part)
     file = parts[0] / STUDY_FILE
     source = StudySource(largest, file if file.is_file() else None)
     count = 0

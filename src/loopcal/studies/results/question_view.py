@@ -17,6 +17,8 @@ NOTE = (
     "were not simulated."
 )
 
+EXTEND = "More machines decide an answer that is not certain (loopcal study extend)."
+
 SHOWN_UNITS = {"m": "um", "rad": "urad", "1": ""}
 """SI symbol of a score -> unit of its limit on the screen."""
 
@@ -26,6 +28,8 @@ def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
     page: list[Block] = []
     for item in answered:
         page += [state_question(item), tabulate_answers(item), ""]
+    if any(answer.certainty == "between" for item in answered for answer in item.answers):
+        return [*page, f"{NOTE} {EXTEND}"]
     return [*page, NOTE] if page else []
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from loopcal.findings import report_finding
+from loopcal.findings.catalog import find_entry
 from loopcal.io.core.json_text import read_json, to_json
 from loopcal.io.core.text_file import write_bytes, write_text
 from loopcal.report.numbers import ABSENT, format_number
@@ -61,8 +62,9 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
     """Return the page of a summary with the named scores."""
     total = study.replicates * len(study.cells)
     state = "" if summary.is_complete else f" (of {total}; the study is not complete)"
+    plural = "s" if len(study.cells) > 1 else ""
     page: list[Block] = [
-        f"{study.title}: {len(study.cells)} cells, {summary.trials} trials{state}",
+        f"{study.title}: {len(study.cells)} cell{plural}, {summary.trials} trials{state}",
         f"{NOTE} {FRAMES[study.scores.frame]}",
         tabulate_medians(study, summary, shown),
     ]
@@ -70,9 +72,15 @@ def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> l
     for cell in summary.cells:
         for code, count in cell.failed.items():
             counts[code] = counts.get(code, 0) + count
-    for code, count in counts.items():
-        page.append(f"Failed trials: {count} of {summary.trials}. {report_finding(code)}")
-    return page
+    return [*page, *explain_failures(counts, summary.trials)]
+
+
+def explain_failures(counts: Mapping[str, int], trials: int) -> list[Block]:
+    """Return a line for each code of failed trials (code -> trials): what it means, what to do."""
+    return [
+        f"Failed trials: {count} of {trials}. {report_finding(code)} {find_entry(code).action}"
+        for code, count in counts.items()
+    ]
 
 
 def build_document(

@@ -26,7 +26,7 @@ from loopcal.estimate.published_methods.raw_steps import (
     penalize_truncated,
     take_steps,
 )
-from loopcal.measure import Trials
+from loopcal.measure import Measurements, Trials
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.studies.simulation.methods import make_method
@@ -118,6 +118,17 @@ def choose_rule(method: MethodLevel) -> StepRule:
     if method.steps is None:
         return StepRule(EPSILON if method.epsilon is None else method.epsilon, LIMIT)
     return StepRule(method.epsilon or 0.0, method.steps)
+
+
+def refuse_per_leg(method: MethodLevel, robot: Mechanism, data: Measurements) -> None:
+    """Raise the reason for which the fit of a trial leg by leg is refused; nothing without one.
+
+    Raises
+    ------
+    EstimationError, DataError : see `identify_per_leg`.
+    """
+    rule = choose_rule(method)
+    identify_per_leg(robot, data, rule.limit if method.steps else MOST_LEG_STEPS, rule.epsilon)
 
 
 def _fit_per_leg(method: MethodLevel, robot: Mechanism, trials: Trials) -> PublishedFits:

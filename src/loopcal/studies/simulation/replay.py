@@ -14,6 +14,7 @@ from loopcal.studies.simulation.block import make_stream, simulate_block
 from loopcal.studies.simulation.fits import state_times
 from loopcal.studies.simulation.preparation import prepare_cell
 from loopcal.studies.simulation.tasks import list_tasks
+from loopcal.studies.specification.levels import MethodLevel
 from loopcal.studies.specification.study import Study
 
 
@@ -24,13 +25,14 @@ class ReplayedTrial:
     Attributes
     ----------
     robot : nominal, with the tolerances of its cell. truth : the true machine.
-    data : its measurements. options : with which they are fitted.
+    data : its measurements. options : with which they are fitted. method : of its cell.
     """
 
     robot: Mechanism
     truth: Mechanism
     data: Measurements
     options: FitOptions
+    method: MethodLevel
 
 
 def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
@@ -57,4 +59,4 @@ def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
     if prepared.scores.verdict:
         data = prepared.hold_out(data)
     truth = prepared.robot.with_values(trials.truth[place])
-    return ReplayedTrial(prepared.robot, truth, data, prepared.fit_options)
+    return ReplayedTrial(prepared.robot, truth, data, prepared.fit_options, prepared.method)
