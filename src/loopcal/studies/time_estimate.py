@@ -98,7 +98,8 @@ def view_estimate(
     lines: list[Block] = [f"{study.title}: {cells}, {estimate.trials} trials"]
     for name in list_factors(study):
         levels = dict.fromkeys(cell.levels[name] for cell in study.cells)
-        lines.append(f"  {name:<12}{', '.join(levels)}")
+        separator = "; " if any("," in level for level in levels) else ", "
+        lines.append(f"  {name:<12}{separator.join(levels)}")
     total = format_duration(estimate.seconds)
     plural = "es" if estimate.workers > 1 else ""
     lines.append(
