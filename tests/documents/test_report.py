@@ -222,3 +222,13 @@ def test_report_explains_the_stated_frame_and_small_residuals(page) -> None:
     text = page.read_text("utf-8")
     assert "The stated frame is the one in which the measurement files state" in text
     assert "every pose is estimated too" not in text
+
+
+def test_orientations_have_one_unit_and_coverage_factors_two_places(page) -> None:
+    """The sentence on the expected error is in degrees."""
+    assert "mrad" not in page.read_text("utf-8")
+    document = json.loads(page.with_suffix(".json").read_text("utf-8"))
+    (section,) = (part for part in document["sections"] if part["name"] == "parameters")
+    (table,) = (e for e in section["elements"] if e.get("table") == "Identified parameters")
+    place = table["columns"].index("k")
+    assert all(re.fullmatch(r"[0-9]+[.][0-9]{2}", row[place]) for row in table["rows"])

@@ -154,8 +154,13 @@ def _list_details() -> list[tuple[Column, Callable[[Mapping[str, Any]], str]]]:
         (Column("shift [tolerances]"), lambda row: f"{shift(row):+.2f}"),
         (Column("u"), lambda row: format_uncertainty(row["sd"])),
         (Column("degrees of freedom"), lambda row: _format_degrees(row["degrees"])),
-        (Column("k"), lambda row: format_number(factor(row), 3)),
+        (Column("k"), lambda row: _format_factor(factor(row))),
     ]
+
+
+def _format_factor(factor: float) -> str:
+    """Return a coverage factor with two decimal places."""
+    return f"{factor:.2f}" if math.isfinite(factor) else format_number(factor, 3)
 
 
 def _format_degrees(degrees: float) -> str:

@@ -23,7 +23,7 @@ from loopcal.report.figures.style import (
     start_figure,
 )
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, UNITS, Dimension, Unit
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
 SLICES = 3
 """Slices of the workspace."""
-
-ANGLE = UNITS["mrad"]
-"""Unit of the uncertainty of an orientation, which is small."""
 
 NEGLIGIBLE = 1e-9
 """Uncertainty [rad] below which an orientation cannot change and is not drawn."""
@@ -66,7 +63,7 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
     slices = _cut(accuracy, measured, layout)
     quantities = [("position", DISPLAY_UNITS[Dimension.LENGTH])]
     if np.nanmax(accuracy.uncertainty.orientation, initial=0.0) > NEGLIGIBLE:
-        quantities.append(("orientation", ANGLE))
+        quantities.append(("orientation", DISPLAY_UNITS[Dimension.ANGLE]))
     figure = start_figure(1.8 + 3.5 * len(slices), 1.5 + 3.1 * len(quantities))
     every: Any = figure.subplots(len(quantities), len(slices), squeeze=False)
     for panels, (name, unit) in zip(every, quantities, strict=True):
