@@ -5,6 +5,9 @@ Each time, the driver is started with `--resume`, and after some new blocks a ra
 the driver itself or a worker, is killed (kill -9). After a killed worker the driver continues, and
 is killed a little later. At last the study is run to its end. Its blocks are compared, to the last
 bit, with those of a study that was computed at once.
+
+Processes are killed at numbers of stored blocks, so the speed of the computer does not matter. A
+study that ends before its last kill gets more replicates.
 """
 
 from __future__ import annotations
@@ -17,22 +20,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from loopcal.studies.driver import count_blocks
+from loopcal.studies.execution import Executor, Processes
 from loopcal.studies.files.store import NAME, read_store
 from loopcal.studies.files.study_folder import load_specification
+from loopcal.studies.running import read_source, run_study
 
-REPLICATES, BLOCK, CELLS = 12_500, 50, 4
+REPLICATES, BLOCK = 12_500, 50
 KILLS = 20
 WORKERS = 2
-LONGEST_WAIT = 120.0
-"""Seconds within which a driver stores a new block."""
-
-PAUSE = 0.25
-"""Longest time between a new block and the kill, as a share of the time of the blocks between two
-kills: fast computers do not finish the study before its last kill.
-"""
+LONGEST_WAIT = 900.0
+"""Seconds without a new block after which a driver that lives has stopped working."""
 
 STUDY = """\
 format: 1
@@ -52,43 +54,57 @@ Contents = dict[tuple[str, int], bytes]
 """Cell and number of a block -> its scores."""
 
 
-def examine(place: Path, replicates: int, block: int, kills: int, seed: int = 5) -> dict[str, int]:
+@dataclass(frozen=True)
+class Disturbance:
+    """What is done to a study.
+
+    Parameters
+    ----------
+    replicates : trials of each cell. block : trials of a block. kills : processes to kill.
+    seed : of the times and victims.
+    """
+
+    replicates: int
+    block: int
+    kills: int
+    seed: int = 5
+
+
+def examine(place: Path, disturbance: Disturbance, executor: Executor) -> dict[str, int]:
     """Return what became of a study that was disturbed.
 
     Parameters
     ----------
-    place : an empty folder. kills : processes to kill. seed : of the times and victims.
+    place : an empty folder. executor : computes the rest of the disturbed study after the last
+        kill, and the undisturbed one.
 
     Returns
     -------
-    blocks : of the study. lost, doubled, different : of the disturbed one. driver_kills,
-    worker_kills : by victim.
+    trials, blocks : of the study. lost, doubled, different : blocks of the disturbed one.
+    driver_kills, worker_kills : by victim.
     """
-    file, rng = place / "study.yaml", random.Random(seed)
-    file.write_text(STUDY.format(replicates=replicates, block=block))
     whole, folder = place / "undisturbed", place / "disturbed"
-    _start(file, whole).communicate()
-    counts = {"driver_kills": 0, "worker_kills": 0}
-    share = len(read_contents(whole)) // (kills + 1)
-    longest = PAUSE * share * measure_block(whole)
-    for kill in range(kills):
+    file, counts = place / "study.yaml", {"driver_kills": 0, "worker_kills": 0}
+    rng, replicates = random.Random(disturbance.seed), disturbance.replicates
+    while (kills := sum(counts.values())) < disturbance.kills:
+        file.write_text(STUDY.format(replicates=replicates, block=disturbance.block))
+        left = count_blocks(read_source(file).study) - count_rows(folder)
+        count = rng.randint(1, max(left // (disturbance.kills - kills + 1), 1))
         with _start(file, folder) as driver:
-            _wait_for_blocks(driver, folder, count_blocks(folder) + rng.randint(1, max(share, 1)))
-            time.sleep(rng.uniform(0.0, longest))
-            workers = list_workers(driver.pid) if kill % 2 else []
-            if workers and _kill(rng.choice(workers)):
-                counts["worker_kills"] += 1
-                _wait_for_blocks(driver, folder, count_blocks(folder) + 1)
-            elif driver.poll() is None:
-                counts["driver_kills"] += 1
-            driver.kill()
-    out, _ = _start(file, folder).communicate()
+            victim = _disturb(driver, folder, count, rng, is_worker=kills % 2 == 1)
+        if victim is None:
+            replicates += disturbance.replicates
+        else:
+            counts[f"{victim}_kills"] += 1
+    source = read_source(file)
+    assert run_study(source, folder, executor, resume=True).is_complete
+    run_study(source, whole, executor)
     expected, got = read_contents(whole), read_contents(folder)
-    assert f"{len(expected)} of {len(expected)} blocks" in out, out
     return {
+        "trials": len(source.study.cells) * replicates,
         "blocks": len(expected),
         "lost": len(expected.keys() - got.keys()),
-        "doubled": count_blocks(folder) - len(got),
+        "doubled": count_rows(folder) - len(got),
         "different": sum(expected[key] != got.get(key) for key in expected),
         **counts,
     }
@@ -104,18 +120,12 @@ def read_contents(folder: Path) -> Contents:
         }
 
 
-def count_blocks(folder: Path) -> int:
+def count_rows(folder: Path) -> int:
     """Return the number of stored rows; 0 where there is no store."""
     if not (folder / NAME).exists():
         return 0
     with read_store(folder) as store:
         return int(store.connection.execute("SELECT count(*) FROM blocks").fetchone()[0])
-
-
-def measure_block(folder: Path) -> float:
-    """Return the mean time of the computation of a stored block [s]."""
-    with read_store(folder) as store:
-        return float(store.connection.execute("SELECT avg(seconds) FROM blocks").fetchone()[0])
 
 
 def list_workers(driver: int) -> list[int]:
@@ -142,32 +152,58 @@ def _kill(process: int) -> bool:
     return True
 
 
+def _disturb(
+    driver: subprocess.Popen[str], folder: Path, count: int, rng: random.Random, is_worker: bool
+) -> str | None:
+    """Kill a driver after a number of new blocks, or first a worker of it; return the victim, or
+    None where the driver ends before.
+    """
+    begin = time.monotonic()
+    if not _wait_for_blocks(driver, folder, count):
+        return None
+    time.sleep(rng.uniform(0.0, (time.monotonic() - begin) / count / 10))
+    victim = "driver"
+    if is_worker:
+        workers = list_workers(driver.pid)
+        if not workers or not _kill(rng.choice(workers)):
+            driver.kill()
+            return None
+        victim = "worker"
+        _wait_for_blocks(driver, folder, 1)
+    elif driver.poll() is not None:
+        return None
+    driver.kill()
+    return victim
+
+
 def _start(file: Path, folder: Path) -> subprocess.Popen[str]:
     """Start a driver that continues the study."""
     options: Sequence[str] = ("-o", str(folder), "--resume", "--workers", str(WORKERS))
     words = [sys.executable, "-m", "loopcal", "study", "run", str(file), *options]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL, text=True, start_new_session=True)
 
 
-def _wait_for_blocks(driver: subprocess.Popen[str], folder: Path, count: int) -> None:
-    """Wait until a number of blocks is stored, or the driver has stored all and ended."""
-    end, before = time.monotonic() + LONGEST_WAIT, -1
-    while (stored := count_blocks(folder)) < count and driver.poll() is None:
+def _wait_for_blocks(driver: subprocess.Popen[str], folder: Path, count: int) -> bool:
+    """Wait until a driver has stored a number of new blocks; return whether it still lives."""
+    first = before = count_rows(folder)
+    end = time.monotonic() + LONGEST_WAIT
+    while (stored := count_rows(folder)) < first + count and driver.poll() is None:
         if stored > before:
             end, before = time.monotonic() + LONGEST_WAIT, stored
         assert time.monotonic() < end, "no new block"
-        time.sleep(0.02)
+        time.sleep(0.01)
+    assert driver.poll() in (None, 0), "the driver failed"
+    return driver.poll() is None
 
 
 def collect() -> dict[str, Any]:
     """Return the counts of the full-size study."""
+    disturbance = Disturbance(REPLICATES, BLOCK, KILLS)
     with tempfile.TemporaryDirectory() as place:
-        counts = examine(Path(place), REPLICATES, BLOCK, KILLS)
-    columns = ["trials", *counts]
-    row = [REPLICATES * CELLS, *counts.values()]
+        counts = examine(Path(place), disturbance, Processes(WORKERS))
     table = {
-        "columns": [c.replace("_", " ") for c in columns],
-        "formats": ["d"] * len(row),
-        "rows": [row],
+        "columns": [name.replace("_", " ") for name in counts],
+        "formats": ["d"] * len(counts),
+        "rows": [list(counts.values())],
     }
     return {"counts": counts, "tables": {"outcome": table}}

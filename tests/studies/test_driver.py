@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import loopcal
-from evidence.study_interruption import examine, read_contents
+from evidence.study_interruption import BLOCK, Disturbance, examine, read_contents
 from loopcal.errors import FileError, StudyError
 from loopcal.studies.driver import Share, count_blocks, count_stored, run_blocks
 from loopcal.studies.execution import Answer, Dask, Processes, Serial
@@ -173,7 +174,7 @@ def test_folder_contains_the_study_file_and_its_robots(tmp_path) -> None:
     with open_study(tmp_path / "study", read_source(file)):
         pass
     names = {path.name for path in (tmp_path / "study").iterdir()}
-    assert names - {f"{NAME}-wal", f"{NAME}-shm"} == {NAME, "study.yaml", "mine.yaml"}
+    assert names == {NAME, "study.yaml", "mine.yaml"}
     assert (tmp_path / "study" / "study.yaml").read_bytes() == file.read_bytes()
     assert read_source(tmp_path / "study" / "study.yaml").study == read_source(file).study
 
@@ -198,6 +199,15 @@ def test_shares_are_disjoint_and_their_folders_join_to_the_whole(
     run_study(other, tmp_path / "other", Serial(), share=Share(1, 7))
     with expect_refusal("store.part-of-other-study", FileError, changes=("seed: 9 -> 3",)):
         merge_studies([folders[0], tmp_path / "other"], tmp_path / "third")
+
+
+def test_damaged_part_is_refused_before_a_folder_is_made(undisturbed, tmp_path) -> None:
+    shutil.copytree(undisturbed, tmp_path / "part")
+    raw = (undisturbed / NAME).read_bytes()
+    (tmp_path / "part" / NAME).write_bytes(raw[:-4096] + bytes(4096))
+    with pytest.raises(FileError, match=f"^{tmp_path / 'part' / NAME}: this file is damaged"):
+        merge_studies([undisturbed, tmp_path / "part"], tmp_path / "whole")
+    assert not (tmp_path / "whole").exists()
 
 
 @dataclass
@@ -248,9 +258,10 @@ def test_two_processes_give_the_same_blocks_and_little_overhead(undisturbed, tmp
 @pytest.mark.slow
 def test_study_survives_killed_drivers_and_workers(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
-    counts = examine(tmp_path, replicates=60, block=5, kills=3)
+    counts = examine(tmp_path, Disturbance(replicates=60, block=5, kills=2), Serial())
+    counts = {name: counts[name] for name in counts if name not in ("trials", "blocks")}
     assert counts == {
-        "blocks": 48, "lost": 0, "doubled": 0, "different": 0, "driver_kills": 2, "worker_kills": 1,
+        "lost": 0, "doubled": 0, "different": 0, "driver_kills": 1, "worker_kills": 1,
     }  # fmt: skip
     left = {path.name for path in tmp_path.iterdir()} - {"study.yaml", "undisturbed", "disturbed"}
     assert left == set()
@@ -258,7 +269,7 @@ def test_study_survives_killed_drivers_and_workers(tmp_path, monkeypatch) -> Non
 
 def test_full_size_evidence_lost_and_doubled_nothing() -> None:
     counts = json.loads(RESULT.read_text())["counts"]
-    assert counts["blocks"] * 50 == 50_000
+    assert counts["blocks"] * BLOCK >= 50_000
     assert counts["driver_kills"] + counts["worker_kills"] == 20
     assert [counts[name] for name in ("lost", "doubled", "different")] == [0, 0, 0]
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import pytest
+
 from loopcal.studies import BlockTask, Study, list_tasks
 from loopcal.studies.schedule import KEPT_POSES, MOST_WAITING, MissingBlock, Schedule
 from loopcal.studies.simulation.poses import CellPoses
@@ -19,6 +21,7 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
 )
+from loopcal.studies.time_estimate import estimate_time, view_estimate
 from tests.studies.studies import make_study
 
 POSES = CellPoses([[0.1, 0.2]], [[0.3, 0.4]])
@@ -145,3 +148,18 @@ def test_poses_depend_on_what_determines_them_only() -> None:
     true_errors = {"1": ErrorsLevel(), "2": ErrorsLevel(error_factor=2.0)}
     planned = {"planned": PosesLevel(5, "planned")}
     assert count_poses(make_schedule(poses=planned, errors=true_errors)) == 1
+
+
+def test_time_estimate_counts_planning_once_for_all_blocks_and_cells_that_share_poses() -> None:
+    planned = {"6": PosesLevel(6, "planned"), "8": PosesLevel(8, "planned")}
+    study = make_study("five-bar", poses=planned, methods=METHODS, replicates=6000)
+    estimate = estimate_time(study, workers=1)
+    assert (estimate.cells, estimate.blocks, estimate.plans) == (4, 4000, 2)
+    total = 4000 * estimate.seconds_per_block + 2 * estimate.seconds_per_plan
+    assert estimate.worker_seconds == pytest.approx(total)
+    assert estimate.seconds == pytest.approx(total)
+    page = [str(line) for line in view_estimate(study, estimate, lambda seconds: f"{seconds} s")]
+    assert page[-1].startswith("This includes planning poses, ")
+    assert page[-1].endswith(" s 2 times")
+    shown = view_estimate(make_study("five-bar"), estimate, lambda seconds: f"{seconds} s")
+    assert "planning" not in str(shown)

@@ -179,6 +179,37 @@ def test_damaged_store_gives_a_sentence(folder, part) -> None:
     assert caught.value.code in {"store.damaged", "store.disk-full", "store.not-accessible"}
 
 
+def test_damaged_part_is_named_where_its_blocks_are_copied(folder, tmp_path) -> None:
+    with open_store(folder) as store:
+        for number in range(200):
+            store.add_block(f"key{number}", A, number, make_scores(number, 20), 0.1)
+    raw = (folder / NAME).read_bytes()
+    middle = len(raw) // 8192 * 4096
+    (folder / NAME).write_bytes(raw[:middle] + bytes(8192) + raw[middle + 8192 :])
+    (tmp_path / "whole").mkdir()
+    make_store(tmp_path / "whole", HEADER)
+    with open_store(tmp_path / "whole") as whole, read_store(folder) as part:
+        with pytest.raises(FileError, match=f"^{folder / NAME}: this file is damaged"):
+            part.check_pages()
+        with pytest.raises(FileError, match=f"^{folder / NAME}: this file is damaged"):
+            whole.copy_blocks(part, A)
+
+
+def test_readers_leave_no_file_beside_a_store_that_no_driver_has(folder) -> None:
+    with open_store(folder) as store:
+        store.add_block("key", A, 0, make_scores(0), 0.5)
+        with read_store(folder) as reader:
+            assert reader.count_cell(A).blocks == 1
+        assert (folder / f"{NAME}-wal").exists()  # of the driver, which goes on
+        store.add_block("key2", A, 1, make_scores(1), 0.5)
+    before = (folder / NAME).read_bytes()
+    for _ in range(2):
+        with read_store(folder) as reader:
+            assert reader.count_cell(A).blocks == 2
+    assert [path.name for path in folder.iterdir()] == [NAME]
+    assert (folder / NAME).read_bytes() == before
+
+
 FULL = """
 import sys
 from pathlib import Path

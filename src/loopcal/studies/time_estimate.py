@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -11,8 +12,10 @@ from dataclasses import dataclass
 from loopcal.report.text_page import Block
 from loopcal.studies.results.summary_view import explain_failures
 from loopcal.studies.simulation.fits import OUTCOMES
-from loopcal.studies.simulation.tasks import compute_block, list_tasks
+from loopcal.studies.simulation.poses import CellPoses, compute_poses, is_planned
+from loopcal.studies.simulation.tasks import compute_block, make_block_task, make_poses_task
 from loopcal.studies.specification.cells import Cell, list_factors
+from loopcal.studies.specification.keys import compute_key, describe_block
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
 
@@ -30,7 +33,9 @@ class TimeEstimate:
     Attributes
     ----------
     cells, trials, blocks : of the study. measured : cells of which a block was computed.
-    seconds_per_block : mean of these blocks. worker_seconds : of the study, by one worker.
+    seconds_per_block : mean of these blocks. plans : sets of poses to draw or to plan, which cells
+    have in common. seconds_per_plan : mean of those of the measured cells.
+    worker_seconds : of the study, by one worker.
     workers : processors of this computer. seconds : of the study by as many processes.
     bytes : of its store. failed : share of the trials of these blocks that failed.
     computed : trials of these blocks. failures : code -> trials of these blocks.
@@ -41,6 +46,8 @@ class TimeEstimate:
     blocks: int
     measured: int
     seconds_per_block: float
+    plans: int
+    seconds_per_plan: float
     worker_seconds: float
     workers: int
     seconds: float
@@ -62,31 +69,43 @@ def estimate_time(
     chosen = _spread(study.cells, MOST_BLOCKS)
     seconds, trials = [], 0
     failures: dict[str, int] = {}
+    poses: dict[str, CellPoses] = {}
+    planning = 0.0
     for i, cell in enumerate(chosen):
         progress(i, len(chosen), "computing a block")
+        content = describe_block(study, cell, 0)
+        plan = make_poses_task(content)
+        if plan.key not in poses:
+            begin = time.perf_counter()
+            poses[plan.key] = compute_poses(json.loads(plan.content))
+            planning += time.perf_counter() - begin
+        task = make_block_task(compute_key(content), cell.number, content, poses[plan.key])
         begin = time.perf_counter()
-        result = compute_block(next(list_tasks(study, [cell.number])))
+        result = compute_block(task)
         seconds.append(time.perf_counter() - begin)
         trials += len(result.values)
         for code in (OUTCOMES[int(number)] for number in result.values[:, 0] if number):
             failures[code] = failures.get(code, 0) + 1
-        if sum(seconds) > LONGEST:
+        if sum(seconds) + planning > LONGEST:
             break
     blocks = study.blocks * len(study.cells)
-    each = sum(seconds) / len(seconds)
+    plans = len({make_poses_task(describe_block(study, cell, 0)).key for cell in study.cells})
+    each, each_plan = sum(seconds) / len(seconds), planning / len(poses)
     return TimeEstimate(
-        len(study.cells),
-        study.replicates * len(study.cells),
-        blocks,
-        len(seconds),
-        each,
-        each * blocks,
-        workers,
-        each * math.ceil(blocks / workers),
-        blocks * study.block * len(study.columns) * 8,
-        sum(failures.values()) / trials,
-        trials,
-        failures,
+        cells=len(study.cells),
+        trials=study.replicates * len(study.cells),
+        blocks=blocks,
+        measured=len(seconds),
+        seconds_per_block=each,
+        plans=plans,
+        seconds_per_plan=each_plan,
+        worker_seconds=each * blocks + each_plan * plans,
+        workers=workers,
+        seconds=each * math.ceil(blocks / workers) + each_plan * math.ceil(plans / workers),
+        bytes=blocks * study.block * len(study.columns) * 8,
+        failed=sum(failures.values()) / trials,
+        computed=trials,
+        failures=failures,
     )
 
 
@@ -107,6 +126,9 @@ def view_estimate(
         f"takes about {total} with {estimate.workers} process{plural}, and "
         f"{max(estimate.bytes / 1e6, 0.1):.1f} MB"
     )
+    if any(is_planned(level) for level in study.poses.values()):
+        times = "once" if estimate.plans == 1 else f"{estimate.plans} times"
+        lines.append(f"This includes planning poses, {estimate.seconds_per_plan:.2g} s {times}")
     return [*lines, *explain_failures(estimate.failures, estimate.computed)]
 
 

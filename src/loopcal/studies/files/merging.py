@@ -31,7 +31,7 @@ def merge_studies(
 
     Raises
     ------
-    FileError : a part is of another study, or a folder cannot be used.
+    FileError : a part is of another study or damaged, or a folder cannot be used.
     """
     studies = [read_study(part) for part in parts]
     first, largest = max(enumerate(studies), key=lambda item: item[1].replicates)
@@ -39,6 +39,9 @@ def merge_studies(
         if changes := list_conflicts(study.to_json(), largest.to_json()):
             code = "store.part-of-other-study"
             raise FileError(report_finding(code, other=str(parts[first]), changes=changes), part)
+    for part in parts:
+        with read_store(part) as other:
+            other.check_pages()
     file = parts[0] / STUDY_FILE
     source = StudySource(largest, file if file.is_file() else None)
     count = 0

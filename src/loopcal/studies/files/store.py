@@ -19,6 +19,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -228,9 +229,21 @@ class StudyStore:
             self.connection.executemany(
                 "INSERT INTO blocks (key, block, trials, scores, seconds, cell) "
                 f"VALUES (?, ?, ?, ?, ?, {cell}) ON CONFLICT (cell, block) DO NOTHING",
-                other.connection.execute(question, (_name_cell(levels),)),
+                other.read_rows(question, _name_cell(levels)),
             )
             return self.connection.total_changes - before
+
+    def read_rows(self, question: str, value: str) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows that answer a question of SQL, which has one value to fill in."""
+        with _report_errors(self.path):
+            yield from self.connection.execute(question, (value,))
+
+    def check_pages(self) -> None:
+        """Read the whole store, and raise FileError where it is damaged."""
+        with _report_errors(self.path):
+            (answer,) = self.connection.execute("PRAGMA quick_check(1)").fetchone()
+        if answer != "ok":
+            raise FileError(report_finding("store.damaged"), self.path)
 
     def _find_cell(self, levels: Levels) -> int:
         """Return the row of a cell, which is made where it is missing."""
@@ -297,9 +310,12 @@ def read_store(folder: Path) -> Iterator[StudyStore]:
     log = path.with_name(f"{NAME}-wal")
     is_still = not log.exists() or log.stat().st_size == 0
     is_copy = is_still and find_network_file_system(folder) is not None
-    mode = "immutable=1" if is_copy else "mode=ro"
+    # only a connection that could write removes the files of the log when it is the last one
+    is_writable = os.access(path, os.W_OK) and os.access(folder, os.W_OK)
+    mode = "immutable=1" if is_copy else "mode=rw" if is_writable else "mode=ro"
     address = f"{path.resolve().as_uri()}?{mode}"
     with _report_errors(path), closing(_connect(address, uri=True)) as connection:
+        connection.execute("PRAGMA query_only = ON")
         _refuse_format(path, connection)
         yield StudyStore(path, connection)
 
