@@ -13,9 +13,15 @@ FORBIDDEN_MODULES = {
     "poplib", "pty", "runpy", "shelve", "smtplib", "socket", "socketserver", "ssl", "subprocess",
     "telnetlib", "urllib", "webbrowser", "xmlrpc",
 }  # fmt: skip
-ALLOWED = {"studies/execution/processes.py": {"multiprocessing", "multiprocessing.connection",
-                                             "multiprocessing.process"}}  # fmt: skip
-"""The workers of a study are processes of this program."""
+ALLOWED = {
+    "studies/execution/processes.py": {
+        "multiprocessing", "multiprocessing.connection", "multiprocessing.process",
+    },
+    "documents/printing.py": {"subprocess"},
+}  # fmt: skip
+"""The workers of a study are processes of this program; a report is printed by an installed
+browser, where --pdf asks for it.
+"""
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "system", "popen", "spawnl", "execv"}
 
 WATCH = """

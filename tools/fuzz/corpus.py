@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.cli import main
+from loopcal.io.runs.certificate_settings import TEMPLATE as CERTIFICATE_FACTS
 from loopcal.measure import KINDS
 from tools.fuzz.sources import SOURCES
 
@@ -158,6 +159,8 @@ def _build_machine(recipe: Recipe) -> Machine:
         run_command(f"{seen} --draw {draw} --seed 2 -o data.csv --truth truth.yaml")
         run_command(f"simulate truth.yaml {recipe.instrument} --draw 7 --seed 3 -o more.csv")
         run_command("calibrate robot.yaml data.csv -o run --hold-out 0.3")
+        run_command("calibrate robot.yaml more.csv -o later", is_needed=False)
+        Path("facts.yaml").write_text(CERTIFICATE_FACTS.replace(': ""', ": A1"), "utf-8")
         Path("targets.csv").write_text(recipe.targets, "utf-8")
         planned = "--poses 8 --hold-out 2 --candidates 16"
         if name in PLANNED:
@@ -230,6 +233,10 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         1 budget run --json
         0.3 report run -o out.html
         0.3 report run -o out.html --json
+        1 compare run later
+        0.5 compare run later --data more.csv --json
+        1 repeatability robot.yaml data.csv
+        1 certificate run facts.yaml
         5 compensate run targets.csv -o out.csv
         1 compensate run targets.csv --mode commands
         1 compensate truth.yaml targets.csv -o out.csv --json
@@ -297,6 +304,9 @@ def _build_sources() -> Iterator[Machine]:
             1 export hexapod-42 --format linuxcnc --into hexapod.hal -o corrected.hal
             1 new limbs -o new.yaml --measurements new.csv --kind position,inclination
             1 new gough -o new.yaml
+            0.2 certificate --new
+            0.2 completion bash
+            0.2 example cable-robot -o out
             0.5 reproduce
             0.05 reproduce tsvd-2016 --trials 1 -o out
             """

@@ -63,7 +63,9 @@ def new(
     with restore_on_failure((output, measurements)):
         write_robot(output, robot_text, robot)
         if measurements is not None:
-            check = partial(check_written_template, robot=robot, instrument=instrument)
+            check = partial(
+                check_written_template, text=template, robot=robot, instrument=instrument
+            )
             write_text(measurements, template, check)
     if as_json:
         terminal.print_json({"robot": output, "measurements": measurements})

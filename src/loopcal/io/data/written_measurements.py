@@ -47,10 +47,11 @@ def check_written_measurements(path: Path, data: Measurements, robot: Mechanism)
         _check_rows(before, after, order)
 
 
-def check_written_template(path: Path, robot: Mechanism, instrument: Instrument) -> None:
-    """Read a measurement file without rows; raise LoopcalError where its columns have no meaning or
-    are not complete, or it states another instrument.
+def check_written_template(path: Path, text: str, robot: Mechanism, instrument: Instrument) -> None:
+    """Read a measurement file without rows; raise LoopcalError where it is not this text, its
+    columns have no meaning or are not complete, or it states another instrument.
     """
+    require_same("text", text, path.read_text("utf-8"))
     table = read_template(path)
     columns = dict.fromkeys(table.names, ("",))
     empty = replace(table, columns=columns, lines=(table.header_line + 1,))
