@@ -62,6 +62,6 @@ def test_commands_for_reprapfirmware_lead_to_a_recommendation(commands) -> None:
     bed = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999" for i, (x, y) in enumerate(POINTS)]
     Path("bed.g").write_text("\n".join(bed) + " S-1\n")
     assert main(commands[2].split()) == 0
-    assert main("calibrate printer.yaml heights.csv -o run".split()) == 0
+    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 0
     # nobody stated the noise: 13 points leave enough to estimate it only if all are fitted
     check_recommendation(truth, "values.apply-fitted")
