@@ -40,6 +40,9 @@ ROOT = str(Path(__file__).parents[2])
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Return a real scheduler and two real worker processes of dask."""
+    # its defaults must be set before: dask would remove them with our setting
+    import distributed  # noqa: F401
+
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "2s"}),  # to a worker that was killed
         make_cluster(2) as cluster,
