@@ -249,7 +249,7 @@ def test_tasks_that_are_given_up_are_reported_and_computed_the_next_time(
     assert (again.computed, again.is_complete) == (missing, True)
 
 
-def test_two_processes_give_the_same_blocks_and_little_overhead(undisturbed, tmp_path) -> None:
+def test_two_processes_give_the_same_blocks(undisturbed, tmp_path) -> None:
     report = run_study(read_source(write_study(tmp_path)), tmp_path / "study", Processes(2))
     assert report.computed == 16
     assert read_contents(tmp_path / "study") == read_contents(undisturbed)
