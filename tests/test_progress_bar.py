@@ -42,7 +42,6 @@ def test_two_pieces_of_work_have_a_line_each(monkeypatch) -> None:
 
 
 def test_notebook_shows_bar_page_and_figure(tmp_path) -> None:
-    """A real notebook, where Jupyter is installed."""
     client, formats = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     cells = [
         "import loopcal as lc\nbar = lc.ProgressBar()\nbar(1, 2, '<b>')\nbar(2, 2, '<b>')",

@@ -48,7 +48,7 @@ def solve_exact_readings(layout: Layout) -> np.ndarray:
 def test_plane_and_line_on_the_same_surface_share_its_direction(layout) -> None:
     local = build_measurements(layout, solve_exact_readings(layout)[0], NOISE).nuisance_parameters
     names = {
-        f"plane{g + 1}.held_z.{part}"
+        f"group{g + 1}.surface-z.{part}"
         for g in range(GROUPS)
         for part in ("u", "v", "height", "a", "b")
     }

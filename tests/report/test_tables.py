@@ -116,7 +116,7 @@ def test_complete_table_of_parameters_has_the_terms_of_the_gum():
         "U (95 %)",
         "unit",
     ]
-    assert table.rows[0][3:] == ("+2.00", "0.100", "4.57", "2", "0.200", "mm")
+    assert table.rows[0][3:] == ("+2.00", "0.100", "4.57", "2.00", "0.200", "mm")
     assert [cells[5] for cells in table.rows] == ["4.57", "164", "over 10000", "infinite"]
     unknown = {**rows[0], "sd": float("inf"), "plus_minus": float("inf")}
     (cells,) = build_parameter_table("Parameters", [unknown], is_complete=True).rows
