@@ -182,6 +182,7 @@ def test_a_paper_study_runs_and_is_summarized(tmp_path):
     assert per_leg.trials == 5
 
 
+@pytest.mark.slow
 def test_errors_in_both_frames_are_summarized(tmp_path, capsys):
     path, folder = tmp_path / "study.yaml", tmp_path / "results"
     assert main(["study", "new", str(path), "--paper", "cmm-constraint-2011"]) == 0
@@ -190,7 +191,9 @@ def test_errors_in_both_frames_are_summarized(tmp_path, capsys):
         .replace("sweeps: 3", "sweeps: 0")
         .replace("held_out: 100", "held_out: 5")
     )
-    text = text.replace("quick: {replicates: 5,", "quick: {errors: {s: 1}, replicates: 2,")
+    one = "{kinds: [plane, line], sigma_position: 0.01 mm}"
+    small = f"quick: {{errors: {{s: 1}}, instruments: {{one: {one}}}, replicates: 2,"
+    text = text.replace("quick: {replicates: 5,", small)
     path.write_text(text, "utf-8")
     assert main(["study", "run", str(path), "-o", str(folder), "--quick", "--workers", "1"]) == 0
     capsys.readouterr()

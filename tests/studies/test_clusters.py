@@ -45,8 +45,11 @@ def test_every_kind_of_worker_computes_identical_blocks(tmp_path, monkeypatch) -
     assert compute(tmp_path / "ray", Ray(processors=2)) == expected
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_ray_survives_lost_workers_and_passes_errors_on(tmp_path, monkeypatch) -> None:
+    """Ray takes half a minute to replace lost workers; those of dask and of processes are lost in
+    test_execution.py.
+    """
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     import ray
