@@ -50,6 +50,15 @@ def test_every_option_of_a_command_is_drawn(name) -> None:
     assert {opt for p in command.params for opt in p.opts if opt.startswith("-")} <= drawn
 
 
+@pytest.mark.parametrize(("code", "rules"), [(4, set()), (0, {"warning"})])
+def test_file_that_a_time_limit_left_open_is_no_find(tmp_path, code, rules) -> None:
+    said = "" if code == 0 else "loopcal: the time limit of 0.001 s was reached\n"
+    outcome = answer(code, err=said)
+    outcome.warned = ["ResourceWarning: unclosed file <x> (os:1)"]
+    case = Case(1, "five-bar", ["check", "robot.yaml", "--time-limit", "1s"], {}, [])
+    assert {find.rule for find in judge(case, outcome, tmp_path)} == rules
+
+
 def answer(code, out="", err="", before=(), after=()) -> Outcome:
     return Outcome(code, out, err, before=dict(before), after=dict(after))
 

@@ -45,6 +45,12 @@ class Find:
         return f"{self.rule}: {self.place}"
 
 
+ABANDONED_FILE = "ResourceWarning: unclosed file"
+"""A time limit that strikes between the opening of a file and the next instruction leaves the file
+to Python, which closes it; no code can prevent that.
+"""
+
+
 def judge(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     """Return every rule that the answer to an input breaks."""
     return list({find.signature: find for find in _list_finds(case, outcome, folder)}.values())
@@ -54,7 +60,11 @@ def _list_finds(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     finds = [
         Find("traceback", f"{kind} at {find_place(text)}", text) for kind, text in outcome.failures
     ]
-    finds += [Find("warning", text.split("(")[-1].rstrip(")"), text) for text in outcome.warned]
+    finds += [
+        Find("warning", text.split("(")[-1].rstrip(")"), text)
+        for text in outcome.warned
+        if not (outcome.code == TIME_LIMIT_CODE and text.startswith(ABANDONED_FILE))
+    ]
     finds += [Find("escape", text.split(" ")[0], text) for text in outcome.escapes]
     if outcome.cpu > CPU_LIMIT and not outcome.failures:
         finds.append(Find("slow", case.words[0], f"{outcome.cpu:.1f} s of processor time"))
