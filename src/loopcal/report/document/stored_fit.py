@@ -5,16 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-
-if TYPE_CHECKING:
-    from loopcal.estimate import Identification
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,21 +26,6 @@ class StoredFit:
     converged: bool = True
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return self.free_parameters.names
-
-    @property
-    def nominal(self) -> FloatArray:
-        """(p,) nominal values."""
-        return self.free_parameters.nominal
-
-    @property
-    def tolerance(self) -> FloatArray:
-        """(p,) tolerances used."""
-        return self.free_parameters.tolerance
-
-    @property
     def standard_deviations(self) -> FloatArray:
         """(p,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
@@ -55,8 +37,8 @@ class StoredFit:
 
 def restore_fit(
     fit: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
-) -> Identification:
-    """Return a stored fit for the functions that draw an `Identification`.
+) -> StoredFit:
+    """Return a stored fit for the functions that draw parameters.
 
     Parameters
     ----------
@@ -69,11 +51,10 @@ def restore_fit(
     factor, _ = free.display()
     tolerance = factor * np.array([row["tolerance"] for row in rows])
     assumed = np.array([bool(row["tolerance_assumed"]) for row in rows])
-    stored = StoredFit(
+    return StoredFit(
         robot,
         FreeParameters(robot, places, arrays["nominal"], tolerance, assumed),
         arrays["estimate"],
         arrays["covariance"],
         factor * np.array([row["plus_minus"] for row in rows]),
     )
-    return cast("Identification", stored)

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from loopcal.estimate import Identification
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.mechanism import Mechanism
 from loopcal.report.figures.style import (
     COLORS,
     DARK,
@@ -43,7 +44,45 @@ SHIFT, WIDTH = COLORS[0], COLORS[1]
 """Colors of shifts and of uncertainties."""
 
 
-def draw_parameters(fit: Identification) -> Figure:
+class FittedParameters(Protocol):
+    """What these figures use of a fit, an `Identification` or a stored one."""
+
+    @property
+    def robot(self) -> Mechanism:
+        """Its robot, with the estimates."""
+        ...
+
+    @property
+    def free_parameters(self) -> FreeParameters:
+        """The free parameters with nominal values and tolerances."""
+        ...
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(p,) estimates."""
+        ...
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(p, p) covariance of the estimates."""
+        ...
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """(p,) standard deviations."""
+        ...
+
+    @property
+    def converged(self) -> bool:
+        """Whether the iteration converged."""
+        ...
+
+    def interval(self) -> FloatArray:
+        """Return half-widths (p,) of the 95 % intervals."""
+        ...
+
+
+def draw_parameters(fit: FittedParameters) -> Figure:
     """Draw the shift of each parameter in tolerances with its 95 % interval, its uncertainty in
     tolerances, and both as numbers in the unit of the robot's file.
 
@@ -51,7 +90,7 @@ def draw_parameters(fit: Identification) -> Figure:
     """
     from matplotlib.lines import Line2D
 
-    p = len(fit.names)
+    p = len(fit.free_parameters.names)
     columns = max(-(-p // MOST_ROWS), 1)
     chunks = np.array_split(np.arange(p), columns)
     figure = start_figure(8.2 * columns, 1.6 + 0.19 * max(len(chunk) for chunk in chunks))
@@ -72,16 +111,16 @@ def draw_parameters(fit: Identification) -> Figure:
     return finish_figure(figure, f"{fit.robot.name}: {p} parameters{assumed}{status}")
 
 
-def _half_widths(fit: Identification) -> FloatArray:
+def _half_widths(fit: FittedParameters) -> FloatArray:
     """Return half-widths (p,) of the 95 % intervals in tolerances; NaN or infinite without."""
     if not fit.converged:
-        return np.full(len(fit.names), np.nan)
-    return fit.interval() / fit.tolerance
+        return np.full(len(fit.free_parameters.names), np.nan)
+    return fit.interval() / fit.free_parameters.tolerance
 
 
-def _draw_shifts(axes: Axes, fit: Identification, chunk: IntArray) -> None:
+def _draw_shifts(axes: Axes, fit: FittedParameters, chunk: IntArray) -> None:
     """Draw estimate minus nominal value in tolerances, with the 95 % interval."""
-    shift = ((fit.estimate - fit.nominal) / fit.tolerance)[chunk]
+    shift = ((fit.estimate - fit.free_parameters.nominal) / fit.free_parameters.tolerance)[chunk]
     half, y = _half_widths(fit)[chunk], np.arange(len(chunk))
     known = np.isfinite(half)
     axes.axvspan(-1.0, 1.0, color=PALE, alpha=0.35, lw=0.0, zorder=0)
@@ -97,11 +136,11 @@ def _draw_shifts(axes: Axes, fit: Identification, chunk: IntArray) -> None:
         capsize=1.5,
     )
     axes.plot(shift[~known], y[~known], "x", color=SHIFT, ms=DOT + 1)
-    _set_rows(axes, [shorten(fit.names[i]) for i in chunk])
+    _set_rows(axes, [shorten(fit.free_parameters.names[i]) for i in chunk])
     label_axes(axes, "estimate - nominal [tolerance]", "", "shift")
 
 
-def _draw_uncertainties(axes: Axes, fit: Identification, chunk: IntArray) -> None:
+def _draw_uncertainties(axes: Axes, fit: FittedParameters, chunk: IntArray) -> None:
     """Draw the half-width of the 95 % interval in tolerances; the numbers are at the right."""
     half, y = _half_widths(fit)[chunk], np.arange(len(chunk))
     drawn = np.isfinite(half) & (half > 0.0)
@@ -112,7 +151,7 @@ def _draw_uncertainties(axes: Axes, fit: Identification, chunk: IntArray) -> Non
         axes.set_xscale("log")
         label_logarithmic(axes.xaxis, FEW_TICKS)
     factor, symbols = fit.free_parameters.display()
-    widths = half * fit.tolerance[chunk] / factor[chunk]
+    widths = half * fit.free_parameters.tolerance[chunk] / factor[chunk]
     estimate = (fit.estimate / factor).tolist()
     numbers = [
         f"{format_with_uncertainty(estimate[i], width)} ± {format_uncertainty(width)} {symbols[i]}"
@@ -131,12 +170,12 @@ def _set_rows(axes: Axes, labels: list[str]) -> None:
     axes.set_ylim(len(labels) - 0.4, -0.6)
 
 
-def draw_correlation(fit: Identification) -> Figure:
+def draw_correlation(fit: FittedParameters) -> Figure:
     """Draw the correlations of all parameters as a matrix of colors.
 
     Parameters without a finite uncertainty have a grey row.
     """
-    p = len(fit.names)
+    p = len(fit.free_parameters.names)
     size = float(np.clip(0.155 * p, 3.4, 13.0))
     figure = start_figure(size + 2.6, size + 1.6)
     axes = figure.add_subplot()
@@ -145,10 +184,10 @@ def draw_correlation(fit: Identification) -> Figure:
     step = -(-p // MOST_NAMES)
     places = list(range(0, p, step))
     font = float(np.clip(size * 72.0 / max(len(places), 1) * 0.72, 4.0, SMALL))
-    names = [shorten(fit.names[i]) for i in places]
+    names = [shorten(fit.free_parameters.names[i]) for i in places]
     axes.set_xticks(places, names, rotation=90, fontsize=font)
     axes.set_yticks(places, names, fontsize=font)
-    owners = [name.split(".")[0] for name in fit.names]
+    owners = [name.split(".")[0] for name in fit.free_parameters.names]
     edges = [i - 0.5 for i in range(1, p) if owners[i] != owners[i - 1]]
     if len(edges) < p - 1:
         for edge in edges:
@@ -160,7 +199,7 @@ def draw_correlation(fit: Identification) -> Figure:
     return finish_figure(figure, f"{fit.robot.name}: {_describe_correlation(fit, step)}")
 
 
-def compute_correlation(fit: Identification) -> FloatArray:
+def compute_correlation(fit: FittedParameters) -> FloatArray:
     """Return the correlations (p, p) [1]; NaN where a parameter has no finite uncertainty."""
     sd = fit.standard_deviations
     usable = np.isfinite(sd) & (sd > 0.0)
@@ -168,15 +207,16 @@ def compute_correlation(fit: Identification) -> FloatArray:
     return np.where(np.outer(usable, usable), fit.covariance, np.nan) / np.outer(scale, scale)
 
 
-def _describe_correlation(fit: Identification, step: int) -> str:
+def _describe_correlation(fit: FittedParameters, step: int) -> str:
     """Return the strongest correlation in words, and what grey means where there is any."""
     correlation = compute_correlation(fit)
     off = np.abs(np.nan_to_num(correlation - np.diag(np.diag(correlation))))
-    words = f"correlation of {len(fit.names)} parameters"
+    words = f"correlation of {len(fit.free_parameters.names)} parameters"
     if off.size and off.max() > 0.0:
         i, j = np.unravel_index(int(off.argmax()), off.shape)
         value = f"{correlation[i, j]:+.2f}"
-        words += f"\nstrongest {value}: {shorten(fit.names[j])} and {shorten(fit.names[i])}"
+        names = fit.free_parameters.names
+        words += f"\nstrongest {value}: {shorten(names[j])} and {shorten(names[i])}"
     if np.isnan(np.diag(correlation)).any():
         words += "\ngrey: without a finite uncertainty"
     if step > 1:
