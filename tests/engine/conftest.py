@@ -3,18 +3,16 @@
 mechanisms.
 """
 
-import importlib
-from types import ModuleType
-
 import pytest
 
+from loopcal.engine import Engine, select_engine
 from tests import zoo
 from tests.engine.cases import Case, make_case
 
 
-@pytest.fixture(scope="session", params=["loopcal.engine"])
-def engine(request) -> ModuleType:
-    return importlib.import_module(request.param)
+@pytest.fixture(scope="session", params=["numpy"])
+def engine(request) -> Engine:
+    return select_engine(request.param)
 
 
 @pytest.fixture(

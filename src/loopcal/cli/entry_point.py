@@ -133,8 +133,14 @@ def find_running_command(words: Sequence[str]) -> click.Command | None:
         "show_default": True,
     },
 )
-@click.version_option(
-    None, "-V", "--version", package_name="loopcal", message="loopcal %(version)s"
+@click.option(
+    "-V",
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=lambda context, _option, is_asked: _print_version(context, is_asked),
+    help="Show the version and the engine, and exit.",
 )
 def command_line() -> None:
     """Calibrate the geometry of robots with closed kinematic loops.
@@ -153,6 +159,18 @@ def command_line() -> None:
       3  a defect of loopcal; the message names a report to send to the developers
       4  the time limit (--time-limit) was reached; no result was written
     """  # noqa: D301
+
+
+def _print_version(context: click.Context, is_asked: bool) -> None:
+    """Print the version of loopcal and the engine that computes, and exit."""
+    if not is_asked or context.resilient_parsing:
+        return
+    from importlib.metadata import version
+
+    from loopcal.engine import current_engine
+
+    click.echo(f"loopcal {version('loopcal')}\nengine {current_engine()}")
+    context.exit()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

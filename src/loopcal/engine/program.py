@@ -11,6 +11,7 @@ together. The rod of a `distance` ending counts as joint J, whose value is added
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,6 +26,9 @@ CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 """Values of `State.status`."""
 NEAR_GOAL = 8
 """The value of `State.status` of a row that comes close to a given goal."""
+
+Task = Callable[[FloatArray, np.ndarray], tuple[FloatArray, FloatArray]]
+"""Conditions on the pose: T (N, 3, 4), rows (N,) -> residual (N, c) [m], its slopes (N, c, 6)."""
 
 
 @dataclass(frozen=True)

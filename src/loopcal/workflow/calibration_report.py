@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -23,6 +21,7 @@ from loopcal.diagnose import (
     StartCheck,
     ValueComparison,
 )
+from loopcal.engine import collect_versions
 from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import InstrumentRecord, Measurements, list_instruments
@@ -47,7 +46,8 @@ class Provenance:
 
     Attributes
     ----------
-    versions : of loopcal, numpy, scipy and python. seeds : by name. options : the options in words.
+    versions : of loopcal, numpy, scipy and python, and the engine that computed. seeds : by name.
+    options : the options in words.
     """
 
     versions: Mapping[str, str]
@@ -61,9 +61,7 @@ class Provenance:
 
 def describe_provenance(options: CalibrationOptions) -> Provenance:
     """Return the versions in use, the seeds and the options."""
-    versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")}
-    versions["python"] = platform.python_version()
-    return Provenance(versions, {"hold_out": options.seed}, repr(options))
+    return Provenance(collect_versions(), {"hold_out": options.seed}, repr(options))
 
 
 def _count_fitted_poses(fit: Identification, data: Measurements) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from loopcal.engine.closure import place_links
+from loopcal.engine.numpy_engine.closure import place_links
 from loopcal.errors import MechanismError
 from loopcal.mechanism import Mechanism, PoseRecord, Workspace, build, differentiate_pose
 from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs

@@ -40,6 +40,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "studies": ("study",),
     "plan": ("plan",),
     "study_folders": ("store", "workers"),
+    "engine": ("engine",),
     "files": ("files",),
 }
 """Files of this folder, in the order of docs/findings.md, and the subjects of their codes."""

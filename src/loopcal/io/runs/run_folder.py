@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.engine import collect_versions
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.read_back import require_same
@@ -67,7 +68,7 @@ RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT
 
 MADE_BY: Mapping[str, str] = {
     "command": "the command line, as a list of words",
-    "versions": "versions of loopcal, python, numpy and scipy",
+    "versions": "versions of loopcal, numpy, scipy and python, and the engine that computed",
     "seeds": "all seeds in use, by name",
     "inputs": "each input file: its name as given, and its sha256",
 }
@@ -87,13 +88,9 @@ def collect_provenance(
     ------
     FileError : an input cannot be read.
     """
-    import platform
-    from importlib.metadata import version
-
-    versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")}
-    versions["python"] = platform.python_version()
     files = {role: {"path": str(path), "sha256": sha256(path)} for role, path in inputs.items()}
-    return {"command": list(command), "versions": versions, "seeds": dict(seeds), "inputs": files}
+    made_by = {"command": list(command), "versions": collect_versions()}
+    return made_by | {"seeds": dict(seeds), "inputs": files}
 
 
 def refuse_run_folder(path: str | Path, force: bool, inputs: Sequence[Path] = ()) -> None:

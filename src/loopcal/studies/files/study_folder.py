@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import loopcal
+from loopcal.engine import current_engine
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
@@ -36,8 +37,8 @@ from loopcal.studies.specification.study import Study
 STUDY_FILE = "study.yaml"
 """Name of the study file in the folder."""
 
-PROGRAM, NUMERICS_PART = "loopcal", "numerics"
-"""What has a version in a store."""
+PROGRAM, NUMERICS_PART, ENGINE = "loopcal", "numerics", "engine"
+"""What has a version in a store; the engine is that of the process that made the store."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,8 @@ def load_specification(store: StudyStore) -> Study:
 
 def make_header(study: Study) -> StoreHeader:
     """Return what the store of a study says about it."""
-    versions = {PROGRAM: loopcal.__version__, NUMERICS_PART: str(NUMERICS)}
+    numerics, engine = str(NUMERICS), str(current_engine())
+    versions = {PROGRAM: loopcal.__version__, NUMERICS_PART: numerics, ENGINE: engine}
     return StoreHeader(study.to_json(), tuple(c.name for c in study.columns), versions)
 
 

@@ -50,7 +50,7 @@ def build_provenance_section(record: CalibrationRecord) -> Section:
     command = " ".join(made_by.get("command") or ()) or "called from Python"
     rows = [
         ("command", command),
-        *((f"version of {name}", value) for name, value in made_by.get("versions", {}).items()),
+        *((_label_version(name), value) for name, value in made_by.get("versions", {}).items()),
         *((f"seed: {name}", str(seed)) for name, seed in made_by.get("seeds", {}).items()),
         ("method", str(record.result["fit"].get("method") or "unknown")),
         ("options", str(record.result.get("options") or "unknown")),
@@ -69,6 +69,11 @@ def build_provenance_section(record: CalibrationRecord) -> Section:
         )
         elements.append(Table("Files and their digests", columns, tuple(files)))
     return Section("provenance", "Provenance", tuple(elements))
+
+
+def _label_version(name: str) -> str:
+    """Return the label of an entry of `versions`; that of the engine states its name, too."""
+    return name if name == "engine" else f"version of {name}"
 
 
 def build_pose_section(record: CalibrationRecord) -> Section:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.engine.householder import SMALLEST, triangularize
+from loopcal.engine.numpy_engine.householder import SMALLEST, triangularize
 from loopcal.engine.program import LENGTH, PITCH, Block, ClosureBlocks, Group, Program, Slot, State
 from loopcal.typing import FloatArray
 

@@ -9,15 +9,21 @@ is. Derivation: docs/theory/engine.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine.closure import Chain, PlacedLinks, dot, exponential, matmul, place_links
-from loopcal.engine.householder import back_substitute, triangularize
+from loopcal.engine.numpy_engine.closure import (
+    Chain,
+    PlacedLinks,
+    dot,
+    exponential,
+    matmul,
+    place_links,
+)
+from loopcal.engine.numpy_engine.householder import back_substitute, triangularize
 from loopcal.engine.program import (
     CONVERGED,
     EXHAUSTED,
@@ -26,6 +32,7 @@ from loopcal.engine.program import (
     STALLED,
     Program,
     State,
+    Task,
 )
 from loopcal.typing import BoolArray, FloatArray
 
@@ -41,9 +48,6 @@ except close to a singularity.
 """
 SINGULAR = 1e-11
 """Smallest pivot of a limb's joints, relative to its largest, below which a limb is singular."""
-
-Task = Callable[[FloatArray, np.ndarray], tuple[FloatArray, FloatArray]]
-"""Conditions on the pose: T (N, 3, 4), rows (N,) -> residual (N, c) [m], its slopes (N, c, 6)."""
 
 
 class Iterate(NamedTuple):

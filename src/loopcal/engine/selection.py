@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which engine computes, and the three functions that call it.
+
+The environment variable LOOPCAL_ENGINE names the engine of a process: `numpy`, or the name of an
+entry point of the group `loopcal.engines`, such as `native`, with a variant of that engine behind a
+colon (`native:v2`). Without the variable, the package `loopcal-native` computes where it is
+installed, and NumPy elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+
+import numpy as np
+
+from loopcal.engine import numpy_engine
+from loopcal.engine.program import ClosureBlocks, Program, State, Task
+from loopcal.errors import MissingPackageError
+from loopcal.findings import report_finding
+from loopcal.typing import FloatArray
+
+VARIABLE, GROUP = "LOOPCAL_ENGINE", "loopcal.engines"
+"""The environment variable that names an engine, and the entry points that provide engines."""
+NUMPY, NATIVE = "numpy", "native"
+NATIVE_MODULE = "loopcal_native"
+
+
+@dataclass(frozen=True)
+class Engine:
+    """An implementation of `solve`, `linearize` and `fold`, whose docstrings are below.
+
+    name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
+    """
+
+    name: str
+    version: str
+    solve: Callable[..., State]
+    linearize: Callable[..., ClosureBlocks]
+    fold: Callable[[FloatArray, FloatArray], FloatArray]
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.version}"
+
+
+def select_engine(choice: str = "") -> Engine:
+    """Return the engine of this name, the fastest installed one without a name.
+
+    An entry point is a function that returns an engine for a variant; `""` is its own choice.
+
+    Raises
+    ------
+    MissingPackageError : there is no such engine, or it does not work here.
+    """
+    choice = choice.strip() or (NATIVE if find_spec(NATIVE_MODULE) else NUMPY)
+    name, _, variant = choice.partition(":")
+    if choice == NUMPY:
+        functions = numpy_engine.solve, numpy_engine.linearize, numpy_engine.fold
+        return Engine(NUMPY, np.__version__, *functions)
+    from importlib.metadata import entry_points
+
+    installed = {entry.name: entry for entry in entry_points(group=GROUP)}
+    if name not in installed:
+        known = (NUMPY, *sorted(installed))
+        raise MissingPackageError(report_finding("engine.unknown", engine=choice, known=known))
+    try:
+        return installed[name].load()(variant)
+    except (ImportError, OSError, ValueError) as cause:
+        finding = report_finding("engine.not-usable", engine=choice, reason=str(cause))
+        raise MissingPackageError(finding) from cause
+
+
+@cache
+def current_engine() -> Engine:
+    """Return the engine that LOOPCAL_ENGINE names, chosen once in a process."""
+    return select_engine(os.environ.get(VARIABLE, ""))
+
+
+def solve(
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    start: State,
+    task: Task | None = None,
+    free: bool = False,
+    max_iterations: int = 60,
+    goal: State | None = None,
+) -> State:
+    """Find the pose and the joints that close every loop.
+
+    e : (t | 1, n_displacements) [m, rad].
+    q : (t | 1, n, n_joints) actuated joint values [m, rad]; with `free` only their first guess.
+    start : first guess, (t | 1, n | 1) rows.
+    task : conditions on the pose, as many as the freed actuators leave open.
+    free : solve for the actuated joints too.
+    goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
+        goal, to which further steps would converge. Its coordinates are those before that step.
+
+    Rows that fail are marked in `status`; nothing is raised.
+    """
+    return current_engine().solve(program, e, q, start, task, free, max_iterations, goal)
+
+
+def linearize(
+    program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
+) -> ClosureBlocks:
+    """Linearize closure at a state (t, n) and eliminate the passive joints.
+
+    e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
+    free : eliminate the actuated joints too, at their values in `state`.
+    """
+    return current_engine().linearize(program, e, q, state, free)
+
+
+def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return the triangular factor R with R'R = factor'factor + rows'rows.
+
+    No product is formed. The signs of the rows of R are arbitrary. A row of zeros changes nothing.
+
+    factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
+    """
+    return current_engine().fold(factor, rows)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One engine computes in a process: the one that LOOPCAL_ENGINE names, and results state it."""
+
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from loopcal import engine
+from loopcal.cli import main
+from loopcal.engine import Engine, numpy_engine, select_engine, selection
+from loopcal.errors import MissingPackageError
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """Set LOOPCAL_ENGINE, as in a new process; the engine is chosen anew afterwards."""
+
+    def name(choice):
+        monkeypatch.setenv(selection.VARIABLE, choice)
+        selection.current_engine.cache_clear()
+
+    yield name
+    selection.current_engine.cache_clear()
+
+
+def make_counting_engine(variant: str) -> Engine:
+    """Return the NumPy engine under another name, as an entry point would."""
+    if variant not in ("", "fast"):
+        raise ValueError(f"no variant {variant!r}")
+    functions = numpy_engine.solve, numpy_engine.linearize, lambda factor, rows: factor + len(rows)
+    return Engine(f"counting:{variant}", "1.0", *functions)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Install an engine named `counting`, and one whose package is broken."""
+    values = {"counting": f"{__name__}:make_counting_engine", "broken": "no_such_module:make"}
+    points = [EntryPoint(name, value, selection.GROUP) for name, value in values.items()]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points)
+    monkeypatch.setattr(EntryPoint, "load", load)
+
+
+def load(point: EntryPoint):
+    """Load an entry point of these tests, whose module pytest imported under another name."""
+    if point.name == "broken":
+        raise ImportError("it was built for another processor")
+    return make_counting_engine
+
+
+def test_numpy_computes_where_nothing_else_is_installed(monkeypatch):
+    monkeypatch.setattr(selection, "find_spec", lambda _: None)
+    assert str(select_engine()) == f"numpy {np.__version__}"
+
+
+def test_the_environment_names_the_engine_of_all_callers(environment, installed):
+    environment("counting:fast")
+    assert str(engine.current_engine()) == "counting:fast 1.0"
+    assert engine.fold(np.zeros((1, 2, 2)), np.zeros((1, 3, 2))).max() == 1.0
+    environment("numpy")
+    assert engine.fold(np.zeros((1, 2, 2)), np.zeros((1, 3, 2))).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("choice", "code"),
+    [
+        ("nativ", "engine.unknown"),
+        ("numpy:v2", "engine.unknown"),
+        (":v2", "engine.unknown"),
+        ("broken", "engine.not-usable"),
+        ("counting:slow", "engine.not-usable"),
+    ],
+)
+def test_engines_that_cannot_compute_are_refused_in_a_sentence(installed, choice, code):
+    with pytest.raises(MissingPackageError) as refusal:
+        select_engine(choice)
+    assert refusal.value.code == code
+    assert repr(choice) in str(refusal.value)
+
+
+def test_a_wrong_name_ends_a_command_with_a_sentence(environment, capsys):
+    environment("nativ")
+    assert main(["check", "five-bar"]) == 1
+    assert "LOOPCAL_ENGINE names the engine 'nativ'" in capsys.readouterr().err
+
+
+def test_version_states_the_engine(environment, capsys):
+    environment("numpy")
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == f"engine numpy {np.__version__}"
+
+
+def test_provenance_states_the_engine(environment):
+    environment("numpy")
+    assert engine.collect_versions()["engine"] == f"numpy {np.__version__}"
