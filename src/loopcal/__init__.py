@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from loopcal.apply import AccuracySimulation as AccuracySimulation
     from loopcal.apply import Compensation as Compensation
     from loopcal.apply import Conformity as Conformity
+    from loopcal.apply import HeightErrors as HeightErrors
     from loopcal.apply import PoseUncertainty as PoseUncertainty
     from loopcal.apply import Repeatability as Repeatability
     from loopcal.apply import RunComparison as RunComparison
@@ -167,9 +168,10 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
     package: names.split()
     for package, names in {
         "loopcal.apply": """
-            AccuracyMap AccuracySimulation Compensation Conformity PoseUncertainty Repeatability
-            RunComparison Validation accuracy_map assess_repeatability compare_runs compensate
-            judge_estimate judge_largest_error pose_uncertainty simulate_accuracy validate
+            AccuracyMap AccuracySimulation Compensation Conformity HeightErrors PoseUncertainty
+            Repeatability RunComparison Validation accuracy_map assess_repeatability compare_runs
+            compensate judge_estimate judge_largest_error pose_uncertainty simulate_accuracy
+            validate
         """,
         "loopcal.diagnose": """
             ConventionCheck CrossValidation FitExamination Identifiability ModelChoice

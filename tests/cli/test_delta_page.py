@@ -31,7 +31,8 @@ def test_calibrate_prints_the_numbers_of_the_page(page, capsys) -> None:
     assert main(command[1].split()) == 0
     out = capsys.readouterr().out
     assert read_report(printed[1]) == read_report(out)
-    assert len(read_table_rows(out)) == 8  # rms and largest error, and six parameters
+    rows = read_table_rows(out)  # rms and largest error, 13 heights, and six parameters
+    assert len(rows) == 2 + 13 + 6
     result = json.loads(Path("run/result.json").read_text())
     assert result["verdict"] == "undecided"
     codes = {finding["code"] for finding in result["findings"]}

@@ -18,9 +18,10 @@ from loopcal.cli import main
 from loopcal.documents.sources import load_record
 from loopcal.errors import ArgumentTypeError, FileError
 from loopcal.report.document.calibration_document import SECTIONS, build_document
-from loopcal.report.document.elements import Document
+from loopcal.report.document.elements import Document, Picture
 from loopcal.report.document.figures import thin_rows
 from loopcal.report.document.page import render_html
+from loopcal.report.tables import Table
 from loopcal.report.validation_view import view_errors
 
 ORDER = (
@@ -232,3 +233,25 @@ def test_orientations_have_one_unit_and_coverage_factors_two_places(page) -> Non
     (table,) = (e for e in section["elements"] if e.get("table") == "Identified parameters")
     place = table["columns"].index("k")
     assert all(re.fullmatch(r"[0-9]+[.][0-9]{2}", row[place]) for row in table["rows"])
+
+
+def test_report_of_a_printer_shows_the_heights_over_the_bed(root, tmp_path) -> None:
+    robot = lc.load_robot(root / "examples" / "delta-printer" / "printer.yaml")
+    data = lc.load_measurements(root / "examples" / "delta-printer" / "heights.csv", robot)
+    report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.4))
+    lc.save_run(tmp_path / "run", report)
+    for source in (report, lc.load_run(tmp_path / "run")):
+        section = build(load_record(source), "height").sections[0]
+        assert section.title == "Height errors over the bed"
+        sentence, summary, picture, by_point = section.elements
+        assert isinstance(sentence, str)
+        assert isinstance(summary, Table)
+        assert isinstance(by_point, Table)
+        assert "predicts at the recorded readings minus the measured one" in sentence
+        assert [row[:3] for row in summary.rows[::2]] == [
+            ("fitted", "rms", "8"),
+            ("held-out", "rms", "5"),
+        ]
+        assert isinstance(picture, Picture)
+        assert picture.name == "height-figure"
+        assert len(by_point.rows) == 13

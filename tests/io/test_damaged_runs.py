@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.apply import HeightErrors
+from loopcal.apply.height_errors import store_heights
 from loopcal.cli import main
 from loopcal.errors import FileError, LoopcalError
 from loopcal.estimate.poses.smooth_errors import describe_smooth_errors
@@ -32,6 +34,7 @@ from loopcal.io.runs.run_arrays import (
 )
 from loopcal.io.runs.run_result import read_result
 from loopcal.report.budget_view import view_budget
+from loopcal.units import find_unit
 from tests.io.changed_documents import change_value, list_places
 
 DATA = """# kind: position
@@ -206,6 +209,10 @@ def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
     own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(2)}
     own |= {"discrepancy_directions": np.eye(p), "discrepancy_variance": np.ones(p)}
     arrays |= own
+    heights = HeightErrors(
+        ("1", "2"), np.ones((2, 2)), np.ones(2), np.ones(2), np.ones(2, dtype=bool), find_unit("mm")
+    )
+    arrays |= store_heights(heights)
     assert set(RULES) <= set(arrays)
     assert set(DISCREPANCY) == set(own)
     assert find_problem(arrays) is None

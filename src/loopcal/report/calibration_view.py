@@ -14,6 +14,7 @@ from loopcal.findings import Finding
 from loopcal.findings.wording import list_names
 from loopcal.mechanism import Mechanism
 from loopcal.report.budget_view import build_budget_table
+from loopcal.report.height_view import view_heights
 from loopcal.report.numbers import (
     format_in,
     format_number,
@@ -57,7 +58,7 @@ def view_calibration(
     fit = report.identification
     rows = fit.to_dict()
     task = ["", str(report.budget)] if report.states_expected_error else []
-    blocks: list[Block] = [report.headline, *task, *_view_errors(report)]
+    blocks: list[Block] = [report.headline, *task, *_view_errors(report, verbose)]
     selected = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in selected])]
     if more := len(report.findings) - len(selected):
@@ -79,13 +80,15 @@ def view_calibration(
     return blocks
 
 
-def _view_errors(report: CalibrationReport) -> list[Block]:
-    """Return the tables of errors, at held-out poses or else at the fitted ones."""
+def _view_errors(report: CalibrationReport, verbose: bool) -> list[Block]:
+    """Return the tables of errors, at held-out poses or else at the fitted ones, and of heights."""
     if report.validation is not None:
-        return view_errors(report.validation, "held-out")
-    if report.fitted_errors is not None:
-        return view_errors(report.fitted_errors, "fitted (optimistic)")
-    return []
+        blocks = view_errors(report.validation, "held-out")
+    elif report.fitted_errors is not None:
+        blocks = view_errors(report.fitted_errors, "fitted (optimistic)")
+    else:
+        blocks = []
+    return [*blocks, *view_heights(report.height_errors, verbose)]
 
 
 def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Block]:

@@ -48,7 +48,7 @@ def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -
         return format_number(value, digits)
     if abs(value) < INSIGNIFICANT * uncertainty:
         value = 0.0
-    return f"{value:.{_decimals(uncertainty)}f}"
+    return f"{value:.{count_decimals(uncertainty)}f}"
 
 
 def format_uncertainty(uncertainty: float) -> str:
@@ -57,10 +57,10 @@ def format_uncertainty(uncertainty: float) -> str:
         return "not given"
     if math.isinf(uncertainty):
         return "unknown"
-    return f"{uncertainty:.{_decimals(uncertainty)}f}" if uncertainty > 0.0 else "0"
+    return f"{uncertainty:.{count_decimals(uncertainty)}f}" if uncertainty > 0.0 else "0"
 
 
-def _decimals(uncertainty: float) -> int:
-    """Return the decimals that show three significant digits, at most 12."""
+def count_decimals(uncertainty: float) -> int:
+    """Return the decimals that show three significant digits of a number above 0, at most 12."""
     rounded = float(f"{uncertainty:.2e}")  # 9.996 shows as 10.0, which has one decimal less
     return min(max(2 - math.floor(math.log10(rounded)), 0), 12)

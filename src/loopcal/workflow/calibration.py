@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from loopcal.apply import Validation, compute_error_budget, validate
+from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
     ConventionCheck,
@@ -230,6 +230,7 @@ def _report(
         conventions=conventions,
         validation=None if held_out is None else errors,
         fitted_errors=errors if held_out is None else None,
+        height_errors=map_height_errors(fit, fitted, held_out) if fit.converged else None,
         findings=sort_by_importance(findings),
         budget=budget,
         examination=examination,

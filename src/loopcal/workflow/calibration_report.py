@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.apply import ErrorBudget, Validation
+from loopcal.apply import ErrorBudget, HeightErrors, Validation
+from loopcal.apply.height_errors import store_heights
 from loopcal.apply.stored_validation import store_differences
 from loopcal.diagnose import (
     ConventionCheck,
@@ -90,6 +91,8 @@ class CalibrationReport(TableResult):
         predicted or the fit did not converge.
     fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic. None
         where the fit did not converge.
+    height_errors : errors of measured heights over the bed, fitted and held-out; None where the
+        data measure no heights, or the fit did not converge.
     findings : everything noticed, the most important first.
     budget : uncertainty of parameters and of poses over the workspace by source; None where there
         are no intervals.
@@ -110,6 +113,7 @@ class CalibrationReport(TableResult):
     conventions: ConventionCheck
     validation: Validation | None
     fitted_errors: Validation | None
+    height_errors: HeightErrors | None
     findings: tuple[Finding, ...]
     budget: ErrorBudget | None
     examination: FitExamination | None
@@ -205,15 +209,16 @@ class CalibrationReport(TableResult):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return arrays to store [SI]: those of the fit, `initial`, the values of all parameters
-        before the calibration, `poses`, the labels of the fitted poses, and the differences at
-        held-out poses.
+        before the calibration, `poses`, the labels of the fitted poses, the differences at held-out
+        poses, and errors of heights.
         """
-        fit, errors = self.identification, self.validation
+        fit, errors, heights = self.identification, self.validation, self.height_errors
         return {
             **fit.arrays(),
             "initial": fit.initial.values,
             "poses": np.array(self.split.fitted.labels, str),
             **({} if errors is None else store_differences(errors)),
+            **({} if heights is None else store_heights(heights)),
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -233,6 +238,7 @@ class CalibrationReport(TableResult):
             "examination": self.examination,
             "remedies": self.suggestions,
             "reading_errors": self.reading_errors,
+            "height_errors": self.height_errors,
         }
         return {
             "verdict": self.verdict,

@@ -4,7 +4,8 @@
 Sizes are numbers, or letters that stand for the same number in every array: p identified and a all
 parameters of the robot, u setup parameters, i instruments, s sources and c columns of the parts of
 the covariance, d directions that the data determine, k centers and m = 6 k coefficients of a model
-discrepancy. Residuals and histories are for people and other programs, and are not checked.
+discrepancy, h heights. Residuals and histories are for people and other programs, and are not
+checked.
 """
 
 from __future__ import annotations
@@ -109,12 +110,19 @@ INFORMATION: Mapping[str, ArrayRule] = {
     "information_deviations": ArrayRule("d"),
     "information_noise": ArrayRule("2", NUMBERS),
 }
+HEIGHTS: Mapping[str, ArrayRule] = {
+    "heights_poses": ArrayRule("h", TEXT),
+    "heights_points": ArrayRule("h 2"),
+    "heights_before": ArrayRule("h"),
+    "heights_after": ArrayRule("h"),
+    "heights_held_out": ArrayRule("h", LOGICAL),
+}
 FITTED = ArrayRule("rows values", NUMBERS)
 """Rules of arrays by name. Runs of format 1 may lack LATER; of the other groups, a run holds all
 arrays or none. `fitted_<number>_<kind>` are the fitted rows, one array for each kind.
 """
 
-RULES = {**FIT, **LATER, **FRAMES, **DISCREPANCY, **NOISE, **INFORMATION}
+RULES = {**FIT, **LATER, **FRAMES, **DISCREPANCY, **NOISE, **INFORMATION, **HEIGHTS}
 FITTED_NAME = re.compile(r"fitted_\d+_.+", re.DOTALL)
 
 
@@ -148,7 +156,7 @@ def find_problem(arrays: Mapping[str, np.ndarray], is_complete: bool = True) -> 
     arrays : name -> array. is_complete : whether LATER are needed, as from format 2 on.
     """
     needed = [*FIT, *(LATER if is_complete else ())]
-    for group in (FRAMES, DISCREPANCY, NOISE, INFORMATION):
+    for group in (FRAMES, DISCREPANCY, NOISE, INFORMATION, HEIGHTS):
         needed += group if any(name in arrays for name in group) else ()
     if missing := [name for name in needed if name not in arrays]:
         return f"the array {missing[0]!r} is missing"

@@ -11,7 +11,11 @@ from loopcal.report.document.sections.data import (
     build_outlier_section,
     build_residual_section,
 )
-from loopcal.report.document.sections.errors import build_error_section, build_workspace_section
+from loopcal.report.document.sections.errors import (
+    build_error_section,
+    build_height_section,
+    build_workspace_section,
+)
 from loopcal.report.document.sections.parameters import (
     build_budget_section,
     build_parameter_section,
@@ -28,6 +32,7 @@ SECTIONS = (
     build_open_section,
     build_outlier_section,
     build_error_section,
+    build_height_section,
     build_residual_section,
     build_workspace_section,
     build_parameter_section,

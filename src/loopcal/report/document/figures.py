@@ -19,6 +19,7 @@ from loopcal.report.document.stored_fit import restore_fit
 from loopcal.report.figures import (
     draw_accuracy_map,
     draw_correlation,
+    draw_height_errors,
     draw_parameters,
     draw_residual_rows,
     draw_scene,
@@ -100,6 +101,24 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
         "Errors at held-out poses before and after calibration.",
         "For each held-out pose the figure shows the size of the error before and after "
         "calibration, with the noise floor.",
+    )
+
+
+def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
+    """Yield the errors of heights over the bed before and after; of many heights none."""
+    heights = record.heights
+    if heights is None:
+        return
+    if len(heights.poses) > MOST_ROWS:
+        yield f"The errors of {len(heights.poses):,} heights are too many for a figure."
+        return
+    yield make_picture(
+        draw_height_errors(heights),
+        "height-figure",
+        "Height errors over the bed before and after calibration.",
+        "Each point is a measured height at its place over the bed; its color is the error, "
+        "predicted minus measured, with the same scale before and after calibration. Circles were "
+        "used in the fit, squares were held out.",
     )
 
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.apply import Validation
+from loopcal.apply import HeightErrors, Validation
+from loopcal.apply.height_errors import restore_heights
 from loopcal.apply.stored_validation import restore_validation
 from loopcal.estimate import Posterior
 from loopcal.estimate.inference.posterior import posterior_from_arrays
@@ -52,6 +53,7 @@ class CalibrationRecord:
     posterior : of a fit that converged; None where the run has none.
     validation : errors at held-out poses; None without any, or where an older version wrote the
         run.
+    heights : errors of measured heights over the bed; None without any.
     residuals : of every kind; none where an older version wrote the run.
     controllers : the values for controllers that can store them.
     """
@@ -63,6 +65,7 @@ class CalibrationRecord:
     initial: Mechanism
     posterior: Posterior | None
     validation: Validation | None
+    heights: HeightErrors | None
     residuals: tuple[KindResiduals, ...]
     controllers: tuple[ControllerValues, ...]
 
@@ -122,6 +125,7 @@ def build_record(
         initial=initial,
         posterior=posterior_from_arrays(robot, arrays) if "posterior_unit" in arrays else None,
         validation=None if stored is None else restore_validation(stored, arrays, robot),
+        heights=restore_heights(arrays, robot),
         residuals=residuals_from_arrays(arrays),
         controllers=controllers,
     )

@@ -6,6 +6,7 @@
 
 from loopcal.report.figures.accuracy_figure import draw_accuracy_map as draw_accuracy_map
 from loopcal.report.figures.convergence_figure import draw_convergence as draw_convergence
+from loopcal.report.figures.height_figure import draw_height_errors as draw_height_errors
 from loopcal.report.figures.identifiability_figure import (
     draw_identifiability as draw_identifiability,
 )

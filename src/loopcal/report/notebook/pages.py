@@ -10,6 +10,7 @@ from loopcal.apply import (
     AccuracySimulation,
     Compensation,
     Conformity,
+    HeightErrors,
     RunComparison,
     Validation,
 )
@@ -28,6 +29,7 @@ from loopcal.mechanism import Solution
 from loopcal.presentation import TableResult
 from loopcal.report.calibration_view import build_model_table, view_calibration, view_fit
 from loopcal.report.compensation_view import view_compensation
+from loopcal.report.height_view import view_heights
 from loopcal.report.notebook.html import render_html
 from loopcal.report.notebook.records import collect_records
 from loopcal.report.notebook.tables import build_main_table
@@ -75,6 +77,12 @@ def write_report(result: CalibrationReport) -> list[Block]:
 def write_validation(result: Validation) -> list[Block]:
     """Return the page that the command line prints."""
     return view_validation(result, with_before=True, verbose=False)
+
+
+@write_page.register
+def write_heights(result: HeightErrors) -> list[Block]:
+    """Return the table that the command line prints."""
+    return view_heights(result, verbose=False)
 
 
 @write_page.register

@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.apply import AccuracyMap, AccuracySimulation, Compensation, PoseUncertainty, Validation
+from loopcal.apply import (
+    AccuracyMap,
+    AccuracySimulation,
+    Compensation,
+    HeightErrors,
+    PoseUncertainty,
+    Validation,
+)
 from loopcal.apply.accuracy import COMPONENTS
 from loopcal.mechanism import POSITION, Jacobian, Mechanism, Solution, Status
 from loopcal.planning import Plan, SurfacePlan
@@ -57,6 +64,24 @@ def collect_validation(result: Validation) -> Records:
             *(Variable(name, row, np.array(values, float)) for name, values in sizes.items()),
         ),
         {"row": number_from_one(len(poses))},
+    )
+
+
+@collect_records.register
+def collect_heights(result: HeightErrors) -> Records:
+    """Return places and errors of heights [SI]."""
+    row = ("row",)
+    return Records(
+        "row",
+        (
+            Variable("pose", row, np.array(result.poses, str)),
+            Variable("x", row, result.points[:, 0], "m"),
+            Variable("y", row, result.points[:, 1], "m"),
+            Variable("before", row, result.before, "m"),
+            Variable("after", row, result.after, "m"),
+            Variable("held_out", row, result.is_held_out),
+        ),
+        {"row": number_from_one(len(result.poses))},
     )
 
 

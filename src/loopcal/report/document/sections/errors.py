@@ -6,10 +6,12 @@ from __future__ import annotations
 from loopcal.report.document.elements import Element, Section
 from loopcal.report.document.figures import (
     draw_accuracy_picture,
+    draw_height_picture,
     draw_scene_picture,
     draw_validation_picture,
 )
 from loopcal.report.document.record import CalibrationRecord
+from loopcal.report.height_view import build_height_map, build_height_summary
 from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
 
 BASELINE = (
@@ -18,6 +20,13 @@ BASELINE = (
     "stated measurement noise alone causes."
 )
 STATED_FRAME = "The stated frame is the one in which the measurement files state their values."
+
+HEIGHTS = (
+    "A height error is the height that a geometry predicts at the recorded readings minus the "
+    "measured one: positive where the bed seems too high. Before: the geometry before calibration, "
+    "with frames, surfaces and offsets fitted to the rows of the calibration. Errors at fitted "
+    "points are optimistic, those at held-out points are not."
+)
 
 NOT_HELD_OUT = (
     "No pose was held out of this fit, so the report states no error at poses that were not fitted."
@@ -42,6 +51,15 @@ def build_error_section(record: CalibrationRecord) -> Section:
     elements += [" ".join(describe_improvements(errors)), *draw_validation_picture(record)]
     elements += [table for table in view_error_statistics(errors) if not isinstance(table, str)]
     return Section("errors", "Errors at held-out poses", tuple(e for e in elements if e))
+
+
+def build_height_section(record: CalibrationRecord) -> Section:
+    """Return the errors of heights over the bed, where heights were measured."""
+    heights, title = record.heights, "Height errors over the bed"
+    if heights is None:
+        return Section("heights", title, ())
+    tables = (build_height_summary(heights), build_height_map(heights))
+    return Section("heights", title, (HEIGHTS, tables[0], *draw_height_picture(record), tables[1]))
 
 
 def build_workspace_section(record: CalibrationRecord) -> Section:

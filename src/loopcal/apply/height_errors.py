@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of measured heights over a bed, before and after calibration.
+
+A printer owner sees a wrong geometry as a bowl or a tilted plane on the bed. Rows that measure one
+height (the component z of the tool, or the gap to a level plane) have an error, prediction minus
+measurement, and a place x, y: where the calibrated geometry has the touching point at the recorded
+readings. Of a height that a firmware reported, the error before calibration is that height itself:
+positive where the bed seems too high.
+
+"Before" is the baseline of `loopcal.apply.validation`: the geometry before calibration with the
+setup parameters that fit it best at the fitted rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from loopcal.diagnose import PredictionComparison, compare_predictions
+from loopcal.diagnose.row_errors import Statistics, compute_statistics
+from loopcal.errors import DataError
+from loopcal.estimate.result import Identification
+from loopcal.findings.wording import round_to_digits
+from loopcal.measure import Measurements, Observations
+from loopcal.measure.kinds import Component, Plane
+from loopcal.presentation import TableResult, draw
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension, Unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from loopcal.mechanism import Mechanism
+
+PREFIX = "heights_"
+"""Beginning of the names of the stored arrays."""
+
+FEWEST = 3
+"""Heights that show a plane; with fewer there is no map."""
+
+LEVEL = 0.2
+"""Largest ratio of the points' range in z to that in x, y of a surface that is called a bed."""
+
+UPRIGHT = 0.95
+"""Least cosine of the angle between the z axes of the measured frame and of the base."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeightErrors(TableResult):
+    """Errors of n measured heights, prediction minus measurement, at their places over the bed.
+
+    Attributes
+    ----------
+    poses : (n,) labels. points : (n, 2) x, y of the touching point by the calibrated geometry, in
+        the base frame of the robot file [m]. before, after : (n,) errors [m].
+    is_held_out : (n,) whether a height was held out of the fit. unit : in which all are shown.
+    """
+
+    poses: tuple[str, ...]
+    points: FloatArray
+    before: FloatArray
+    after: FloatArray
+    is_held_out: BoolArray
+    unit: Unit
+
+    def statistics(self, errors: str, held_out: bool) -> Statistics:
+        """Return the statistics of the sizes of "before" or "after", of the held-out or of the
+        fitted heights [m].
+        """
+        return compute_statistics(np.abs(getattr(self, errors)[self.is_held_out == held_out]))
+
+    def list_sets(self) -> Iterator[tuple[str, bool]]:
+        """Yield "fitted" and "held-out" with whether they are held out, as far as there are any."""
+        for name, is_held_out in (("fitted", False), ("held-out", True)):
+            if (self.is_held_out == is_held_out).any():
+                yield name, is_held_out
+
+    def plot(self) -> Figure:
+        """Draw the errors over the bed before and after calibration, with one scale of colors."""
+        return draw("draw_height_errors", self)
+
+    def __str__(self) -> str:
+        """Return one line for the fitted and one for the held-out heights."""
+        factor, symbol = self.unit.factor_to_si, self.unit.symbol
+        lines = [f"Height errors at {len(self.poses)} points of the bed:"]
+        for name, is_held_out in self.list_sets():
+            before, after = (self.statistics(e, is_held_out) for e in ("before", "after"))
+            rms = [f"{round_to_digits(s.rms / factor)} {symbol}" for s in (before, after)]
+            lines.append(f"  {name} ({after.count}): rms {rms[0]} before, {rms[1]} after")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return points, errors and their statistics by name for JSON, SI."""
+        return {
+            **{name: getattr(self, name) for name in ("poses", "points", "before", "after")},
+            "held_out": self.is_held_out,
+            "statistics": {
+                name: {e: vars(self.statistics(e, is_held_out)) for e in ("before", "after")}
+                for name, is_held_out in self.list_sets()
+            },
+        }
+
+
+def map_height_errors(
+    fit: Identification, fitted: Measurements, held_out: Measurements | None
+) -> HeightErrors | None:
+    """Return the errors of all heights over the bed; None where the data measure no heights, or a
+    geometry does not reach their poses.
+
+    Parameters
+    ----------
+    fit : that converged. fitted, held_out : the measurements of the calibration.
+    """
+    parts = []
+    for data, is_held_out in ((fitted, False), (held_out, True)):
+        if data is None or not any(_measures_height(o) for o in data.observations):
+            continue
+        try:
+            compared = compare_predictions(
+                fit.initial, fit.robot, data, fit.nuisance.starts, fit.nuisance.values
+            )
+        except DataError:  # the validation reports that no pose is reached
+            continue
+        parts += [(*part, is_held_out) for part in _list_heights(compared, fit.robot)]
+    unit = fit.robot.get_unit(Dimension.LENGTH)
+    if sum(len(labels) for labels, *_ in parts) < FEWEST:
+        return None
+    labels, points, before, after, is_held_out = zip(*parts, strict=True)
+    count = [len(of_part) for of_part in labels]
+    return HeightErrors(
+        tuple(label for of_part in labels for label in of_part),
+        np.concatenate(points),
+        np.concatenate(before),
+        np.concatenate(after),
+        np.repeat(np.array(is_held_out, dtype=bool), count),
+        unit,
+    )
+
+
+def store_heights(heights: HeightErrors) -> dict[str, np.ndarray]:
+    """Return the errors as arrays by name [SI]."""
+    arrays = {name: getattr(heights, name) for name in ("points", "before", "after")}
+    arrays |= {"poses": np.array(heights.poses, str), "held_out": heights.is_held_out}
+    return {f"{PREFIX}{name}": array for name, array in arrays.items()}
+
+
+def restore_heights(arrays: Mapping[str, np.ndarray], robot: Mechanism) -> HeightErrors | None:
+    """Return stored errors; None where a run has none.
+
+    Parameters
+    ----------
+    arrays : of the run. robot : for the unit.
+    """
+    if f"{PREFIX}poses" not in arrays:
+        return None
+    points, before, after, held_out = (
+        arrays[f"{PREFIX}{name}"] for name in ("points", "before", "after", "held_out")
+    )
+    labels = tuple(arrays[f"{PREFIX}poses"].tolist())
+    return HeightErrors(labels, points, before, after, held_out, robot.get_unit(Dimension.LENGTH))
+
+
+def _measures_height(rows: Observations) -> bool:
+    """Return whether each row measures one height: z of the tool, or the gap of one target."""
+    kind = rows.kind
+    if isinstance(kind, Component):
+        return kind.components == ("z",) and bool(kind.T_base_frame[2, 2] > UPRIGHT)
+    return isinstance(kind, Plane) and len(kind.targets) == 1
+
+
+def _list_heights(
+    compared: PredictionComparison, robot: Mechanism
+) -> Iterator[tuple[tuple[str, ...], FloatArray, FloatArray, FloatArray]]:
+    """Yield labels, places (r, 2) and errors (r,) before and after of each kind of heights."""
+    rows = compared.data.observations
+    before, after = compared.before.residuals(rows), compared.after.residuals(rows)
+    for i, o in enumerate(rows):
+        if not _measures_height(o):
+            continue
+        points = _locate_points(compared.after.T[0, o.rows.reshape(len(o))], o, robot)
+        extent = np.ptp(points, axis=0)
+        if isinstance(o.kind, Plane) and extent[2] > LEVEL * extent[:2].max():
+            continue  # a wall
+        labels = tuple(compared.data.labels[k] for k in o.rows.reshape(len(o)))
+        yield labels, points[:, :2], before[i][:, 0], after[i][:, 0]
+
+
+def _locate_points(T: FloatArray, rows: Observations, robot: Mechanism) -> FloatArray:
+    """Return the touching points (r, 3) [m] in the base, with the tool or target as stated."""
+    kind = rows.kind
+    place = robot.tool[:3, 3]
+    if isinstance(kind, Component) and kind.T_platform_tool is not None:
+        place = kind.T_platform_tool[:3, 3]
+    if isinstance(kind, Plane) and kind.places is not None:
+        place = kind.places[0]
+    return T[:, :3, :3] @ place + T[:, :3, 3]
