@@ -10,7 +10,7 @@ WORKERS := 1
 FUZZ := runs/fuzz.json
 export PYTHON
 
-.PHONY: help demo test quick evidence docs fuzz bench bench-update check format constraints clean
+.PHONY: help demo test quick evidence docs site fuzz bench bench-update check format constraints clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -33,6 +33,9 @@ docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evid
 	$(BIN)/python -m tools.file_reference
 	$(BIN)/python -m tools.findings_reference
 	$(BIN)/python -m tools.api_reference
+
+site: .venv/dev.stamp  ## build the documentation site into build/site (open build/site/index.html), warnings as errors
+	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
 
 fuzz: .venv/dev.stamp  ## run N more random inputs through the command line (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
 	@mkdir -p $(dir $(FUZZ))

@@ -49,10 +49,14 @@ def write_page() -> str:
     """Return the text of the page."""
     sections = [HEAD]
     for package, heading in SECTIONS.items():
-        names = sorted(loopcal.PUBLIC_NAMES[package], key=lambda name: (name.lower(), name))
-        rows = [(f"`{name}`", describe_name(name)) for name in names]
+        rows = [(f"`{name}`", describe_name(name)) for name in list_names(package)]
         sections.append(f"\n## {heading}\n\n{format_table(('name', 'purpose'), rows)}")
     return "".join(sections)
+
+
+def list_names(package: str) -> list[str]:
+    """Return the public names of a section in the order of the alphabet."""
+    return sorted(loopcal.PUBLIC_NAMES[package], key=lambda name: (name.lower(), name))
 
 
 def describe_name(name: str) -> str:

@@ -27,7 +27,7 @@ def test_commands_of_the_page_run_and_calibrate_the_machine(page, capsys) -> Non
     ]
     assert len(commands) == 11
     printed = re.search(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    targets = re.search(r"^```csv\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    targets = re.search(r"^```text\n(pose,.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert printed
     assert targets
     Path("targets.csv").write_text(targets[1])
