@@ -16,8 +16,8 @@ from loopcal.apply.error_budget import ErrorSources as ErrorSources
 from loopcal.apply.error_budget import compute_error_budget as compute_error_budget
 from loopcal.apply.height_errors import HeightErrors as HeightErrors
 from loopcal.apply.height_errors import map_height_errors as map_height_errors
-from loopcal.apply.repeatability import Repeatability as Repeatability
 from loopcal.apply.repeatability import assess_repeatability as assess_repeatability
+from loopcal.apply.repeatability_result import Repeatability as Repeatability
 from loopcal.apply.reused_rows import report_reused_rows as report_reused_rows
 from loopcal.apply.run_comparison import PairComparison as PairComparison
 from loopcal.apply.run_comparison import RunComparison as RunComparison

@@ -12,7 +12,7 @@ weights changed, not from the part of the source. See docs/theory/uncertainty.md
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -41,9 +41,12 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Solution, sample_workspace
-from loopcal.presentation import HtmlResult
+from loopcal.presentation import TableResult, draw
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 POSES, SEED = 200, 0
 """Number of poses that are drawn from the workspace, and the seed of their draw."""
@@ -110,7 +113,7 @@ class HalvedErrors(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorBudget(HtmlResult):
+class ErrorBudget(TableResult):
     """The uncertainty of the parameters and of poses over the workspace, by source.
 
     Attributes
@@ -133,6 +136,10 @@ class ErrorBudget(HtmlResult):
     poses: int
     is_workspace: bool
     finding: Finding
+
+    def plot(self) -> Figure:
+        """Draw the part of each source in the expected error, and what half its sigma leaves."""
+        return draw("draw_budget", self)
 
     def __str__(self) -> str:
         return str(self.finding)

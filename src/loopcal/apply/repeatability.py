@@ -20,12 +20,13 @@ Derivation and measured coverage: docs/theory/repeatability.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.apply.repeatability_result import Estimate, Repeatability, VisitedPose
 from loopcal.apply.validation_findings import describe_frame, group_setup
 from loopcal.diagnose import compare_predictions, compute_noise_floor, compute_row_errors
 from loopcal.diagnose.row_errors import QuantityErrors
@@ -35,7 +36,6 @@ from loopcal.measure import Measurements, check_actuators
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_chi_square_quantile
-from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 
 TAIL = 0.025
@@ -66,91 +66,6 @@ MANY = 20
 """Sets of visits that together give the true RP_l of a scatter, in terms of `DRAWS` visits."""
 
 POSITION, ORIENTATION = "position", "orientation"
-
-
-class Estimate(NamedTuple):
-    """A value [m] or [rad] with its interval of 95 %."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True, eq=False)
-class VisitedPose:
-    """Pose accuracy and repeatability of one target at one commanded pose.
-
-    Attributes
-    ----------
-    pose : label of its first visit. target, direction : names of the target and of the direction of
-        approach (the group of the rows); empty for the only one. visits : their number.
-    components : names of the measured components, such as ("x", "y", "z").
-    mean : (c,) attained minus commanded values.
-    accuracy, repeatability : AP_p and RP_l of a position; None for an orientation.
-    accuracies, repeatabilities : AP and RP of each component.
-    commanded : number of the commanded pose.
-    """
-
-    pose: str
-    target: str
-    direction: str
-    visits: int
-    components: tuple[str, ...]
-    mean: FloatArray
-    accuracy: Estimate | None
-    repeatability: Estimate | None
-    accuracies: tuple[Estimate, ...]
-    repeatabilities: tuple[Estimate, ...]
-    commanded: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content by name for JSON, SI."""
-        listed = {
-            name: {
-                component: estimate._asdict()
-                for component, estimate in zip(self.components, estimates, strict=True)
-            }
-            for name, estimates in (("AP", self.accuracies), ("RP", self.repeatabilities))
-        }
-        whole = {
-            name: estimate._asdict()
-            for name, estimate in (("AP_p", self.accuracy), ("RP_l", self.repeatability))
-            if estimate is not None
-        }
-        names = ("pose", "target", "direction", "visits")
-        return {**{name: getattr(self, name) for name in names}, **whole, **listed}
-
-
-@dataclass(frozen=True, eq=False)
-class Repeatability(HtmlResult):
-    """Pose accuracy and repeatability of a machine.
-
-    Attributes
-    ----------
-    frame : in which frame the differences are, in words.
-    poses : by quantity, "position" and "orientation", one entry for each pose, target, direction.
-    variations : (pose, target) -> largest distance of the mean positions of two directions of
-        approach (vAP_p) [m], where there are several.
-    findings : what limits these numbers.
-    """
-
-    frame: str
-    poses: Mapping[str, tuple[VisitedPose, ...]]
-    variations: Mapping[tuple[str, str], float]
-    findings: tuple[Finding, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content by name for JSON, SI."""
-        return {
-            "standard": "ISO 9283:1998",
-            "frame": self.frame,
-            **{name: [pose.to_dict() for pose in poses] for name, poses in self.poses.items()},
-            "variations": [
-                {"pose": pose, "target": target, "vAP_p": value}
-                for (pose, target), value in self.variations.items()
-            ],
-            "findings": self.findings,
-        }
 
 
 def assess_repeatability(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -30,8 +30,11 @@ from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
-from loopcal.presentation import TableResult
+from loopcal.presentation import TableResult, draw
 from loopcal.typing import FloatArray, Progress, report_no_progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PER_DECADE = 4
 """Values of lam per factor of ten where no fit is repeated."""
@@ -108,6 +111,10 @@ class RegularizationCurves(TableResult):
             f"<RegularizationCurves of {self.robot}: {len(self.ridge.values)} values of lam, "
             f"{len(self.truncation.values)} of k, {self.scheme}>"
         )
+
+    def plot(self) -> Figure:
+        """Draw the held-out error against lam and against k, with what rules choose."""
+        return draw("draw_regularization", self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes for JSON."""

@@ -128,6 +128,7 @@ def suggest_measurements(
     check_type(
         identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
     )
+    check_type(sigma or {}, dict, "sigma", "a dictionary of standard deviations by dimension")
     combinations, factor = identifiability.unidentifiable, identifiability.factor
     if not combinations:
         return ()

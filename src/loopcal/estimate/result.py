@@ -17,7 +17,7 @@ from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, covera
 from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
 from loopcal.estimate.methods.regularization import Regularization
-from loopcal.estimate.nuisance.estimate import NuisanceEstimate
+from loopcal.estimate.nuisance.estimate import NuisanceEstimate, format_half_width
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
 from loopcal.estimate.residuals import KindResiduals, store_residuals
@@ -269,7 +269,7 @@ class Identification(TableResult):
             return lines
         lines = [f"{'parameter':<{width}} {'nominal':>14} {'estimate':>14} {'+/- (95 %)':>12} unit"]
         for entry in rows:
-            half_width = _format_half_width(entry["plus_minus"])
+            half_width = format_half_width(entry["plus_minus"])
             decimals, shown = half_width if entry.get("free", True) else (6, "fixed")
             nominal, estimate = (f"{entry[key]:>14.{decimals}f}" for key in ("nominal", "estimate"))
             lines.append(
@@ -363,15 +363,3 @@ class Identification(TableResult):
             **({} if self.poses is None else self.poses.arrays()),
             **store_residuals(self.residuals),
         }
-
-
-def _format_half_width(half: float) -> tuple[int, str]:
-    """Return the decimals that an uncertainty leaves, and the uncertainty with two digits."""
-    if np.isnan(half):
-        return 6, "not given"
-    if np.isinf(half):
-        return 6, "unknown"
-    if half == 0.0:
-        return 6, "0"
-    decimals = int(np.clip(1 - np.floor(np.log10(half)), 0, 12))
-    return decimals, f"{half:.{decimals}f}"

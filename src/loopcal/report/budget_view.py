@@ -101,10 +101,13 @@ def _show_share(variance: float | None, total: float) -> str:
     return "below 0.1" if 0.0 < share < 0.1 else f"{share:.1f}"
 
 
+def name_source(kind: str, name: str) -> str:
+    """Return the words for a source of this kind and name."""
+    return WORDS[kind].format(name=name) if kind in WORDS else kind
+
+
 def _name_source(line: Mapping[str, Any]) -> str:
-    """Return the words for a source."""
-    kind: str = line["kind"]
-    return WORDS[kind].format(name=line["name"]) if kind in WORDS else kind
+    return name_source(line["kind"], line["name"])
 
 
 def _add(budget: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from loopcal.apply.repeatability import Estimate, Repeatability, VisitedPose
+from loopcal.apply.repeatability_result import DIMENSIONS, Estimate, Repeatability, VisitedPose
 from loopcal.mechanism import Mechanism
 from loopcal.report.numbers import format_number, units_of
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block, format_list
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit
-
-DIMENSIONS = {"position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
 
 
 def view_repeatability(result: Repeatability, robot: Mechanism | None = None) -> list[Block]:

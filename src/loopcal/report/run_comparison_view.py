@@ -79,7 +79,7 @@ def build_shifts(comparison: RunComparison) -> Table:
     for name, unit in zip(comparison.parameters, comparison.units, strict=True):
         cells = [name]
         for pair in comparison.pairs:
-            shift, sd, is_significant = _find_shift(pair, name)
+            shift, sd, is_significant = find_shift(pair, name)
             if not math.isfinite(sd):
                 cells += [ABSENT, ABSENT]
                 continue
@@ -119,7 +119,7 @@ def tabulate_comparison(comparison: RunComparison) -> Table:
     for run in comparison.runs:
         pair = pairs.get(run.name)
         for name, unit in zip(comparison.parameters, comparison.units, strict=True):
-            shift, sd, is_significant = _find_shift(pair, name)
+            shift, sd, is_significant = find_shift(pair, name)
             numbers = (run.estimates.get(name), run.plus_minus.get(name), shift, sd)
             cells = (_write(value, unit) for value in numbers)
             is_tested = math.isfinite(sd)
@@ -140,7 +140,7 @@ def find_error_units(comparison: RunComparison) -> dict[str, Unit]:
     return {"position": lengths, "length": lengths, "orientation": angles}
 
 
-def _find_shift(pair: PairComparison | None, name: str) -> tuple[float, float, bool]:
+def find_shift(pair: PairComparison | None, name: str) -> tuple[float, float, bool]:
     """Return the shift of a parameter, its standard deviation [SI], and whether it is significant;
     NaN where it is not tested.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from loopcal.apply.run_comparison.comparability import check_runs, list_free, refuse_incomparable
 from loopcal.apply.run_comparison.held_out_errors import RunErrors, collect_errors
@@ -13,8 +13,11 @@ from loopcal.apply.run_comparison.pair_comparison import PairComparison, compare
 from loopcal.apply.run_comparison.stored_run import StoredRun
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
-from loopcal.presentation import HtmlResult
+from loopcal.presentation import TableResult, draw
 from loopcal.units import UNITS, Unit, find_unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class RunSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class RunComparison(HtmlResult):
+class RunComparison(TableResult):
     """Calibrations side by side; the first one is the reference of all others.
 
     Attributes
@@ -62,6 +65,10 @@ class RunComparison(HtmlResult):
         """Whether any machine differs from that of the first run; None where nothing was tested."""
         answers = [pair.moved for pair in self.pairs if pair.moved is not None]
         return any(answers) if answers else None
+
+    def plot(self) -> Figure:
+        """Draw the estimates of all runs with their 95 % intervals, and the tested shifts."""
+        return draw("draw_runs", self)
 
     def __str__(self) -> str:
         """Return the findings, one on each line."""

@@ -13,8 +13,8 @@ from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.measure import Kind, Measurements
 
 DECLARED = ("frame", "targets", "tool", "anchor")
-"""Setup items that a user may forget to declare unknown. Surfaces and offsets are none of them: the
-errors of the machine explain those, too.
+"""Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets are
+none of them: the errors of the machine explain those, too.
 """
 
 
@@ -56,4 +56,7 @@ def list_setup_interpretations(data: Measurements, count: int) -> Iterator[Setup
 
 def _list_known(kind: Kind) -> tuple[str, ...]:
     """Return the items that a kind allows to be unknown, and that it states."""
-    return tuple(i for i in DECLARED if i in kind.allowed_unknown and i not in kind.unknown)
+    allowed = set(kind.allowed_unknown)
+    if "surface" in allowed:
+        allowed.discard("frame")
+    return tuple(i for i in DECLARED if i in allowed and i not in kind.unknown)

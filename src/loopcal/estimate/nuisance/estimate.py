@@ -24,6 +24,7 @@ from loopcal.measure.kinds.setup_parameters import ROTATION_AXES
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.parameters import Parameter, ParameterTable
+from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -33,7 +34,7 @@ it: rounding."""
 
 
 @dataclass(frozen=True, eq=False)
-class NuisanceEstimate:
+class NuisanceEstimate(TableResult):
     """Nuisance parameters after a fit. Arrays are (U,) in the order of `table`, SI.
 
     Attributes
@@ -65,6 +66,23 @@ class NuisanceEstimate:
 
     def __len__(self) -> int:
         return len(self.table)
+
+    def __repr__(self) -> str:
+        owners = ", ".join(_owners(self.names)) or "none"
+        return f"<NuisanceEstimate: {len(self)} setup parameters ({owners})>"
+
+    def __str__(self) -> str:
+        """Return one line for each: name, estimate and standard deviation in its unit."""
+        title = "setup parameter"
+        width = max(map(len, (title, *self.names)))
+        lines = [f"{title:<{width}} {'estimate':>14} {'+/- (1 sd)':>12} unit"]
+        for entry, value, sd, (factor, symbol) in zip(
+            self.table.entries, self.estimate, self.sd, self.display, strict=True
+        ):
+            decimals, half = format_half_width(sd / factor) if entry.free else (6, "fixed")
+            number = f"{value / factor:>14.{decimals}f}"
+            lines.append(f"{entry.name:<{width}} {number} {half:>12} {symbol}")
+        return "\n".join(lines) if self.names else "no setup parameters"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,3 +262,15 @@ def _display_unit(robot: Mechanism, entry: Parameter) -> tuple[float, str]:
     """Return factor to SI and symbol of the unit in which a parameter is shown."""
     symbol = robot.units[entry.dimension]
     return find_unit(symbol).factor_to_si, symbol
+
+
+def format_half_width(half: float) -> tuple[int, str]:
+    """Return the decimals that an uncertainty leaves, and the uncertainty with two digits."""
+    if np.isnan(half):
+        return 6, "not given"
+    if np.isinf(half):
+        return 6, "unknown"
+    if half == 0.0:
+        return 6, "0"
+    decimals = int(np.clip(1 - np.floor(np.log10(half)), 0, 12))
+    return decimals, f"{half:.{decimals}f}"

@@ -17,6 +17,9 @@ from loopcal.report.figures.plan_figures import draw_plan as draw_plan
 from loopcal.report.figures.regularization_figure import draw_regularization as draw_regularization
 from loopcal.report.figures.residual_figure import draw_residual_rows as draw_residual_rows
 from loopcal.report.figures.residual_figure import draw_residuals as draw_residuals
+from loopcal.report.figures.result_figures import draw_budget as draw_budget
+from loopcal.report.figures.result_figures import draw_repeatability as draw_repeatability
+from loopcal.report.figures.result_figures import draw_runs as draw_runs
 from loopcal.report.figures.robot_figure import draw_robot as draw_robot
 from loopcal.report.figures.scene_figure import draw_scene as draw_scene
 from loopcal.report.figures.validation_figure import draw_validation as draw_validation

@@ -14,7 +14,7 @@ from loopcal.apply import (
     RunComparison,
     Validation,
 )
-from loopcal.apply.repeatability import Repeatability
+from loopcal.apply.repeatability_result import Repeatability
 from loopcal.diagnose import (
     CrossValidation,
     FitExamination,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from loopcal.optional_packages import import_optional
-from loopcal.report.notebook import fit_records, machine_records, pose_records
+from loopcal.report.notebook import fit_records, machine_records, pose_records, result_records
 from loopcal.report.notebook.records import Records, Variable, collect_records
 from loopcal.report.numbers import format_number
 from loopcal.report.tables import Column, Table
 
-REGISTERED = (fit_records, machine_records, pose_records)
+REGISTERED = (fit_records, machine_records, pose_records, result_records)
 """Modules whose functions say which numbers a result has; importing them registers these."""
 
 EXTRA = "tables"

@@ -34,7 +34,9 @@ class SurfaceKind(TargetKind):
     surface : str
         Name of the surface; its parameters begin with it. A plane and a line with the same name,
         point and direction share `u` and `v`: the line is perpendicular to the plane.
-    Others: see `TargetKind`; "surface" and "targets" (the offsets of the probe) may be unknown.
+    Others: see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
+    unknown. Faces of a body with known dimensions, such as a datum cube, are known surfaces in one
+    unknown frame.
 
     Raises
     ------
@@ -46,7 +48,7 @@ class SurfaceKind(TargetKind):
     along: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     surface: str = "surface"
 
-    allowed_unknown: ClassVar[tuple[str, ...]] = ("surface", "targets")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "surface", "targets")
     changes_with_pose: ClassVar[bool] = False
     length_error: ClassVar[str] = "gap"
 
