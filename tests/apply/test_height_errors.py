@@ -69,7 +69,10 @@ def test_figure_has_one_scale_of_colors_and_shows_every_point(report, heights) -
     scales = {c.get_clim() for axes in figure.axes[:2] for c in axes.collections}
     largest = 1e3 * float(np.abs(heights.before).max())
     assert scales == {(-largest, largest)}
-    shown = [sum(len(c.get_offsets()) for c in axes.collections) for axes in figure.axes[:2]]
+    shown = [
+        sum(np.asarray(c.get_offsets()).shape[0] for c in axes.collections)
+        for axes in figure.axes[:2]
+    ]
     assert shown == [13, 13]
     assert "[mm]" in figure.axes[2].get_ylabel()
     assert [len(axes.texts) for axes in figure.axes[:2]] == [13, 13]

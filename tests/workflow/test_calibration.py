@@ -24,6 +24,8 @@ from loopcal.workflow.verdict import choose_next_step, decide_verdict
 from tests.estimate.problems import hexapod, hexapod_data
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
+APPLY = "values.apply"
+"""Recommendation of most calibrations."""
 
 
 @pytest.fixture(scope="module")
@@ -250,7 +252,7 @@ def test_most_severe_finding_decides_the_verdict():
     assert decide_verdict((info, warning)) is Verdict.RESERVATIONS
     assert decide_verdict((info,)) is Verdict.CALIBRATED
     assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
-    step = choose_next_step(Verdict.RESERVATIONS, (warning,), ())
+    step = choose_next_step(Verdict.RESERVATIONS, (warning,), (), APPLY)
     assert step.code == "workflow.next-resolve-warnings"
     data = {"ratio": 3.9, "degrees": 81.0, "p_value": 1e-9}
     noise = report_finding("noise.residuals-too-large", Severity.FAILURE, **data)
@@ -260,7 +262,25 @@ def test_most_severe_finding_decides_the_verdict():
         ((noise,), "workflow.next-check-noise"),
         ((noise, sessions), "workflow.next-check-residuals"),
     ):
-        assert choose_next_step(Verdict.NOT_CALIBRATED, findings, ()).code == code
+        assert choose_next_step(Verdict.NOT_CALIBRATED, findings, (), APPLY).code == code
+
+
+@pytest.mark.parametrize(
+    ("recommendation", "code"),
+    [
+        ("values.apply", "workflow.next-use-result"),
+        ("values.apply-held-out", "workflow.next-use-result"),
+        ("values.keep-within-noise", "workflow.next-keep-values"),
+        ("values.keep-not-confirmed", "workflow.next-keep-values"),
+        ("values.keep-undecided", "workflow.next-state-noise"),
+    ],
+)
+def test_next_step_of_a_good_calibration_agrees_with_the_recommendation(
+    recommendation, code
+) -> None:
+    step = choose_next_step(Verdict.CALIBRATED, (), (), recommendation)
+    assert step.code == code
+    assert str(step).startswith("Use the calibrated geometry") == ("apply" in recommendation)
 
 
 def test_measurements_made_in_python_are_checked_for_wrong_conventions(robot, data) -> None:
@@ -346,7 +366,7 @@ def test_next_step_after_an_exceeded_limit_names_repeatability_that_no_calibrati
     )
 
     def step(findings, shares):
-        return choose_next_step(Verdict.NOT_CALIBRATED, findings, (), shares)
+        return choose_next_step(Verdict.NOT_CALIBRATED, findings, (), APPLY, shares)
 
     chosen = step((failure,), {"position": 0.83, "orientation": 0.0})
     assert chosen.code == "workflow.next-improve-machine"

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,12 @@ def probe(
     return Measurements(printer.name, q, (observed,))
 
 
+def with_assumed_noise(data: Measurements) -> Measurements:
+    """Return the measurements as an import makes them where nobody states the noise."""
+    rows = tuple(replace(o, is_noise_assumed=True) for o in data.observations)
+    return replace(data, observations=rows)
+
+
 def recommend(printer: Mechanism, data: Measurements, hold_out: float, seed: int = 1) -> str:
     options = lc.CalibrationOptions(hold_out=hold_out, seed=seed, check_conventions=False)
     return lc.calibrate(printer, data, options).recommendation.code
@@ -74,6 +82,50 @@ def test_wrong_values_are_replaced(printer, errors, hold_out) -> None:
     expected = "values.apply" if hold_out else "values.apply-fitted"
     codes = [recommend(printer, probe(printer, errors, seed), hold_out, seed) for seed in (1, 2)]
     assert set(codes) == {expected}
+
+
+def probe_13(printer: Mechanism, errors: dict[str, float], seed: int) -> Measurements:
+    """Return heights at the thirteen points of the page, whose noise nobody stated."""
+    data = probe(printer, errors, seed)
+    chosen = np.zeros(data.n_poses, dtype=bool)
+    chosen[[0, *range(1, 13, TIMES), *range(13, 25, TIMES)]] = True
+    return with_assumed_noise(data.take(chosen))
+
+
+def test_held_out_points_decide_where_nobody_states_the_noise(printer) -> None:
+    """Eight fitted points leave two degrees of freedom, too few to estimate the noise."""
+    wrong, right = {"radius": 0.5e-3, "tower1.stop": -0.2e-3}, {}
+    codes = [recommend(printer, probe_13(printer, wrong, seed), 0.4, seed) for seed in (1, 2)]
+    assert "values.apply-held-out" in codes
+    assert set(codes) <= {"values.apply", "values.apply-held-out"}
+    codes = [recommend(printer, probe_13(printer, right, seed), 0.4, seed) for seed in (1, 2)]
+    assert all(code.startswith("values.keep") for code in codes), codes
+
+
+def test_unknown_noise_without_held_out_points_leaves_the_current_values(printer) -> None:
+    data = probe_13(printer, {"radius": 0.1e-3}, 1)
+    few = data.take(np.arange(13) < 8)
+    report = lc.calibrate(printer, few, lc.CalibrationOptions(check_conventions=False))
+    assert report.recommendation.code == "values.keep-undecided"
+    assert report.start.finding.code == "residuals.start-needs-sigma"
+    assert "the noise is not known well enough" in str(report)
+    assert "Use the calibrated geometry" not in str(report)
+
+
+def test_p_value_of_a_gain_is_uniform_where_the_values_before_are_right(printer) -> None:
+    rng = np.random.default_rng(6)
+    rows = np.arange(6)
+    kind = Component(("z",)).with_tool(printer.tool)
+    observed = Observations.from_sigma(kind, rows, np.zeros((6, 1)), SIGMA)
+    change = SIGMA * rng.standard_normal((6, 1))
+    p_values = []
+    for noise in 7.0 * SIGMA * rng.standard_normal((2000, 6, 1)):  # sigma is wrong by a factor of 7
+        kinds = compute_kind_errors([observed], [noise], [noise - change])
+        p_values.append(kinds[-1].compute_gain_p_value(6))
+    for level in (0.05, 0.5):
+        share = np.mean(np.array(p_values) < level)
+        assert share == pytest.approx(level, abs=4.0 * np.sqrt(level * (1.0 - level) / 2000))
+    assert np.isnan(kinds[-1].compute_gain_p_value(1))
 
 
 @pytest.mark.evidence

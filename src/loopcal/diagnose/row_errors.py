@@ -220,6 +220,28 @@ class KindErrors:
         product = 0.5 * (self.before**2 - self.after**2 + self.change**2)
         return float(np.sqrt(self.count) * product / self.change)
 
+    def compute_gain_p_value(self, values: int) -> float:
+        """Return the probability of such a gain where the geometry before is the truth.
+
+        It is the same whatever the noise is, and NaN where too few values are left. With
+        g = b.d / |d| as in `gain`, the rest |b|^2 - g^2 of b is independent of g and has one
+        degree of freedom less than b, so g over the root mean square of the rest has Student's t
+        distribution: a common factor of all sigmas cancels.
+
+        Parameters
+        ----------
+        values : measured values that are left to check the geometry.
+        """
+        from scipy.special import stdtr
+
+        degrees = min(self.count, values) - 1
+        if degrees < 1 or not np.isfinite(self.change):
+            return float("nan")
+        rest = max(self.count * self.before**2 - self.gain**2, 0.0)
+        if rest == 0.0:
+            return 0.0 if self.gain > 0.0 else 1.0
+        return float(stdtr(degrees, -self.gain / np.sqrt(rest / degrees)))
+
     @property
     def improvement(self) -> float:
         """Factor by which the error became smaller."""

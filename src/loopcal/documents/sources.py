@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 from loopcal.errors import LoopcalError
 from loopcal.io import Run
@@ -36,6 +37,7 @@ def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
         result, name = json.loads(to_json(build_document(source))), ""
         intervals = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}
         exported = ExportSource(robot, intervals)
+    exported = replace(exported, is_for_people=True)
     return build_record(result, arrays, robot, initial, name, list_controllers(exported))
 
 

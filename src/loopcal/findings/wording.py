@@ -55,6 +55,12 @@ def round_to_digits(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
+def count_decimals(uncertainty: float) -> int:
+    """Return the decimals that show three significant digits of a number above 0, at most 12."""
+    rounded = float(f"{uncertainty:.2e}")  # 9.996 shows as 10.0, which has one decimal less
+    return min(max(2 - math.floor(math.log10(rounded)), 0), 12)
+
+
 def list_names(names: Sequence[Any], shown: int = SHOWN_NAMES) -> str:
     """Return `a, b and c`; of more than `shown` names the first ones and `and 3 more`."""
     words = [str(name) for name in names]

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.apply import HeightErrors
-from loopcal.report.numbers import count_decimals, format_in
+from loopcal.findings.wording import count_decimals
+from loopcal.report.numbers import format_in
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from loopcal.findings.wording import count_decimals
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
@@ -58,9 +59,3 @@ def format_uncertainty(uncertainty: float) -> str:
     if math.isinf(uncertainty):
         return "unknown"
     return f"{uncertainty:.{count_decimals(uncertainty)}f}" if uncertainty > 0.0 else "0"
-
-
-def count_decimals(uncertainty: float) -> int:
-    """Return the decimals that show three significant digits of a number above 0, at most 12."""
-    rounded = float(f"{uncertainty:.2e}")  # 9.996 shows as 10.0, which has one decimal less
-    return min(max(2 - math.floor(math.log10(rounded)), 0), 12)

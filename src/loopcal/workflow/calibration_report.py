@@ -167,7 +167,9 @@ class CalibrationReport(TableResult):
                 for quantity, errors in sources.items()
                 if sum(errors) > 0.0
             }
-        return choose_next_step(self.verdict, self.findings, outliers, repeatability)
+        return choose_next_step(
+            self.verdict, self.findings, outliers, self.recommendation.code, repeatability
+        )
 
     @cached_property
     def recommendation(self) -> Finding:

@@ -8,6 +8,9 @@ measurements into the machine:
    (`check_start_values`, which allows for the number of fitted parameters).
 2. The identified values predict the held-out poses better, beyond their noise (`KindErrors.gain`).
    Without held-out poses the first test decides alone.
+
+Where the noise is not known well enough for the first test, the held-out poses decide alone, by a
+test that needs no noise (`KindErrors.compute_gain_p_value`) and has the level of the first.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from loopcal.apply import Validation
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import StartCheck
 from loopcal.diagnose.fit_checks.start_values import StartVerdict
-from loopcal.estimate.inference.residual_test import ResidualTest, coverage_factor
+from loopcal.estimate.inference.residual_test import SIGNIFICANCE, ResidualTest, coverage_factor
 from loopcal.findings import Finding, report_finding
 from loopcal.workflow.verdict import Verdict
 
@@ -33,13 +36,16 @@ def recommend_values(
     """
     if verdict is Verdict.NOT_CALIBRATED:
         return report_finding("values.keep-not-calibrated")
-    if start.verdict is StartVerdict.OPEN:
-        return report_finding("values.keep-undecided")
-    if start.verdict is not StartVerdict.NOT_CALIBRATED:
+    if start.verdict in (StartVerdict.BEST, StartVerdict.WITHIN_NOISE):
         return report_finding("values.keep-within-noise")
+    is_open = start.verdict is StartVerdict.OPEN
     checked = None if errors is None else errors.without_blunders or errors
     if checked is None or min(checked.judged, checked.values_left) < FEW_ROWS:
-        return report_finding("values.apply-fitted")
+        return report_finding("values.keep-undecided" if is_open else "values.apply-fitted")
+    if is_open:
+        p_value = checked.kinds[-1].compute_gain_p_value(checked.values_left)
+        code = "values.apply-held-out" if p_value < SIGNIFICANCE else "values.keep-undecided"
+        return report_finding(code, p_value=p_value, poses=checked.judged)
     gain = checked.kinds[-1].gain / residual_test.sigma_scale
     needed = coverage_factor(residual_test.noise_degrees)
     code = "values.apply" if gain >= needed else "values.keep-not-confirmed"

@@ -25,6 +25,13 @@ TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDE
 LIMIT_EXCEEDED = "gates.limit-exceeded"
 """Finding that an error is above a stated limit."""
 
+NEXT_WITH_VALUES = {
+    "values.keep-undecided": "workflow.next-state-noise",
+    "values.keep-within-noise": "workflow.next-keep-values",
+    "values.keep-not-confirmed": "workflow.next-keep-values",
+}
+"""Next step of a good calibration whose values are not recommended."""
+
 DEPENDENT = (
     "residuals.drift",
     "residuals.trend",
@@ -82,6 +89,7 @@ def choose_next_step(
     verdict: Verdict,
     findings: Sequence[Finding],
     outliers: Sequence[str],
+    recommendation: str,
     repeatability: Mapping[str, float] | None = None,
 ) -> Finding:
     """Return the step that helps most now, as a suggestion.
@@ -89,10 +97,11 @@ def choose_next_step(
     Parameters
     ----------
     findings : of the calibration. outliers : labels of poses that do not fit the others.
+    recommendation : code of the finding that recommends the identified or the current values.
     repeatability : its share of the variance of the expected error, by quantity.
     """
     if verdict is Verdict.CALIBRATED:
-        return report_finding("workflow.next-use-result")
+        return report_finding(NEXT_WITH_VALUES.get(recommendation, "workflow.next-use-result"))
     wrong = [f.data["poses"] for f in findings if f.code == BLUNDERS[0]]
     if wrong and verdict is not Verdict.RESERVATIONS:
         labels = tuple(dict.fromkeys(label for poses in wrong for label in poses))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -331,24 +331,31 @@ def _view_import(
     help="File of the controller to correct; everything else in it stays as it is.",
     metavar="FILE",
 )
-@file_option("-o", "--output", help="File to write.", required=True)
+@file_option(
+    "-o",
+    "--output",
+    help="File to write; without it, --format prints what to type, with sensible digits.",
+)
 @force_option("the output file", ", and write also the numbers of a calibration that failed")
 @json_option
 def export(
     source: str,
     format_name: str | None,
     into: Path | None,
-    output: Path,
+    output: Path | None,
     force: bool,
     as_json: bool,
 ) -> int:
     """Write the parameters of RUN, or of a robot file, as another program reads them.
 
-    A note names what the format cannot express. The exit code is 2 where the calibration of RUN
+    Without -o, the lines are printed for people: each identified value has three digits of its
+    uncertainty, and no more decimals than the controller keeps. Files have all digits. A note names
+    what the format cannot express. The exit code is 2 where the calibration of RUN
     failed; then nothing is written without --force.
 
     \b
     Examples:
+      loopcal export run --format marlin
       loopcal export run --format klipper --into printer.cfg -o corrected.cfg
       loopcal export run --format reprap -o config-override.g
       loopcal export run -o parameters.csv
@@ -359,7 +366,12 @@ def export(
     from loopcal.io.runs.run_folder import find_failure
     from loopcal.report.calibration_view import with_hint
 
-    target = choose_format(output, format_name, is_written=True)
+    if output is None and (format_name is None or into is not None):
+        raise DataError(
+            "state the file to write with -o, such as -o parameters.csv; without it, --format "
+            "prints the lines of a controller, and --into is not possible"
+        )
+    target = choose_format(output or Path(), format_name, is_written=True)
     refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
     failure = find_failure(source)
     failures = [] if failure is None else [failure]
@@ -368,13 +380,21 @@ def export(
             document = {"output": None, "format": target.name, "notes": [], "reasons": failures}
             terminal.print_json(document)
         return terminal.print_failures(with_hint(failure, hint_for) for failure in failures)
-    exported = export_robot(load_source(source), target, into)
-    write_text(output, exported.text, exported.read_back)
+    loaded = replace(load_source(source), is_for_people=output is None)
+    exported = export_robot(loaded, target, into)
+    if output is not None:
+        write_text(output, exported.text, exported.read_back)
     if as_json:
         notes = [str(finding) for finding in exported.findings]
         document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}
+        document |= {"text": exported.text} if output is None else {}
         terminal.print_json(document)
+        return terminal.print_failures(failures)
+    noted = [with_hint(finding, hint_for) for finding in exported.findings]
+    if output is None:
+        for note in noted:
+            terminal.print_note(note)
+        terminal.print_text(exported.text)
     else:
-        noted = [with_hint(finding, hint_for) for finding in exported.findings]
         terminal.print_page([*noted, f"Written to {output}"])
     return terminal.print_failures(failures)

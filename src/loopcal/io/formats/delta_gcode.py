@@ -14,32 +14,24 @@ Marlin's documentation of M665, M666 and M851, and its modules delta and motion.
 RepRapFirmware: L is one length or, from 2.03 on, a:b:c; stop_k = H + adjustment_k, and the firmware
 keeps the mean adjustment at zero. M666 A and B tilt the bed in percent. Source: Duet's G-code
 dictionary (M665, M666) and LinearDeltaKinematics of RepRapFirmware.
-
-Of several commands with the same number, the last one that has a word counts, as in the firmware.
-Reports of a firmware (M503: `echo:  M665 L269 ...`) are read as well, and so are small letters,
-line numbers and checksums (`N10 M665 L269*87`), remarks behind `;` or in parentheses, and, where
-the firmware supports it, several commands in a line. Text behind a command that is not words is
-refused, because half a number is another number.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import xor
 from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaGeometry,
     format_robot,
     get_geometry,
 )
+from loopcal.io.formats.gcode_file import GcodeFile, parse_gcode, read_gcode
 from loopcal.io.formats.probe_reports import import_probes
 from loopcal.io.formats.program_format import (
     Exported,
@@ -48,131 +40,17 @@ from loopcal.io.formats.program_format import (
     Imported,
     ImportOptions,
 )
-from loopcal.io.formats.value_file import Name, Value, ValueFile, format_number, is_same
-from loopcal.plain_text import quote
-
-COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
-FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")
-WORD = re.compile(r"\s*([A-Z])[ \t]*(\{[^}]*\}|[^A-Z\s{]*)")
-ASIDE = re.compile(r'"[^"]*"?|;.*|\([^)]*\)?')
-CHECKSUM = re.compile(r"\*\s*\d*\s*$")
-UPPER = {ord(small): small.upper() for small in "abcdefghijklmnopqrstuvwxyz"}
-
-READ = ("M665", "M666", "M851")
-"""Commands whose words are read."""
+from loopcal.io.formats.value_file import Name, format_number, is_same, shorten_numbers
 
 ECHO = re.compile(r"\s*echo:", re.IGNORECASE)
 MARLIN_COMMANDS, REPRAP_COMMANDS = ("M851",), ("M307", "M584")
 """What only a report of Marlin begins with, and commands that only one of the firmwares has."""
 
-WITH_TEXT = ("M16", "M23", "M28", "M30", "M32", "M117", "M118")
-"""Commands that are followed by text."""
-
-
-@dataclass(frozen=True)
-class GcodeFile(ValueFile):
-    """A file whose values are words, by command and letter.
-
-    `commands` has the line (from 0) and the column behind the last word of each command.
-    """
-
-    commands: Mapping[str, tuple[int, int]]
-
-    def describe_missing(self, group: str, name: str) -> str:
-        """Return the sentence about a word that does not exist."""
-        return f"{group} has no {name}; write it as {group} {name}.."
-
-    def with_lines(self, lines: Sequence[str]) -> GcodeFile:
-        """Return the file with other lines."""
-        return parse_gcode(lines, self.path)
-
-    def insert(self, lines: list[str], name: Name, text: str) -> None:
-        """Insert a new word behind the others of its command, or a new command at the end."""
-        command, letter = name
-        if command in self.commands:
-            number, end = self.commands[command]
-            line = lines[number]
-            lines[number] = self.finish_line(f"{line[:end]} {letter}{text}{line[end:]}")
-        else:
-            lines.append(f"{command} {letter}{text}{self.line_end}")
-
-    def finish_line(self, line: str) -> str:
-        """Return a line with the checksum of its text, where it has one: all bytes before `*`."""
-        code = _blank_asides(line).rstrip()
-        match = CHECKSUM.search(code)
-        if match is None:
-            return line
-        text = line[: match.start()]
-        return f"{text}*{reduce(xor, text.encode(), 0)}{line[len(code) :]}"
-
-
-def read_gcode(path: Path, one_in_a_line: bool = False) -> GcodeFile:
-    """Read a file.
-
-    Raises
-    ------
-    FileError : no M665, inches, or several commands in a line where the firmware runs only one.
-    """
-    file = parse_gcode(
-        read_text(path, "G-code file").splitlines(keepends=True), path, one_in_a_line
-    )
-    if "M665" not in file.commands:
-        raise FileError("no M665, the geometry of a delta, in this file; print it by M503", path)
-    if "G20" in file.commands:
-        sentence = "G20 selects inches; write the geometry in millimeters"
-        raise FileError(sentence, path, file.commands["G20"][0] + 1)
-    return file
-
-
-def parse_gcode(lines: Iterable[str], path: Path, one_in_a_line: bool = False) -> GcodeFile:
-    """Find the words; FileError for text that is not words, and for a letter that occurs twice."""
-    complete = tuple(lines)
-    words: dict[Name, Value] = {}
-    commands: dict[str, tuple[int, int]] = {}
-    for i, line in enumerate(complete):
-        for position, (command, letters, end, rest) in enumerate(_split_commands(line)):
-            commands[command] = (i, end)
-            if command not in READ:
-                continue
-            if position and one_in_a_line:
-                sentence = (
-                    f"{command} is not the first command of this line; move it to its own line"
-                )
-                raise FileError(sentence, path, i + 1)
-            if rest:
-                sentence = f"{command} has {quote(rest)}, but a letter and its number are needed"
-                raise FileError(f"{sentence}; correct it", path, i + 1)
-            for k, (letter, start, length) in enumerate(letters):
-                if any(letter == other for other, *_ in letters[:k]):
-                    raise FileError(f"{command} has {letter} twice; remove one", path, i + 1)
-                words[command, letter] = Value(line[start : start + length], i, start)
-    return GcodeFile(path, complete, words, commands)
-
-
-def _split_commands(line: str) -> Iterator[tuple[str, list[tuple[str, int, int]], int, str]]:
-    """Yield the commands of a line: name, words (letter, column, length), end, other text."""
-    code = CHECKSUM.sub("", _blank_asides(line).rstrip()).translate(UPPER)
-    front = FRONT.match(code)
-    column = front.end() if front is not None else 0
-    while (command := COMMAND.match(code, column)) is not None:
-        column, words = command.end(), []
-        while not COMMAND.match(code, column) and (word := WORD.match(code, column)):
-            words.append((word[1], word.start(2), len(word[2])))
-            column = word.end()
-        rest = "" if COMMAND.match(code, column) else code[column:].strip()
-        yield command[1], words, len(code[:column].rstrip()), rest
-        if command[1] in WITH_TEXT:
-            return
-
-
-def _blank_asides(line: str) -> str:
-    """Return a line of the same length, with blanks for remarks and no letters in quotes."""
-
-    def blank(match: re.Match[str]) -> str:
-        return ("\0" if match[0].startswith('"') else " ") * len(match[0])
-
-    return ASIDE.sub(blank, line)
-
+MM = 1e-3
+MARLIN_DECIMALS, REPRAP_DECIMALS = 4, 3
+"""Decimals that a firmware keeps: Marlin has numbers of single precision, which resolve 0.00003 mm
+of 300 mm; RepRapFirmware writes three decimals (M500).
+"""
 
 TOWERS, TRIMS = "XYZ", "ABC"
 Numbers = tuple[float, ...]
@@ -187,6 +65,7 @@ class DeltaFirmware:
     ----------
     name : of the format. program : of the firmware. remark : first line of a new file.
     one_in_a_line : whether the firmware runs one command in a line.
+    decimals : that the firmware keeps of a number in mm or degrees.
     probe : word that H contains besides the height [mm]; None without one.
     choose_height : returns the height of a stop without adjustment, from those of all stops [mm].
     refuse : raises FileError for words that contradict the firmware, or that loopcal lacks.
@@ -199,6 +78,7 @@ class DeltaFirmware:
     remark: str
     sign: float
     one_in_a_line: bool
+    decimals: int
     probe: Name | None
     choose_height: Callable[[Numbers], float]
     refuse: Callable[[GcodeFile], None]
@@ -232,13 +112,14 @@ class DeltaFirmware:
 
     def write(self, source: ExportSource, into: Path | None) -> Exported:
         """Return the corrected words in an existing file, or two lines of their own."""
-        geometry = get_geometry(source, self.name)
+        geometry = get_geometry(source, self.name, self.decimals)
         file = parse_gcode([self.remark], Path("config.g"))
         if into is not None:
             file = read_gcode(into, self.one_in_a_line)
             self.refuse(file)
         arms, findings = self.list_arms(geometry.arms, into is None)
         height = self.choose_height(geometry.stops)
+        height = source.round_number(height, "tower1.stop", MM, self.decimals)
         turns = zip(TOWERS, geometry.angles, NOMINAL_ANGLES, strict=True)
         words: Words = {("M665", "R"): geometry.radius}
         words["M665", "H"] = height + self._get_probe_offset(file)
@@ -253,6 +134,8 @@ class DeltaFirmware:
             words = arms | words
         zeros = {("M665", letter): 0.0 for letter in TOWERS + TRIMS}
         zeros |= {("M666", letter): 0.0 for letter in TOWERS}
+        if source.is_for_people and into is None:
+            words = shorten_numbers(words, self.decimals)
         return file.export(into, words, zeros, findings)
 
     def _get_probe_offset(self, file: GcodeFile) -> float:
@@ -351,6 +234,7 @@ MARLIN_FIRMWARE = DeltaFirmware(
     "(M851) to H\n",
     -1.0,
     True,
+    MARLIN_DECIMALS,
     ("M851", "Z"),
     min,
     _refuse_marlin,
@@ -363,6 +247,7 @@ REPRAP_FIRMWARE = DeltaFirmware(
     "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n",
     1.0,
     False,
+    REPRAP_DECIMALS,
     None,
     lambda stops: sum(stops) / 3,
     _refuse_reprap,

@@ -69,16 +69,24 @@ def format_robot(
     )
 
 
-def get_geometry(source: ExportSource, format_name: str) -> DeltaGeometry:
-    """Return the geometry of a robot of the family linear-delta; DataError for another."""
+def get_geometry(source: ExportSource, format_name: str, decimals: int) -> DeltaGeometry:
+    """Return the geometry of a robot of the family linear-delta; DataError for another.
+
+    Parameters
+    ----------
+    decimals : that the firmware stores, the most that people type.
+    """
     get_record(source, LinearDelta, format_name, "a robot of the family linear-delta")
     values = source.values()
 
+    def convert(name: str, factor: float) -> float:
+        return source.round_number(values[name] * factor, name, 1.0 / factor, decimals)
+
     def list_towers(name: str, factor: float) -> tuple[float, ...]:
-        return tuple(values[name.format(k)] * factor for k in (1, 2, 3))
+        return tuple(convert(name.format(k), factor) for k in (1, 2, 3))
 
     return DeltaGeometry(
-        values["radius"] * 1e3,
+        convert("radius", 1e3),
         list_towers("tower{}.angle", math.degrees(1)),
         list_towers("arm{}.length", 1e3),
         list_towers("tower{}.stop", 1e3),

@@ -40,7 +40,7 @@ from loopcal.io.formats.program_format import (
     Imported,
     ImportOptions,
 )
-from loopcal.io.formats.value_file import Name, Value, ValueFile
+from loopcal.io.formats.value_file import DECIMALS, Name, Value, ValueFile, shorten_numbers
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -227,7 +227,7 @@ def get_step_distance(cfg: KlipperConfig, section: str) -> float:
 
 def write(source: ExportSource, into: Path | None) -> Exported:
     """Return the corrected numbers in an existing printer.cfg, or a saved block to paste."""
-    geometry = get_geometry(source, "klipper")
+    geometry = get_geometry(source, "klipper", DECIMALS)
     wanted: dict[Name, float | str] = {("printer", "delta_radius"): geometry.radius}
     defaults: dict[Name, float] = {}
     for k, section in enumerate(STEPPERS):
@@ -240,6 +240,8 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     if into is not None:
         return read_config(into).export(into, wanted, defaults)
     new = parse_config((), Path("printer.cfg"))
+    if source.is_for_people:
+        wanted = shorten_numbers(wanted, DECIMALS)
     return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
 
 

@@ -38,7 +38,7 @@ from loopcal.io.formats.program_format import (
     format_head,
     get_record,
 )
-from loopcal.io.formats.value_file import Name, Value, ValueFile
+from loopcal.io.formats.value_file import DECIMALS, Name, Value, ValueFile
 from loopcal.mechanism.families.gough import Gough
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
@@ -183,8 +183,10 @@ def _list_pins(
     for n in range(6):
         for side in SIDES:
             for axis in "xyz":
-                value = values[f"leg{n + 1}.{side}.{axis}"] / factor
+                name = f"leg{n + 1}.{side}.{axis}"
+                value = values[name] / factor
                 shifted = value - (lift if axis == "z" else 0.0)
+                shifted = source.round_number(shifted, name, factor, DECIMALS)
                 pins[f"{side}.{n}.{axis}"] = float(format_scaled(shifted, 1.0))
     if record.screw is not None:
         legs = record.screw.legs()

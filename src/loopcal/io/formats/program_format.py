@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import count_decimals
 from loopcal.io.core.names import format_comment
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.text_file import read_bytes
@@ -100,11 +102,29 @@ class ExportSource:
     ----------
     plus_minus : parameter -> half of the 95 % interval, in the unit of the robot file; None where
         there is none. nulls : parameter -> reason why there is none.
+    is_for_people : whether the numbers are to be read and typed: an identified value then has the
+        digits that its interval supports. Files for programs have all digits.
     """
 
     robot: Mechanism
     plus_minus: Mapping[str, float | None] = field(default_factory=dict)
     nulls: Mapping[str, str] = field(default_factory=dict)
+    is_for_people: bool = False
+
+    def round_number(self, number: float, name: str, factor: float, most: int) -> float:
+        """Return a number as it is written: for people to the third digit of the interval of a
+        parameter, with at most `most` decimals; for programs as it is.
+
+        Parameters
+        ----------
+        name : of the parameter. factor : from the unit in which the number is written to SI.
+        """
+        half = self.plus_minus.get(name)
+        if not self.is_for_people or half is None or not 0.0 < half < math.inf:
+            return number
+        table = self.robot.parameters
+        unit = self.robot.get_unit(table.entries[table.index(name)].dimension)
+        return round(number, min(count_decimals(half * unit.factor_to_si / factor), most))
 
     def values(self) -> dict[str, float]:
         """Return parameter -> value [SI]."""

@@ -191,6 +191,24 @@ def format_number(value: float) -> str:
     return f"{value:.{DECIMALS}f}"
 
 
+def shorten_numbers(wanted: Mapping[Name, float | str], decimals: int) -> dict[Name, float | str]:
+    """Return numbers as texts for people, without zeros at their ends; lists are `a:b:c`."""
+    return {
+        name: ":".join(
+            _shorten(float(number), decimals)
+            for number in (value.split(":") if isinstance(value, str) else (value,))
+        )
+        for name, value in wanted.items()
+    }
+
+
+def _shorten(number: float, decimals: int) -> str:
+    """Return a number with at most so many decimals."""
+    text = f"{number:.{decimals}f}"
+    text = text.rstrip("0").rstrip(".") if "." in text else text
+    return "0" if text == "-0" else text
+
+
 def is_same(*pairs: tuple[float, float]) -> bool:
     """Return whether the two numbers of each pair are written alike."""
     return all(format_number(a) == format_number(b) for a, b in pairs)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply import HeightErrors
+from loopcal.findings.wording import count_decimals
 from loopcal.report.figures.style import (
     DARK,
     DIVERGING,
@@ -18,7 +19,6 @@ from loopcal.report.figures.style import (
     label_axes,
     start_figure,
 )
-from loopcal.report.numbers import count_decimals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

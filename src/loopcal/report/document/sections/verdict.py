@@ -13,9 +13,9 @@ from loopcal.workflow import Verdict
 
 MEANING = {
     Verdict.CALIBRATED: "All quality gates are met, held-out poses were predicted, and there is no "
-    "warning. The corrected values can be used.",
-    Verdict.RESERVATIONS: "All quality gates are met. The corrected values can be used, but the "
-    "warnings below affect their accuracy.",
+    "warning. The recommendation below states whether to use the corrected values.",
+    Verdict.RESERVATIONS: "All quality gates are met, but the warnings below affect the accuracy "
+    "of the corrected values. The recommendation below states whether to use them.",
     Verdict.UNDECIDED: "No quality gate failed, but the held-out poses do not suffice to state the "
     "accuracy at poses that were not fitted.",
     Verdict.NOT_CALIBRATED: "A quality gate is not met. Do not write these values to a machine.",
