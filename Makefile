@@ -10,7 +10,7 @@ WORKERS := 1
 FUZZ := runs/fuzz.json
 export PYTHON
 
-.PHONY: help demo test quick evidence docs site fuzz bench bench-update check format constraints clean
+.PHONY: help demo test quick evidence docs site fuzz bench bench-update viewer check format constraints clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -46,6 +46,11 @@ bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when
 
 bench-update: .venv/dev.stamp  ## measure again and rewrite benchmarks/baseline.json (REASON="another machine")
 	$(BIN)/python -m benchmarks.run --update --reason "$(REASON)"
+
+viewer:  ## build the script of the 3-D view from tools/viewer (needs Node.js >= 18 and the npm registry)
+	cd tools/viewer && npm ci --no-audit --no-fund && npm run build
+	cd tools/viewer && sha256sum package.json package-lock.json build.js src/*.js \
+	  ../../src/loopcal/report/scene/viewer.min.js ../../src/loopcal/report/scene/three.LICENSE.txt > SHA256SUMS
 
 check: .venv/dev.stamp  ## lint, format, types, layers, sizes
 	$(BIN)/ruff check

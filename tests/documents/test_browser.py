@@ -26,18 +26,38 @@ pytestmark = [
 
 MOST_PAGES = 12
 
+WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Options with which Chromium computes WebGL without a graphics card."""
+
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as program:
-        options = ["--no-sandbox"] * is_root()
-        started = program.chromium.launch(executable_path=BROWSER, args=options)
+def program() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
         yield started
-        started.close()
+
+
+def launch(program: Any, *options: str) -> Any:
+    """Return a started Chromium."""
+    options += ("--no-sandbox",) * is_root()
+    return program.chromium.launch(executable_path=BROWSER, args=list(options))
+
+
+@pytest.fixture(scope="module")
+def browser(program) -> Iterator[Any]:
+    started = launch(program, *WEBGL)
+    yield started
+    started.close()
 
 
 def count_pages(pdf: bytes) -> int:
     return len(re.findall(rb"/Type\s*/Page\b", pdf))
+
+
+def open_view(tab: Any) -> Any:
+    """Return the figure of the 3-D view, which opens when it is near the screen."""
+    tab.locator("figure.scene").scroll_into_view_if_needed()
+    tab.wait_for_selector("figure.live canvas")
+    return tab.locator("figure.live")
 
 
 def test_page_opens_without_requests_errors_and_javascript(browser, page) -> None:
@@ -83,6 +103,7 @@ def test_page_passes_axe(browser, page, scheme, rules) -> None:
     context = browser.new_context(offline=True, color_scheme=scheme, bypass_csp=True)
     tab = context.new_page()
     tab.goto(page.as_uri())
+    open_view(tab)
     tab.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text("utf-8"))
     answer = tab.evaluate(f"axe.run({rules})")
     assert [(v["id"], v["nodes"][0]["html"]) for v in answer["violations"]] == []
@@ -106,6 +127,68 @@ def test_page_can_be_used_with_the_keyboard_alone(browser, page) -> None:
     wide += " && getComputedStyle(e).overflowX === 'auto' && e.tabIndex < 0).length"
     assert tab.evaluate(wide) == 0
     context.close()
+
+
+def test_view_opens_without_requests_and_errors_and_turns_by_keys(browser, page) -> None:
+    context = browser.new_context(offline=True, reduced_motion="reduce")
+    tab, logged, asked = context.new_page(), [], []
+    tab.on("console", lambda message: logged.append(message.text))
+    tab.on("pageerror", lambda error: logged.append(str(error)))
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.goto(page.as_uri())
+    figure = open_view(tab)
+    assert not figure.locator("> svg").is_visible()
+    canvas, said = figure.locator("canvas"), figure.locator("output")
+    assert "hexapod-42" in canvas.get_attribute("aria-label")
+    legend = " ".join(figure.locator(".legend li").all_inner_texts())
+    assert re.search(r"before calibration, [0-9]+ times magnified.* mm", legend)
+    first = figure.locator(".names").inner_html()
+    canvas.focus()
+    tab.keyboard.press("ArrowLeft")
+    turned = wait_for_change(figure, first)
+    frames = "new Promise(done => {let n = 0; const ask = window.requestAnimationFrame;"
+    frames += (
+        "window.requestAnimationFrame = f => {n++; return ask(f)}; setTimeout(() => done(n), 300)})"
+    )
+    assert tab.evaluate(frames) == 0  # nothing moves by itself
+    tab.keyboard.press("Home")
+    assert wait_for_change(figure, turned) == first
+    figure.locator("select").select_option(label="4")
+    place = "x [-0-9.]+, y [-0-9.]+, z [-0-9.]+ mm"
+    text = rf"Pose 4: tool at {place}; error before calibration [0-9.]+ mm\."
+    assert re.fullmatch(text, said.inner_text())
+    figure.get_by_label("errors", exact=True).uncheck()
+    tab.emulate_media(media="print")
+    assert figure.locator("> svg").is_visible()
+    assert not canvas.is_visible()
+    assert count_pages(tab.pdf(prefer_css_page_size=True)) <= MOST_PAGES
+    assert asked == [page.as_uri()]
+    assert logged == []
+    context.close()
+
+
+def wait_for_change(figure: Any, before: str) -> str:
+    """Return the names with their places after the next drawing."""
+    names = figure.locator(".names")
+    for _ in range(100):
+        if (after := names.inner_html()) != before:
+            return after
+        figure.page.wait_for_timeout(20)
+    raise AssertionError("the view was not drawn again")
+
+
+def test_picture_stays_where_a_browser_has_no_webgl(program, page) -> None:
+    started = launch(program, "--disable-3d-apis")
+    tab, logged = started.new_page(), []
+    tab.on("console", lambda message: logged.append(message.text))
+    tab.on("pageerror", lambda error: logged.append(str(error)))
+    tab.goto(page.as_uri())
+    tab.locator("figure.scene").scroll_into_view_if_needed()
+    tab.wait_for_timeout(200)
+    assert tab.locator("figure.scene > svg").is_visible()
+    assert tab.locator("canvas").count() == 0
+    assert logged == []
+    started.close()
 
 
 def test_option_pdf_prints_at_most_12_pages(run, tmp_path, monkeypatch, capsys) -> None:

@@ -24,7 +24,8 @@ HTML = (".html", ".htm")
 def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     """Write the report of a calibration as one HTML file for people, and as JSON beside it.
 
-    The HTML file loads nothing and runs no program; it can be printed, sent and archived. An older
+    The HTML file loads nothing and can be printed, sent and archived. It contains one script, the
+    3-D view, in place of which a browser without WebGL or JavaScript shows a picture. An older
     report of this name is replaced. Commands: see `loopcal report`.
 
     Parameters

@@ -20,12 +20,14 @@ class Picture:
     ----------
     name : prefix of its identifiers. svg : see `inline_figure`. caption : shown below it.
     description : what it shows, for readers who do not see it.
+    scene : JSON of a scene, which replaces the figure where a browser has WebGL; empty without.
     """
 
     name: str
     svg: str = field(repr=False)
     caption: str
     description: str
+    scene: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.apply import accuracy_map
+from loopcal.apply import AccuracyMap, accuracy_map
 from loopcal.errors import LoopcalError
 from loopcal.estimate.residuals import KindResiduals
 from loopcal.measure.kinds.joints.actuator_readings import ActuatorReadings
@@ -25,7 +25,13 @@ from loopcal.report.figures import (
     draw_scene,
     draw_validation,
 )
-from loopcal.typing import FloatArray
+from loopcal.report.scene.scene import Scene, compute_pose_errors
+from loopcal.report.scene.scene_data import choose_rows, write_scene
+from loopcal.typing import FloatArray, IntArray
+
+MAP_SENTENCE = (
+    " Pale squares show the standard uncertainty of positions over the workspace by color."
+)
 
 MOST_ROWS = 3000
 """Rows that the figures of a report show."""
@@ -122,7 +128,9 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     )
 
 
-def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
+def draw_scene_picture(
+    record: CalibrationRecord, accuracy: AccuracyMap | None
+) -> Iterator[Element]:
     """Yield the robot at home with the measured poses and the errors that calibration removes."""
     readings = record.readings
     if not record.converged:
@@ -131,54 +139,71 @@ def draw_scene_picture(record: CalibrationRecord) -> Iterator[Element]:
     if readings is None or not len(readings):
         yield "The run does not contain the readings of its poses, so they are not drawn."
         return
-    kept = _thin_readings(readings)
-    if len(kept) < len(readings):
-        yield f"The figure shows {len(kept):,} of {len(readings):,} fitted poses."
-    figure, magnification = draw_scene(record.robot, record.initial, kept)
+    rows = _spread_rows(len(readings))
+    if len(rows) < len(readings):
+        yield f"The figure shows {len(rows):,} of {len(readings):,} fitted poses."
+    labels = _label_rows(record, rows)
+    poses = compute_pose_errors(record.robot, record.initial, readings[rows], labels)
+    scene = Scene(record.robot, poses, accuracy)
+    shown = len(choose_rows(record.robot, len(poses.tool)))
+    if shown < len(poses.tool):
+        yield f"The 3-D view can show the robot at {shown:,} of these poses, evenly spread."
     yield make_picture(
-        figure,
+        draw_scene(scene),
         "scene-figure",
         "The robot at home, and the tool point at the fitted poses.",
         "A point is the tool at a fitted pose. The line from it is the position error of the "
-        f"geometry before calibration there, {magnification:g} times magnified: its predicted "
-        "position minus that of the calibrated geometry at the same readings, in the base frame of "
-        "the robot file.",
+        f"geometry before calibration there, {poses.magnification:g} times magnified: its "
+        "predicted position minus that of the calibrated geometry at the same readings, in the "
+        f"base frame of the robot file.{MAP_SENTENCE if accuracy is not None else ''}",
+        write_scene(scene),
     )
 
 
-def _thin_readings(readings: FloatArray) -> FloatArray:
-    """Return at most MOST_ROWS rows of readings, evenly spread."""
-    return readings[np.unique(np.linspace(0, len(readings) - 1, MOST_ROWS).astype(np.intp))]
+def _label_rows(record: CalibrationRecord, rows: IntArray) -> tuple[str, ...]:
+    """Return the labels of fitted poses; their numbers where an older version wrote the run."""
+    labels, count = (
+        record.fitted_labels,
+        len(record.readings if record.readings is not None else ()),
+    )
+    return tuple(labels[i] if len(labels) == count else str(i + 1) for i in rows)
 
 
-def _describe_count(readings: FloatArray) -> str:
+def _spread_rows(count: int) -> IntArray:
+    """Return at most MOST_ROWS of so many rows, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, MOST_ROWS).astype(np.intp))
+
+
+def _describe_count(readings: FloatArray | None) -> str:
     """Return how many of the measured poses are compared, where these are not all."""
-    count = len(readings)
+    count = 0 if readings is None else len(readings)
     return f" of the {MOST_ROWS:,} that are compared" if count > MOST_ROWS else ""
 
 
-def draw_accuracy_picture(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield the uncertainty of poses over the workspace, and the sentence that sums it up."""
+def compute_accuracy(record: CalibrationRecord) -> AccuracyMap | str:
+    """Return the uncertainty of poses over the workspace, or the sentence why it is not known."""
     budget, readings = record.result.get("expected_error"), record.readings
     if record.posterior is None or readings is None or not budget:
-        yield "This run has no intervals, so the accuracy over the workspace is not known."
-        return
+        return "This run has no intervals, so the accuracy over the workspace is not known."
     try:
-        accuracy = accuracy_map(
+        return accuracy_map(
             record.posterior,
-            _thin_readings(readings),
+            readings[_spread_rows(len(readings))],
             MAP_POSES,
             SEED,
             frame=budget.get("frame", "fitted"),
         )
     except LoopcalError as error:
-        yield f"The accuracy over the workspace cannot be computed: {error}"
-        return
+        return f"The accuracy over the workspace cannot be computed: {error}"
+
+
+def draw_accuracy_picture(record: CalibrationRecord, accuracy: AccuracyMap) -> Iterator[Element]:
+    """Yield the uncertainty of poses over the workspace, and the sentence that sums it up."""
     less = int(accuracy.extrapolated.sum())
     yield (
         f"The standard uncertainty of the pose was computed at {len(accuracy.coordinates)} poses "
         f"of the workspace, {accuracy.uncertainty.frame}. {less} of these poses are less certain "
-        f"than every measured pose{_describe_count(readings)}."
+        f"than every measured pose{_describe_count(record.readings)}."
     )
     yield make_picture(
         draw_accuracy_map(accuracy),

@@ -31,10 +31,12 @@ _REFERENCE = re.compile(r"url\(#([^)]+)\)")
 _DIGITS = re.compile(r"-?\d+\.\d{3,}")
 
 
-def make_picture(figure: Figure, name: str, caption: str, description: str) -> Picture:
-    """Return a figure as a picture."""
+def make_picture(
+    figure: Figure, name: str, caption: str, description: str, scene: str = ""
+) -> Picture:
+    """Return a figure as a picture; see `Picture` for the arguments."""
     svg = inline_figure(render_svg_text(figure), name)
-    return Picture(name, svg, caption, description)
+    return Picture(name, svg, caption, description, scene)
 
 
 def inline_figure(svg: bytes, name: str) -> str:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A document as one HTML file, which loads nothing and runs no program.
+"""A document as one HTML file, which loads nothing.
 
-Its content security policy allows only its own style sheet, by digest, and embedded images.
+Its content security policy allows only its own style sheet and the script of the 3-D view, both by
+digest, and embedded images. A document without a scene has no script.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.plain_text import escape
 from loopcal.report.document.elements import Code, Document, Listing, Picture
+from loopcal.report.scene.scene_data import load_script
 from loopcal.report.tables import Table
 
 if TYPE_CHECKING:
@@ -29,11 +31,23 @@ WIDEST = 6
 def render_html(document: Document) -> str:
     """Return a document as HTML; a name that is not plain text is shown with escapes."""
     style = (FOLDER / STYLE).read_text("utf-8")
-    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    policy = f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:; base-uri 'none'"
+    elements = (element for section in document.sections for element in section.elements)
+    has_scene = any(isinstance(element, Picture) and element.scene for element in elements)
+    script = load_script() if has_scene else ""
+    allowed = f"script-src '{_digest(script)}'; " if script else ""
+    policy = f"default-src 'none'; {allowed}style-src '{_digest(style)}'; img-src data:"
     return _load_template().render(
-        document=document, style=style, policy=f"{policy}; form-action 'none'", widest=WIDEST
+        document=document,
+        style=style,
+        script=script,
+        policy=f"{policy}; base-uri 'none'; form-action 'none'",
+        widest=WIDEST,
     )
+
+
+def _digest(text: str) -> str:
+    """Return the source of a content security policy that allows exactly this text."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
 @cache

@@ -2,21 +2,22 @@
 """A picture of a mechanism: its limbs, joints, rods, platform and tool, in space and from above.
 
 A limb has the same color in both views. A short line through a point is the axis of a revolute
-joint, a dashed line is the guide of a sliding joint, and a filled point is driven. The placement of
-links comes from `mechanism.frames`.
+joint, a dashed line is the guide of a sliding joint, and a filled point is driven. The parts come
+from `loopcal.report.scene.robot_parts`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
+from loopcal.mechanism import Mechanism, Solution
 from loopcal.report.figures.style import (
     COLORS,
+    DARK,
+    FRAME_COLORS,
     LABEL,
     SMALL,
     add_legend,
@@ -24,20 +25,12 @@ from loopcal.report.figures.style import (
     label_axes,
     start_figure,
 )
+from loopcal.report.scene.robot_parts import Part, Role, is_planar, list_parts
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-AXIS, GUIDE = 0.06, 0.12
-"""Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
-as a share of the robot's size.
-"""
-
-
-PLANAR = {"x", "y", "rz"}
-"""Freedoms of a platform that moves in the x-y plane."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +45,7 @@ def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0)
     """Draw a robot at home, or at a row of a solution, in the length unit of its file."""
     state = robot.home_state if solution is None else solution.take(np.array([row])).state
     length = find_unit(robot.units[Dimension.LENGTH])
-    strokes = list(
-        _strokes(
-            robot,
-            [f[0, 0] for f in compute_limb_frames(robot, robot.values[None], state)],
-            state.T[0, 0],
-        )
-    )
+    strokes = [_make_stroke(part) for part in list_parts(robot, state)]
     strokes = [Stroke(s.points / length.factor_to_si, s.style) for s in strokes]
     everything = np.concatenate([s.points for s in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -81,78 +68,26 @@ def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0)
     return finish_figure(figure, _caption(robot, where, length.symbol))
 
 
-def is_planar(robot: Mechanism) -> bool:
-    """Return whether the platform moves in the x-y plane only: one view shows everything."""
-    return set(robot.freedoms) <= PLANAR
-
-
-def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:
-    """Yield everything to draw [m]: a line for each limb, then joints, platform, base and tool."""
-    for i, frames in enumerate(limbs):
-        chain = frames[:-1, :3, 3]
-        yield Stroke(
-            chain, {"color": COLORS[i % len(COLORS)], "lw": 2.5, "solid_capstyle": "round"}
-        )
-    for i, (limb, frames) in enumerate(zip(robot.assembly.limbs, limbs, strict=True)):
-        color, points = COLORS[i % len(COLORS)], frames[:, :3, 3]
-        for j, joint in enumerate(limb.joints):
-            axis, face = frames[j, :3, 2], color if joint.actuator else "white"
-            if joint.kind == "P":
-                slid = (points[j + 1] - points[j]) @ axis
-                ends = np.array(
-                    [min(slid, 0.0) - GUIDE * robot.size, max(slid, 0.0) + GUIDE * robot.size]
-                )
-                yield Stroke(
-                    points[j] + ends[:, None] * axis, {"color": color, "lw": 1.0, "ls": (0, (4, 3))}
-                )
-                place = points[j] + slid * axis
-            else:
-                place = points[j]
-                yield Stroke(
-                    place + np.array([[-1.0], [1.0]]) * AXIS * robot.size * axis,
-                    {"color": "black", "lw": 1.2},
-                )
-            yield Stroke(
-                place[None],
-                _dot(
-                    "s" if joint.kind == "P" else "o", color, face, 8.0 if joint.actuator else 5.0
-                ),
-            )
-        if limb.ending == "distance":
-            face = color if limb.actuator else "white"
-            yield Stroke(points[-2:], {"color": color, "lw": 1.6})
-            yield Stroke(
-                points[-2:].mean(axis=0)[None] if limb.actuator else points[-2:-1],
-                _dot("D", color, face),
-            )
-        if limb.ending != "rigid":
-            yield Stroke(points[-1:], _dot("o", color, "white"))
-    yield from _bodies(
-        robot, np.array([f[-1, :3, 3] for f in limbs]), np.array([f[0, :3, 3] for f in limbs]), T
-    )
-
-
-def _bodies(robot: Mechanism, top: FloatArray, foot: FloatArray, T: FloatArray) -> Iterator[Stroke]:
-    """Yield platform, base, their frames, and the tool."""
-    yield Stroke(_outline(foot), {"color": "0.6", "lw": 1.0, "ls": ":", "zorder": 0.5})
-    yield Stroke(_outline(top), {"color": "0.25", "lw": 2.0})
-    tool = T @ robot.tool
-    yield Stroke(np.stack([T[:3, 3], tool[:3, 3]]), {"color": "0.25", "lw": 1.0})
-    for frame in (np.eye(4), tool):
-        for axis, color in enumerate(("#b22222", "#228b22", "#1e3fae")):
-            end = frame[:3, 3] + 2 * AXIS * robot.size * frame[:3, axis]
-            yield Stroke(np.stack([frame[:3, 3], end]), {"color": color, "lw": 1.4})
-    yield Stroke(tool[None, :3, 3], _dot("*", "black", "black", 8.0))
-
-
-def _outline(points: FloatArray) -> FloatArray:
-    """Return points (n, 3) sorted by angle about their center and closed; unchanged on a line."""
-    offset = points - points.mean(axis=0)
-    _, s, V = np.linalg.svd(offset, full_matrices=True)
-    if len(points) < 3 or s[1] < 1e-6 * max(s[0], 1e-300):
-        return points
-    order = np.argsort(np.arctan2(offset @ V[1], offset @ V[0]))
-    return points[[*order, order[0]]]
+def _make_stroke(part: Part) -> Stroke:
+    """Return a part at its first pose, as figures draw it."""
+    color = COLORS[part.index % len(COLORS)]
+    face = color if part.is_driven else "white"
+    styles: dict[Role, dict[str, Any]] = {
+        "limb": {"color": color, "lw": 2.5, "solid_capstyle": "round"},
+        "axis": {"color": "black", "lw": 1.2},
+        "guide": {"color": color, "lw": 1.0, "ls": (0, (4, 3))},
+        "joint": _dot("o", color, face, 8.0 if part.is_driven else 5.0),
+        "slide": _dot("s", color, face, 8.0 if part.is_driven else 5.0),
+        "rod": {"color": color, "lw": 1.6},
+        "rod drive": _dot("D", color, face),
+        "end": _dot("o", color, "white"),
+        "base": {"color": "0.6", "lw": 1.0, "ls": ":", "zorder": 0.5},
+        "platform": {"color": DARK, "lw": 2.0},
+        "arm": {"color": DARK, "lw": 1.0},
+        "frame": {"color": FRAME_COLORS[part.index % 3], "lw": 1.4},
+        "tool": _dot("*", "black", "black", 8.0),
+    }
+    return Stroke(part.points[0], styles[part.role])
 
 
 def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]:

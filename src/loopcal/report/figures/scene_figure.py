@@ -1,70 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot at home with the measured poses, and the position errors there before calibration."""
+"""A scene as a picture: a robot at home, measured poses with errors, and the accuracy map."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism, forward
 from loopcal.report.figures.robot_figure import draw_robot
-from loopcal.report.figures.style import finish_figure
+from loopcal.report.figures.style import ERROR, LABEL, POSE, SEQUENTIAL, SMALL, THIN, finish_figure
+from loopcal.report.scene.scene import PoseErrors, Scene
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LONGEST = 0.15
-"""Length of the longest drawn error, as a share of the robot's size."""
 
-POSE, ERROR = "#5b3a8e", "#c2185b"
-"""Colors of poses and of errors, which no limb has."""
-
-
-def draw_scene(robot: Mechanism, initial: Mechanism, readings: FloatArray) -> tuple[Figure, float]:
-    """Draw a robot at home, the tool point at readings, and the errors of the initial geometry.
-
-    Parameters
-    ----------
-    robot : calibrated. initial : before calibration. readings : (n, a) of the poses [m or rad].
-
-    Returns
-    -------
-    figure, and by which factor the errors are longer than the poses' scale. Poses that one of the
-    two geometries does not reach are left out.
+def draw_scene(scene: Scene) -> Figure:
+    """Draw a robot at home; with measured poses the tool points and errors there; with an accuracy
+    map the uncertainty of positions over the workspace as pale points.
     """
-    after, before = (forward(machine, readings) for machine in (robot, initial))
-    reached = after.converged & before.converged
-    tool = (after.T[reached] @ robot.tool)[:, :3, 3]
-    error = (before.T[reached] @ initial.tool)[:, :3, 3] - tool
-    magnification = _choose_magnification(error, robot.size)
+    robot, poses = scene.robot, scene.poses
     figure = draw_robot(robot)
     factor = find_unit(robot.units[Dimension.LENGTH]).factor_to_si
-    ends = np.stack([tool, tool + magnification * error, np.full(tool.shape, np.nan)], axis=1)
-    points, lines = tool / factor, ends.reshape(-1, 3) / factor
-    for axes in figure.axes:
-        is_space = axes.name == "3d"
-        kept = slice(None) if is_space else slice(0, 2)
-        axes.plot(*lines[:, kept].T, color=ERROR, lw=1.0, zorder=8)
-        axes.plot(*points[:, kept].T, "o", color=POSE, ms=2.5, zorder=8)
-        if is_space and len(points):
-            _include(axes, lines)
-    count = f"{len(tool)} measured {'pose' if len(tool) == 1 else 'poses'}"
-    title = f"{robot.name} at home, {count}; errors before calibration, x {magnification:g}"
-    return finish_figure(figure, title), magnification
+    panels = figure.axes
+    if scene.accuracy is not None:
+        _draw_map(figure, panels, scene, factor)
+    if poses is None:
+        return figure
+    ends = _join_ends(poses) / factor
+    for axes in panels:
+        kept = slice(None) if axes.name == "3d" else slice(0, 2)
+        axes.plot(*ends[:, kept].T, color=ERROR, lw=1.0, zorder=8)
+        axes.plot(*poses.tool[:, kept].T / factor, "o", color=POSE, ms=2.5, zorder=8)
+        if axes.name == "3d" and len(ends):
+            _include(axes, ends)
+    n = len(poses.tool)
+    count = f"{n} measured {'pose' if n == 1 else 'poses'}"
+    title = f"{robot.name} at home, {count}; errors before calibration"
+    return finish_figure(figure, f"{title}, x {poses.magnification:g}")
 
 
-def _choose_magnification(error: FloatArray, size: float) -> float:
-    """Return 1, 2 or 5 times a power of ten with which the longest error is at most LONGEST."""
-    longest = float(np.sqrt((error**2).sum(axis=1)).max(initial=0.0))
-    if longest <= 1e-9 * size:
-        return 1.0
-    wanted = LONGEST * size / longest
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted)
+def _join_ends(poses: PoseErrors) -> FloatArray:
+    """Return the ends of the errors (3 n, 3) [m], with NaN behind each."""
+    ends = (poses.tool, poses.tool + poses.magnification * poses.error)
+    return np.stack([*ends, np.full(poses.tool.shape, np.nan)], axis=1).reshape(-1, 3)
+
+
+def _draw_map(figure: Figure, panels: list[Any], scene: Scene, factor: float) -> None:
+    """Draw the uncertainty of positions where it is known, with its scale of colors."""
+    assert scene.accuracy is not None
+    unit = DISPLAY_UNITS[Dimension.LENGTH]
+    values = scene.accuracy.uncertainty.position / unit.factor_to_si
+    known = np.isfinite(values) & np.isfinite(scene.map_points).all(axis=1)
+    if not known.any():
+        return
+    points, drawn = scene.map_points[known] / factor, []
+    for axes in panels:
+        kept = slice(None) if axes.name == "3d" else slice(0, 2)
+        style = {"c": values[known], "cmap": SEQUENTIAL, "s": 9.0, "marker": "s", "lw": 0.0}
+        drawn.append(axes.scatter(*points[:, kept].T, alpha=0.45, zorder=0.4, **style))
+        if axes.name == "3d":
+            _include(axes, points)
+    bar: Any = figure.colorbar(drawn[-1], ax=panels[-1], aspect=30, pad=0.02, shrink=0.8)
+    bar.set_label(f"position uncertainty (rms) [{unit.symbol}]", fontsize=LABEL)
+    bar.ax.tick_params(labelsize=SMALL, width=THIN)
+    bar.solids.set_alpha(1.0)
 
 
 def _include(axes: Any, points: FloatArray) -> None:

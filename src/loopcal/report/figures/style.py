@@ -21,6 +21,12 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c
 MARKERS = "os^DvP<>"
 """Of series in turn."""
 
+FRAME_COLORS = ("#b22222", "#228b22", "#1e3fae")
+"""Of the axes x, y and z of a frame."""
+
+POSE, ERROR = "#5b3a8e", "#c2185b"
+"""Of measured poses and of their errors; no limb has these colors."""
+
 DIVERGING, SEQUENTIAL = "RdBu_r", "viridis"
 """Color maps of numbers with a sign, and of numbers above zero."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from loopcal.report.document.elements import Element, Section
 from loopcal.report.document.figures import (
+    compute_accuracy,
     draw_accuracy_picture,
     draw_height_picture,
     draw_scene_picture,
@@ -64,5 +65,9 @@ def build_height_section(record: CalibrationRecord) -> Section:
 
 def build_workspace_section(record: CalibrationRecord) -> Section:
     """Return the robot with its measured poses, and the uncertainty over its workspace."""
-    elements = (*draw_scene_picture(record), *draw_accuracy_picture(record))
+    accuracy = compute_accuracy(record)
+    if isinstance(accuracy, str):
+        elements = (*draw_scene_picture(record, None), accuracy)
+    else:
+        elements = (*draw_scene_picture(record, accuracy), *draw_accuracy_picture(record, accuracy))
     return Section("workspace", "Measured poses and accuracy over the workspace", elements)
