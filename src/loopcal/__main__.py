@@ -5,11 +5,18 @@ Ctrl-C is answered in a sentence from the first import on; the command line itse
 it runs.
 """
 
+import gc
 import sys
+
+COLLECTED_AFTER = 100_000
+"""New objects after which Python looks for unused ones. Its 700 are reached a hundred times while
+packages are imported and figures drawn, where nothing becomes unused.
+"""
 
 
 def run() -> int:
     """Run the command line and return its exit code."""
+    gc.set_threshold(COLLECTED_AFTER)
     try:
         from loopcal.cli import main
 

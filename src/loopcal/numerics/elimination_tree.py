@@ -122,13 +122,13 @@ def connected_groups(links: IntArray, count: int) -> IntArray:
 
     `links` (k, 2) join items directly; items are in one group where links join them.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count))
-    member = connected_components(graph, directed=False)[1]
-    _, first, member = np.unique(member, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[member].astype(np.int64)
+    lowest = np.arange(count)  # of the items that are known to be in a group with this one
+    while (apart := lowest[links[:, 0]] != lowest[links[:, 1]]).any():
+        ends = lowest[links[apart]]
+        np.minimum.at(lowest, ends.max(axis=1), ends.min(axis=1))
+        while (lowest[lowest] != lowest).any():
+            lowest = lowest[lowest]
+    return np.unique(lowest, return_inverse=True)[1].astype(np.int64)
 
 
 def _components(chosen: BoolArray, pairs: IntArray) -> IntArray:

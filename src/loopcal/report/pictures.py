@@ -20,6 +20,9 @@ FORMATS = (".png", ".svg", ".pdf")
 DPI = 150
 """Resolution of a PNG picture."""
 
+POINTS = 72
+"""Units of an inch in an SVG picture."""
+
 PLACES = 4
 """Decimals of the position of axes, as a share of the figure."""
 
@@ -97,11 +100,13 @@ def render_figure(figure: Figure, ending: str) -> bytes:
 def render_svg_text(figure: Figure) -> bytes:
     """Return a figure as SVG whose texts stay text, in a font of the reader.
 
-    The layout is computed once: saving would compute it twice, and draw twice.
+    The layout is computed once, in the units of the picture, so that texts are measured once:
+    saving would compute it twice, and draw twice.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
+    figure.set_dpi(POINTS)
     if (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)
         figure.set_layout_engine("none")

@@ -48,7 +48,7 @@ def inline_figure(svg: bytes, name: str) -> str:
     name : prefix of all identifiers.
     """
     root = ElementTree.fromstring(escape(svg.decode("utf-8"), "\n\r\t"))
-    drawn = _copy(root, name)
+    drawn = _copy(root, name, {})
     for attribute in ("version", "height"):
         drawn.attrib.pop(attribute, None)
     drawn.set("stroke-linejoin", "round")
@@ -58,13 +58,22 @@ def inline_figure(svg: bytes, name: str) -> str:
     return ElementTree.tostring(drawn, encoding="unicode")
 
 
-def _copy(element: ElementTree.Element, name: str) -> ElementTree.Element:
-    """Return an element without namespaces, styles and what does not draw."""
+def _copy(
+    element: ElementTree.Element, name: str, styles: dict[str, dict[str, str]]
+) -> ElementTree.Element:
+    """Return an element without namespaces, styles and what does not draw.
+
+    Parameters
+    ----------
+    styles : the attributes of each style that occurred before; gets new ones.
+    """
     copied = ElementTree.Element(element.tag.rpartition("}")[2])
     for key, value in element.attrib.items():
         attribute = key.rpartition("}")[2]
         if attribute == "style":
-            copied.attrib |= _split_style(value, name)
+            if value not in styles:
+                styles[value] = _split_style(value, name)
+            copied.attrib |= styles[value]
         elif attribute == "id":
             copied.set("id", f"{name}-{value}")
         elif attribute == "href":
@@ -76,7 +85,7 @@ def _copy(element: ElementTree.Element, name: str) -> ElementTree.Element:
     copied.text, copied.tail = _word(element.text), _word(element.tail)
     for child in element:
         if isinstance(child.tag, str) and child.tag.rpartition("}")[2] in DRAWING:
-            copied.append(_copy(child, name))
+            copied.append(_copy(child, name, styles))
     return copied
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure  # noqa: TID253  # only functions that draw import this module
 
+from loopcal.report.figures.figure_layout import make_layout
 from loopcal.report.pictures import render_figure
 
 PIXELS = 96
@@ -22,4 +23,4 @@ class _NotebookFigure(Figure):
 
 def make_figure(width: float, height: float) -> Figure:
     """Return an empty figure of this size [inch]."""
-    return _NotebookFigure(figsize=(width, height), layout="constrained")
+    return _NotebookFigure(figsize=(width, height), layout=make_layout())

@@ -75,7 +75,7 @@ def label_axes(axes: Axes, x: str, y: str, title: str = "", grid: bool = True) -
     axes.set_xlabel(x, fontsize=LABEL)
     axes.set_ylabel(y, fontsize=LABEL)
     if title:
-        axes.set_title(title, fontsize=LABEL)
+        axes.set_title(title, fontsize=LABEL, y=1.0)  # else matplotlib looks for free space
     axes.tick_params(labelsize=SMALL)
     axes.set_axisbelow(True)
     if grid:
