@@ -23,7 +23,6 @@ version = release = loopcal.__version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx_click",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
     "tools.site_pages",
@@ -33,6 +32,7 @@ include_patterns = ["docs/**", "README.md", "ARCHITECTURE.md", "CHANGELOG.md", "
                     "SECURITY.md", "evidence/README.md", "examples/*/README.md"]  # fmt: skip
 exclude_patterns = [".*", "build", "dist", "runs", "src", "tests", "tools", "benchmarks",
                     "constraints", "docs/gallery", "docs/evidence"]  # fmt: skip
+smartquotes = False  # `--hold-out` keeps its hyphens
 default_role = "py:obj"  # names in single backticks, as the docstrings have them
 
 # --- Markdown
@@ -41,9 +41,14 @@ myst_links_external_new_tab = False
 
 # --- Python and commands
 autodoc_typehints = "signature"
+autodoc_type_aliases = {
+    name: name
+    for name in ("ArrayLike", "BoolArray", "Figure", "FloatArray", "IntArray", "Progress", "Rule")
+}
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
+add_module_names = False
 python_use_unqualified_type_names = True
 
 # --- gallery
@@ -64,6 +69,9 @@ sphinx_gallery_conf = {
 html_theme = "furo"
 html_title = "loopcal"
 html_copy_source = False
+html_show_search_summary = False  # a page from disk may not read others
+html_static_path = ["site/static"]
+html_css_files = ["site.css"]
 html_show_sphinx = False
-html_extra_path = ["site"]
+html_extra_path = ["site/index.html"]
 copybutton_exclude = ".linenos, .gp, .go"

@@ -7,12 +7,8 @@ Docstrings of loopcal are NumPy style with the description on the line of the na
 
 import re
 
-FIELDS = {
-    "Parameters": ":param {}:",
-    "Raises": ":raises {}:",
-    "Attributes": "``{}``",  # a list of definitions: a field would be linked by its name alone
-}
-"""From the heading of a section to what one of its entries begins with."""
+TERMS = {"Parameters": "``{}``", "Attributes": "``{}``", "Raises": ":py:exc:`{}`"}
+"""From the heading of a section of entries to the markup of the name of an entry."""
 
 ENTRY = re.compile(r"^([*\w][\w, *.]*?) : ?(.*)$")
 NEXT_ENTRY = re.compile(r"(?<=[.;\]]) (?=\w[\w, ]*? : )")
@@ -22,43 +18,34 @@ CODE = re.compile(r"(``.*?``|`[^`]*`|^ *>>> .*$)", re.DOTALL | re.MULTILINE)
 
 
 def convert_docstring(lines: list[str]) -> list[str]:
-    """Return the lines of a docstring in the markup of docutils."""
+    """Return the lines of a docstring in the markup of docutils: a heading, then definitions."""
     result: list[str] = []
     heading = ""
     for line, after in zip(lines, [*lines[1:], ""], strict=True):
         if UNDERLINE.match(after) and NAME.match(line):
             heading = line
-            result += start_section(heading)
+            result += [f".. rubric:: {heading}", ""]
         elif UNDERLINE.match(line):
             continue
-        elif heading in FIELDS:
-            result += convert_entries(line, FIELDS[heading])
-        elif heading == "Returns" and line:
-            result.append(f"    {line.strip()}")
+        elif heading in TERMS:
+            result += convert_entries(line, TERMS[heading])
         else:
             result.append(line)
     return escape_markup("\n".join(result)).split("\n")
 
 
-def start_section(heading: str) -> list[str]:
-    """Return the lines with which a section begins."""
-    if FIELDS.get(heading, "").startswith(":"):
-        return []
-    return [":returns:"] if heading == "Returns" else [f".. rubric:: {heading}", ""]
-
-
-def convert_entries(line: str, field: str) -> list[str]:
-    """Return the fields that a line of a section begins, or the line that continues one."""
-    if not line or line.startswith(" "):
-        return [line]
+def convert_entries(line: str, term: str) -> list[str]:
+    """Return the definitions that a line of a section begins, or the line that continues one."""
+    first, *others = NEXT_ENTRY.split(line)
+    if not first or first.startswith(" "):
+        return [first, *(text for part in others for text in convert_entries(part, term))]
     result = []
-    for part in NEXT_ENTRY.split(line):
+    for part in (first, *others):
         entry = ENTRY.match(part)
         if entry:
-            names = entry[1].replace(", ", ",")  # else the first is read as the type of the second
-            result += [field.format(names), f"    {entry[2]}"]
+            result += [term.format(entry[1]), f"    {entry[2]}"]
         elif NAME.match(part):
-            result.append(field.format(part))
+            result.append(term.format(part))
         else:
             result += ["", part, ""]
     return result
