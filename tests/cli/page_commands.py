@@ -3,8 +3,8 @@
 
 `run_page` executes a page from top to bottom in the present folder. Its conventions:
 
-* Each line of an `sh` block is a command of loopcal, with exit code 0 or with the one in its comment
-  (`# exit code 2`).
+* Each line of an `sh` block is a command of loopcal, with exit code 0 or with the one in its
+  comment (`# exit code 2`).
 * All `python` blocks share their names.
 * A `text` block below them has lines of what the commands and the code above it have printed, in
   this order; `...` stands for lines that are left out.
