@@ -9,6 +9,10 @@ N := 1000
 WORKERS := 1
 FUZZ := runs/fuzz.json
 export PYTHON
+# Python compiles loopcal and its tests once, not again in each process that a test starts.
+unexport PYTHONDONTWRITEBYTECODE
+# Tests of a file stay together, so that what they share is made once.
+PARALLEL := -n 2 --dist worksteal
 
 .PHONY: help demo test quick evidence docs site fuzz bench bench-update viewer check format constraints clean
 
@@ -19,10 +23,10 @@ demo: .venv/core.stamp  ## calibrate the shipped hexapod from its measurement fi
 	$(BIN)/loopcal calibrate $(ROBOT) $(DATA) -o runs/demo --hold-out 0.25 --force
 
 test: .venv/dev.stamp  ## every test except the full-size statistics
-	$(BIN)/pytest -n 2 -m "not evidence"
+	$(BIN)/pytest $(PARALLEL) -m "not evidence"
 
 quick: .venv/dev.stamp  ## the tests that together take under 30 s
-	$(BIN)/pytest -n 2 -m "quick or not (slow or evidence)"
+	$(BIN)/pytest $(PARALLEL) -m "quick or not (slow or evidence)"
 
 evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
 	$(BIN)/python -m tools.evidence
