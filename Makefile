@@ -38,8 +38,10 @@ docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evid
 	$(BIN)/python -m tools.findings_reference
 	$(BIN)/python -m tools.api_reference
 
-site: .venv/dev.stamp  ## build the documentation site into build/site (open build/site/index.html), warnings as errors
+site: .venv/dev.stamp  ## build the documentation site, build/site/index.html; warnings and wrong links are errors
+	rm -rf build/site
 	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
+	$(BIN)/python -m tools.check_site build/site --browser
 
 fuzz: .venv/dev.stamp  ## run N more random inputs through the command line (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
 	@mkdir -p $(dir $(FUZZ))
@@ -72,7 +74,7 @@ constraints: .venv/dev.stamp  ## regenerate constraints/python3.XX.txt for every
 	$(BIN)/python -m tools.constraints
 
 clean:  ## remove the environment and what the tools left behind
-	rm -rf .venv runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv runs build dist docs/generated .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 .venv/core.stamp: pyproject.toml $(wildcard constraints/*.txt)
 	@tools/setup.sh core

@@ -72,6 +72,7 @@ html_copy_source = False
 html_show_search_summary = False  # a page from disk may not read others
 html_static_path = ["site/static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_show_sphinx = False
 html_extra_path = ["site/index.html"]
 copybutton_exclude = ".linenos, .gp, .go"

@@ -11,8 +11,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 THEORY = ROOT / "docs" / "theory"
-PAGES = sorted(THEORY.glob("*.md"))
-TEXTS = {page: page.read_text("utf-8") for page in [*PAGES, ROOT / "docs" / "README.md"]}
+INDEX = THEORY / "README.md"
+PAGES = sorted(page for page in THEORY.glob("*.md") if page != INDEX)
+TEXTS = {page: page.read_text("utf-8") for page in [*PAGES, INDEX]}
 FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 EXAMPLE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -35,8 +36,7 @@ def test_every_theory_page_cited_by_code_exists() -> None:
 
 
 def test_every_theory_page_is_in_the_index() -> None:
-    index = TEXTS[ROOT / "docs" / "README.md"]
-    assert [page.name for page in PAGES if f"(theory/{page.name})" not in index] == []
+    assert [page.name for page in PAGES if f"({page.name})" not in TEXTS[INDEX]] == []
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
@@ -70,6 +70,8 @@ def test_examples_of_a_theory_page_give_the_printed_output(page: Path) -> None:
     source = "\n".join(EXAMPLE.findall(TEXTS[page]))
     example = doctest.DocTestParser().get_doctest(source, {}, page.name, str(page), 0)
     report: list[str] = []
-    failed, tried = doctest.DocTestRunner().run(example, out=report.append)
+    failed, tried = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(
+        example, out=report.append
+    )
     assert tried > 0
     assert failed == 0, "".join(report)

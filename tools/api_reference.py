@@ -27,9 +27,12 @@ SECTIONS = {
     "loopcal.estimate": "Estimation",
     "loopcal.diagnose": "Diagnosis",
     "loopcal.apply": "Use of a calibration",
+    "loopcal.sampling": "Resampling and posterior draws",
     "loopcal.planning": "Planning",
     "loopcal.studies.running": "Simulation studies",
     "loopcal.studies": "Parts of studies",
+    "loopcal.documents": "Documents",
+    "loopcal.progress_bar": "Notebooks",
     "loopcal.findings": "Findings",
     "loopcal.errors": "Errors",
 }
@@ -47,6 +50,8 @@ shapes, units and errors. This page is made from the code by `make docs`.
 
 def write_page() -> str:
     """Return the text of the page."""
+    if set(SECTIONS) != set(loopcal.PUBLIC_NAMES):
+        raise SystemExit(f"SECTIONS lacks {set(loopcal.PUBLIC_NAMES) - set(SECTIONS)}")
     sections = [HEAD]
     for package, heading in SECTIONS.items():
         rows = [(f"`{name}`", describe_name(name)) for name in list_names(package)]

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation site: its contents, its pages of the code, and the check of its links.
+
+`make site` builds it with warnings as errors and searches it in Chromium; nothing is built here.
+"""
+
+import inspect
+
+import click
+import pytest
+from docutils.core import publish_string
+
+import loopcal
+from loopcal.cli import command_line
+from tools import check_site, site_commands, site_docstrings, site_pages
+from tools.api_reference import SECTIONS
+
+INDEX = """\
+# Documentation
+
+| page | content |
+|---|---|
+| [one](one.md) | see also [two](two.md) |
+
+## Questions
+
+- [All questions](questions/README.md)
+
+## Gallery
+
+- [Examples](gallery/GALLERY_HEADER.rst)
+
+A paragraph that links [no page of its own](three.md).
+"""
+
+
+def read_source(page: str, text: str) -> str:
+    """Return the text that Sphinx reads for a page."""
+    source = [text]
+    site_pages.add_contents(None, page, source)
+    return source[0]
+
+
+def test_links_of_an_index_become_its_contents_in_their_order() -> None:
+    text = read_source("docs/README", INDEX)
+    contents = [block.split("```")[0].split() for block in text.split("```{toctree}")[1:]]
+    assert contents == [
+        [":hidden:", "one.md"],
+        [":hidden:", ":caption:", "Questions", "questions/README.md"],
+        [":hidden:", ":caption:", "Gallery", "generated/gallery/index.rst"],
+    ]
+
+
+def test_home_page_shows_the_questions_by_title(root) -> None:
+    text = read_source("docs/README", INDEX)
+    for page in (root / "docs" / "questions").glob("*.md"):
+        if page.stem != "README":
+            assert f"](questions/{page.name})" in text
+
+
+def test_page_that_is_no_index_stays_as_it_is() -> None:
+    assert read_source("docs/robots", INDEX) == INDEX
+
+
+def test_each_page_of_docs_is_in_an_index(root) -> None:
+    docs = root / "docs"
+    listed = set()
+    for index in docs.rglob("README.md"):
+        entries = site_pages.list_entries(index.read_text("utf-8"))
+        listed |= {(index.parent / entry).resolve() for entry in entries}
+    pages = {path for path in docs.rglob("*.md") if "generated" not in path.parts}
+    assert pages - listed == {docs / "README.md"}
+
+
+def test_each_public_name_has_a_page_and_a_link_to_it(root) -> None:
+    text = read_source("docs/api", (root / "docs" / "api.md").read_text("utf-8"))
+    for package in SECTIONS:
+        assert f"generated/api/{site_pages.name_page(package)}.rst" in text
+    for name in set(loopcal.__all__) - {"__version__"}:
+        assert f"{{py:obj}}`{name} <loopcal.{name}>`" in text
+
+
+def test_each_command_has_a_page_with_its_options() -> None:
+    pages = dict(site_commands.write_command_pages())
+    assert list(pages) == command_line.list_commands(click.Context(command_line))
+    assert ".. option:: --hold-out SHARE" in pages["calibrate"]
+    assert "   loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25" in (
+        pages["calibrate"].splitlines()
+    )
+    assert "loopcal study run\n-----------------\n" in pages["study"]
+
+
+DOCSTRING = """\
+Do it, with |z|^2 and `a*b`.
+
+Parameters
+----------
+target : (n, 4, 4) poses
+    in base. seed : of the draws.
+a, b : two *numbers*.
+
+Returns
+-------
+A sum; never an error.
+
+Raises
+------
+DataError
+    Too few.
+FileError : no file.
+"""
+
+
+def test_docstring_becomes_definitions() -> None:
+    lines = site_docstrings.convert_docstring(DOCSTRING.splitlines())
+    assert [line for line in lines if line] == [
+        r"Do it, with \|z\|^2 and `a*b`.",
+        ".. rubric:: Parameters",
+        "``target``",
+        "    (n, 4, 4) poses",
+        "    in base.",
+        "``seed``",
+        "    of the draws.",
+        "``a, b``",
+        r"    two \*numbers\*.",
+        ".. rubric:: Returns",
+        "A sum; never an error.",
+        ".. rubric:: Raises",
+        ":py:exc:`DataError`",
+        "    Too few.",
+        ":py:exc:`FileError`",
+        "    no file.",
+    ]
+
+
+@pytest.mark.parametrize("name", sorted(set(loopcal.__all__) - {"__version__", "KINDS"}))
+def test_docstring_of_a_public_name_is_valid_markup(name) -> None:
+    lines = site_docstrings.convert_docstring(
+        (inspect.getdoc(getattr(loopcal, name)) or "").split("\n")
+    )
+    text = ".. default-role:: literal\n\n" + "\n".join(lines).replace(":py:exc:", "")
+    settings = {"report_level": 2, "halt_level": 2}
+    assert publish_string(text, settings_overrides=settings)
+
+
+def write_site(folder, body: str):
+    """Write a site of two pages, and return its problems."""
+    (folder / "a.html").write_text(f"<html><body id='top'>{body}</body></html>")
+    (folder / "b.html").write_text("<p id='part'>text</p>")
+    pages = check_site.read_site(folder)
+    return list(check_site.list_problems(folder, pages))
+
+
+def test_links_that_lead_on_are_no_problem(tmp_path) -> None:
+    body = "<a href='b.html#part'></a><a href='#top'></a><a href='https://example.org'></a>"
+    assert write_site(tmp_path, body) == []
+
+
+@pytest.mark.parametrize(
+    ("body", "problem"),
+    [
+        ("<a href='c.html'>", "a.html: c.html leads to no file"),
+        ("<a href='b.html#other'>", "a.html: b.html#other leads to no anchor"),
+        ("<img src='b.png'>", "a.html: b.png leads to no file"),
+        (
+            "<script src='https://example.org/x.js'></script>",
+            "a.html: loads https://example.org/x.js from the network",
+        ),
+        ("<link href='//example.org/x.css'>", "a.html: loads //example.org/x.css from the network"),
+    ],
+)
+def test_wrong_link_is_reported(body, problem, tmp_path) -> None:
+    assert write_site(tmp_path, body) == [problem]
