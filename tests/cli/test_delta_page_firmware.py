@@ -12,6 +12,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli import main
+from loopcal.io.formats.probe_reports import read_reports
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_g30
 
 NOISE = 0.02
@@ -68,3 +69,24 @@ def test_commands_for_reprapfirmware_lead_to_a_recommendation(commands) -> None:
     words = ["calibrate", "printer.yaml", "heights.csv", "-o", "run", "--hold-out", "0.4"]
     assert main([*words, "--force"]) == 0
     check_recommendation(truth, "values.apply-held-out", 0.4e-3)
+
+
+def test_lines_of_the_page_probe_its_thirteen_points(root, tmp_path) -> None:
+    page = (root / "docs" / "delta-printers.md").read_text("utf-8")
+    section = page.split("### Thirteen points")[1].split("## What to type")[0]
+    marlin, reprap, klipper = re.findall(r"```text\n(.*?)```", section, re.DOTALL)
+    sent = re.findall(r"^G30 X(\S+) Y(\S+)$", marlin, re.MULTILINE)
+    options = klipper.split("points:")[1]
+    stored = re.findall(r"^ +(\S+), (\S+)$", options, re.MULTILINE)
+    for points in (sent, stored):
+        np.testing.assert_allclose(np.array(points, float), POINTS, atol=0.006)  # [mm]
+    heights = " ".join(["0.010", *["0.020"] * 12])
+    (tmp_path / "bed.g").write_text(reprap)
+    (tmp_path / "g32.txt").write_text(f"G32 bed probe heights: {heights}, mean 0.019")
+    read = read_reports([tmp_path / "g32.txt", tmp_path / "bed.g"], "reprap")
+    np.testing.assert_allclose([(p.x, p.y) for p in read], POINTS, atol=0.006)
+    assert reprap.strip().endswith(" S-1")
+    typed = page.split("## What to type")[1].split("\n## ")[0]
+    assert re.findall(r"^loopcal (.*)$", typed, re.MULTILINE) == [
+        f"export run --format {name}" for name in ("marlin", "reprap", "klipper")
+    ]

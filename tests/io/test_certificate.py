@@ -3,6 +3,7 @@
 
 import json
 import math
+import re
 from xml.etree import ElementTree
 
 import pytest
@@ -54,6 +55,29 @@ RULES = {
 }
 """Children of each element that is written, in the order of the schema."""
 
+TEXT = r"\S+(\s+\S+)*"
+NUMBER = r"[-+]?\d+(\.\d+)?([eE][-+]?\d+)?"
+DATE = r"\d{4}-\d\d-\d\d"
+VALUES = {
+    **dict.fromkeys(("release", "uniqueIdentifier", "norm", "model", "city", "street"), TEXT),
+    **dict.fromkeys(("postCode", "role", "eMail"), TEXT),
+    **dict.fromkeys(("countryCodeISO3166_1", "countryCode"), "[A-Z]{2}"),
+    **dict.fromkeys(("usedLangCodeISO639_1", "mandatoryLangCodeISO639_1"), "[a-z]{2}"),
+    **dict.fromkeys(("beginPerformanceDate", "endPerformanceDate", "issueDate"), DATE),
+    "performanceLocation": "laboratory|customer|laboratoryBranch|customerBranch|other",
+    "issuer": "manufacturer|calibrationLaboratory|customer|owner|other",
+    "mainSigner": "true|false",
+    "unit": r"\\metre|\\radian|\\one",
+    **dict.fromkeys(("valueExpandedMU", "coverageFactor"), NUMBER.removeprefix("[-+]?")),
+    "coverageProbability": r"0(\.\d+)?|1(\.0+)?",
+    "conformity": "pass|fail|conditionalPass|conditionalFail|noPass|noFail",
+}
+"""What the text of an element without children must match, as in the schema; `value` is text in an
+identification and a number in a quantity.
+"""
+ATTRIBUTES = {"digitalCalibrationCertificate": {"schemaVersion", "schemaLocation"}}
+"""Attributes that are written; no other element has any."""
+
 HOSTILE = '<script>alert("1")</script> & ]]> \N{SNOWMAN}'
 
 
@@ -70,13 +94,15 @@ def read_text(element: ElementTree.Element, path: str) -> str:
 def check_rules(element: ElementTree.Element) -> None:
     """Assert that an element and all below it follow the rules."""
     tag = element.tag.rpartition("}")[2]
+    names = {name.rpartition("}")[2] for name in element.attrib}
+    assert names == ATTRIBUTES.get(tag, set()), tag
     children = [child.tag.rpartition("}")[2] for child in element]
     if tag == "location":
         assert children
         return
     if tag not in RULES:
         assert not children, tag
-        assert (element.text or "").strip(), tag
+        check_value(tag, element.text or "")
         return
     left = list(children)
     for rule in RULES[tag].split():
@@ -89,6 +115,17 @@ def check_rules(element: ElementTree.Element) -> None:
     assert left == [], (tag, children)
     for child in element:
         check_rules(child)
+    for child in (element.find("dcc:value", NAMES), element.find("si:value", NAMES)):
+        if child is not None:
+            rule = NUMBER if tag == "real" else TEXT
+            assert re.fullmatch(rule, child.text or ""), (tag, child.text)
+
+
+def check_value(tag: str, text: str) -> None:
+    """Assert that the text of an element without children is one that the schema allows."""
+    assert text.strip(), tag
+    if tag in VALUES:
+        assert re.fullmatch(VALUES[tag], text), (tag, text)
 
 
 @pytest.fixture
@@ -109,6 +146,11 @@ def write_facts(folder, name="A", **changed):
         text = text.replace(old, new)
     (folder / "facts.yaml").write_text(text, "utf-8")
     return folder / "facts.yaml"
+
+
+@pytest.fixture
+def certificate(tmp_path, run) -> str:
+    return format_certificate(lc.load_run(run), load_administration(write_facts(tmp_path)))
 
 
 def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> None:
@@ -133,6 +175,28 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
         unit = r"\metre" if row["unit"] == "mm" else r"\radian"
         assert read_text(quantity, "si:real/si:unit") == unit
     assert read_text(root, ".//dcc:metaData/dcc:conformity") == "pass"
+
+
+@pytest.mark.parametrize(
+    ("element", "text"),
+    [
+        (".//dcc:uniqueIdentifier", " 2026"),
+        (".//dcc:coreData/dcc:issueDate", "31.01.2026"),
+        (".//dcc:coreData/dcc:usedLangCodeISO639_1", "EN"),
+        (".//si:real/si:value", "inf"),
+        (".//si:valueExpandedMU", "-1.0"),
+        (".//si:coverageProbability", "95"),
+        (".//dcc:metaData/dcc:conformity", "passed"),
+        (".//dcc:identification/dcc:issuer", "loopcal"),
+    ],
+)
+def test_rules_refuse_what_the_schema_refuses(tmp_path, certificate, element, text) -> None:
+    root = ElementTree.fromstring(certificate)
+    changed = root.find(element, NAMES)
+    assert changed is not None
+    changed.text = text
+    with pytest.raises(AssertionError):
+        check_rules(root)
 
 
 def test_characters_that_xml_cannot_hold_become_visible(tmp_path, run) -> None:

@@ -120,12 +120,13 @@ def test_p_value_of_a_gain_is_uniform_where_the_values_before_are_right(printer)
     change = SIGMA * rng.standard_normal((6, 1))
     p_values = []
     for noise in 7.0 * SIGMA * rng.standard_normal((2000, 6, 1)):  # sigma is wrong by a factor of 7
-        kinds = compute_kind_errors([observed], [noise], [noise - change])
-        p_values.append(kinds[-1].compute_gain_p_value(6))
+        errors = compute_kind_errors([observed], [noise], [noise - change])[-1]
+        p_values.append(errors.compute_gain_p_value(6))
     for level in (0.05, 0.5):
         share = np.mean(np.array(p_values) < level)
         assert share == pytest.approx(level, abs=4.0 * np.sqrt(level * (1.0 - level) / 2000))
-    assert np.isnan(kinds[-1].compute_gain_p_value(1))
+    nothing = compute_kind_errors([observed], [change], [change])[-1]
+    assert np.isnan(nothing.compute_gain_p_value(1))
 
 
 @pytest.mark.evidence
@@ -175,3 +176,16 @@ def test_values_that_held_out_poses_do_not_confirm_are_kept(printer) -> None:
     assert finding.code == "values.keep-not-confirmed"
     failed = recommend_values(Verdict.NOT_CALIBRATED, fitted.start, test, others)
     assert failed.code == "values.keep-not-calibrated"
+
+
+def test_next_step_asks_for_the_sign_of_heights_that_fit_with_either(root, printer) -> None:
+    folder = root / "examples" / "delta-printer"
+    data = lc.load_measurements(folder / "heights.csv", printer)
+    report = lc.calibrate(printer, data, lc.CalibrationOptions(hold_out=0.4))
+    assert "conventions.height-sign-undecided" in {f.code for f in report.findings}
+    assert report.recommendation.code == "values.apply"
+    assert report.next_step.code == "workflow.next-check-height-sign"
+    (rows,) = data.observations
+    touched = replace(data, observations=(replace(rows, measured=0.0 * rows.measured),))
+    report = lc.calibrate(printer, touched, lc.CalibrationOptions(hold_out=0.4))
+    assert "conventions.height-sign-undecided" not in {f.code for f in report.findings}

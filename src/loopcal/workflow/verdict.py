@@ -25,6 +25,9 @@ TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDE
 LIMIT_EXCEEDED = "gates.limit-exceeded"
 """Finding that an error is above a stated limit."""
 
+SIGN_UNDECIDED = "conventions.height-sign-undecided"
+"""Finding that heights fit with either sign: the wrong one leads to the wrong geometry."""
+
 NEXT_WITH_VALUES = {
     "values.keep-undecided": "workflow.next-state-noise",
     "values.keep-within-noise": "workflow.next-keep-values",
@@ -100,6 +103,9 @@ def choose_next_step(
     recommendation : code of the finding that recommends the identified or the current values.
     repeatability : its share of the variance of the expected error, by quantity.
     """
+    is_applied = verdict is not Verdict.NOT_CALIBRATED and recommendation.startswith("values.apply")
+    if is_applied and any(finding.code == SIGN_UNDECIDED for finding in findings):
+        return report_finding("workflow.next-check-height-sign")
     if verdict is Verdict.CALIBRATED:
         return report_finding(NEXT_WITH_VALUES.get(recommendation, "workflow.next-use-result"))
     wrong = [f.data["poses"] for f in findings if f.code == BLUNDERS[0]]

@@ -115,7 +115,7 @@ def read_config(path: Path) -> KlipperConfig:
     ------
     FileError : it is unreadable, its saved part was edited, or it is not that of a delta printer.
     """
-    cfg = parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
+    cfg = parse_config_file(path)
     is_stated = cfg.has("printer", "kinematics")
     kinematics = cfg.text("printer", "kinematics") if is_stated else ""
     sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
@@ -239,10 +239,28 @@ def write(source: ExportSource, into: Path | None) -> Exported:
                 defaults[section, option] = values[0]
     if into is not None:
         return read_config(into).export(into, wanted, defaults)
-    new = parse_config((), Path("printer.cfg"))
     if source.is_for_people:
-        wanted = shorten_numbers(wanted, DECIMALS)
+        return _list_options(shorten_numbers(wanted, DECIMALS))
+    new = parse_config((), Path("printer.cfg"))
     return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
+
+
+def _list_options(wanted: Mapping[Name, float | str]) -> Exported:
+    """Return options for people: they change them where they are, because an option of the main
+    part would hide one of a pasted block.
+    """
+    lines: list[str] = []
+    for (section, option), text in wanted.items():
+        header = f"[{section}]"
+        lines += [header] if header not in lines else []
+        lines.append(f"{option}: {text}")
+    content = "\n".join(lines) + "\n"
+    return Exported(content, parse_config_file, (report_finding("files.options-to-change"),))
+
+
+def parse_config_file(path: Path) -> KlipperConfig:
+    """Return the options of a file."""
+    return parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
 
 
 def _parse_probes(cfg: KlipperConfig) -> _Probes:
