@@ -102,3 +102,20 @@ def test_existing_file_is_replaced_only_with_force(tmp_path, capsys) -> None:
 def test_unknown_family_is_refused(capsys) -> None:
     assert main(["new", "hexpod", "-o", "mine.yaml"]) == 1
     assert "neither a family nor a shipped robot" in capsys.readouterr().err
+
+
+def test_template_of_a_tracker_declares_unknown_frame_and_targets(tmp_path, capsys) -> None:
+    words = "new gough -o my.yaml --measurements tracker.csv --kind position --frames base"
+    assert main([*words.split(), "--targets", "SMR1,SMR2,SMR3", "--sigma-position", "15um"]) == 0
+    text = (tmp_path / "tracker.csv").read_text()
+    assert "# targets: [SMR1, SMR2, SMR3]\n# places: [[160 mm, 0 mm, 0 mm], [-80 mm" in text
+    assert '# unknown: [frame, targets]\n# noise: {"*": 15 um}\npose,q1 [mm]' in text
+    assert ",SMR3.x [mm],SMR3.y [mm],SMR3.z [mm]\n" in text
+    assert "# Replace the places of the targets above by yours" in text
+    assert main(["new", "gough", "-o", "other.yaml", "--kind", "pose", "--targets", "SMR1"]) == 1
+    assert "the kind 'pose' measures no targets" in capsys.readouterr().err
+    assert (
+        main("new gough -o other.yaml --kind position --frames tracker".split()) == 1  # noqa: SIM905
+    )
+    assert "'tracker' is not a frame that can be unknown" in capsys.readouterr().err
+    assert not (tmp_path / "other.yaml").exists()

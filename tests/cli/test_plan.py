@@ -372,3 +372,11 @@ def test_column_use_is_checked_and_excludes_hold_out(folder, capsys):
     (folder / "all.csv").write_text(text.replace(",fit,", ",held-out,"))
     assert run("calibrate linear-delta all.csv -o run") == 1
     assert "leave some to fit" in capsys.readouterr().err
+
+
+def test_plan_takes_the_instrument_from_a_file_without_rows(folder) -> None:
+    words = "new linear-delta -o p.yaml --measurements t.csv --kind position --frames base"
+    assert run(words) == 0
+    words = "plan p.yaml -o plan --like t.csv --poses 6 --hold-out 0 --candidates 40"
+    assert run(f"{words} --stroke-margin 5mm") == 0
+    assert "# unknown: [frame]" in (folder / "plan" / "measurements.csv").read_text()

@@ -68,6 +68,10 @@ COMMANDS = {
     "io/exports/conversion.py:save_conversion": (
         "import spheres.csv --profile spheres.yaml -o F.csv",
     ),
+    "io/exports/sheet_filling.py:save_filled_sheet": (
+        "fill five-bar sheet.csv spheres.csv --profile spheres.yaml --allow-implausible -o F.csv",
+    ),
+    "cli/commands/sheet_commands.py:gcode": ("gcode linear-delta stops.csv -o F.ngc",),
     "io/runs/draws_file.py:save_draws": (
         "bootstrap run --count 5 -o F.csv",
         "sample run --count 100 -o F.csv",
@@ -190,6 +194,11 @@ def inputs(tmp_path_factory, root) -> Path:
     for name in ("spheres.csv", "spheres.yaml"):
         shutil.copy(root / "examples" / "exports" / f"cmm-{name}", folder / name)
     (folder / "targets.csv").write_text("pose,x [mm],y [mm]\na,0,330\nb,10,320\n")
+    (folder / "stops.csv").write_text("step,pose,use,x [mm],y [mm],z [mm]\n1,1,fit,10,5,100\n")
+    rows = "".join(f"{i},{90 + 5 * i},{60 + 3 * i},,,\n" for i in range(1, 9))
+    header = "# kind: position\n# noise: {x: 1 um, y: 1 um, z: 1 um}\n"
+    columns = "pose,left [deg],right [deg],x [mm],y [mm],z [mm]\n"
+    (folder / "sheet.csv").write_text(header + columns + rows)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for command in (

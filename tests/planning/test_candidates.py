@@ -130,3 +130,35 @@ def test_listed_poses_outside_the_limits_are_excluded_with_the_reason():
 def test_invalid_constraints_are_refused(make, said):
     with pytest.raises(DataError, match=said):
         make()
+
+
+def test_stroke_margin_holds_at_poses_and_on_paths() -> None:
+    robot = load_robot("five-bar")
+    margin = np.radians(60.0)
+    free = draw_candidates(robot, Constraints(), 60)
+    kept = draw_candidates(robot, Constraints(stroke_margin_angle=margin), 60)
+    low, high = np.array([a.stroke for a in robot.actuators]).T
+
+    def measure(candidates) -> float:
+        q = candidates.solution.q
+        return float(np.minimum(q - low, high - q).min())
+
+    assert measure(free) < margin <= measure(kept) + 1e-12  # [rad], rounding
+
+
+@pytest.mark.parametrize(
+    ("margin", "words"),
+    [
+        ({"stroke_margin": 0.01}, "no actuator of five-bar of dimension length has a stroke"),
+        ({"stroke_margin_angle": 1.6}, "twice the margin of 91.7 deg .* stroke of left, 180 deg"),
+    ],
+)
+def test_impossible_stroke_margin_is_refused(margin, words) -> None:
+    with pytest.raises(DataError, match=words):
+        draw_candidates(load_robot("five-bar"), Constraints(**margin), 10)
+
+
+@pytest.mark.parametrize("margin", [-1.0, np.inf, np.nan])
+def test_stroke_margin_is_a_finite_number(margin) -> None:
+    with pytest.raises(DataError, match="margin from the ends of strokes"):
+        Constraints(stroke_margin=margin)

@@ -39,6 +39,8 @@ SECTIONS = {
     "Prepare measurements": {
         "identifiability": "Show which parameters measurements determine.",
         "plan": "Plan which poses to measure, and write a sheet for them.",
+        "gcode": "Write a program that moves a machine to the poses of a plan.",
+        "fill": "Fill in the sheet of a plan from the export of an instrument.",
         "simulate": "Write a measurement file of a simulated machine.",
     },
     "Calibrate": {
@@ -76,6 +78,7 @@ MODULES = {
     "exchange_commands": ("import", "export"),
     "measurement_commands": ("identifiability", "simulate"),
     "plan_command": ("plan",),
+    "sheet_commands": ("gcode", "fill"),
     "certificate_command": ("certificate",),
     "repeatability_command": ("repeatability",),
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),

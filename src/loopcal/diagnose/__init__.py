@@ -54,6 +54,7 @@ from loopcal.diagnose.parameter_subset import IdentifiableSubset as Identifiable
 from loopcal.diagnose.parameter_subset import (
     choose_identifiable_subset as choose_identifiable_subset,
 )
+from loopcal.diagnose.point_findings import examine_points as examine_points
 from loopcal.diagnose.prediction_errors import PosePredictions as PosePredictions
 from loopcal.diagnose.prediction_errors import PredictionComparison as PredictionComparison
 from loopcal.diagnose.prediction_errors import compare_predictions as compare_predictions

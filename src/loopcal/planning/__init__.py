@@ -10,3 +10,4 @@ from loopcal.planning.plane_line_planning import SurfacePlan as SurfacePlan
 from loopcal.planning.plane_line_planning import plan_surfaces as plan_surfaces
 from loopcal.planning.pose_planning import plan as plan
 from loopcal.planning.result import Plan as Plan
+from loopcal.planning.route import check_route as check_route

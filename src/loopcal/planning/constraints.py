@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from loopcal.argument_types import check_fields
 from loopcal.errors import DataError
+from loopcal.findings import report_finding
 from loopcal.mechanism import (
     NEAR_SHARE,
     Mechanism,
@@ -26,6 +27,7 @@ from loopcal.mechanism import (
     evaluate_limits,
 )
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
 
 ROUNDING = 1e-12
 """Share of a bound by which it may be exceeded: the rounding of its own number."""
@@ -105,16 +107,21 @@ class Constraints:
     max_tilt : largest angle between the z axis of the platform and that of the base [rad]; also
         required on paths.
     sight : line of sight to the target, required at each pose.
+    stroke_margin, stroke_margin_angle : smallest distance of each reading from both ends of its
+        stroke, of actuators that move a length [m] and of those that turn [rad]; also required on
+        paths.
 
     Raises
     ------
     DataError
-        The margin or the tilt is out of range.
+        A margin or the tilt is out of range.
     """
 
     min_margin: float = NEAR_SHARE
     max_tilt: float | None = None
     sight: LineOfSight | None = None
+    stroke_margin: float = 0.0
+    stroke_margin_angle: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -128,6 +135,16 @@ class Constraints:
                 f"the largest tilt is {np.degrees(self.max_tilt):g} deg; give an angle above 0, at "
                 "most 180 deg"
             )
+        for margin, unit in ((self.stroke_margin, "m"), (self.stroke_margin_angle, "rad")):
+            if not 0.0 <= margin < np.inf:
+                raise DataError(
+                    f"the margin from the ends of strokes is {margin:g} {unit}; give a finite "
+                    "number, 0 or more"
+                )
+
+    def stroke_margin_of(self, dimension: Dimension) -> float:
+        """Return the margin from the ends of a stroke of this dimension [m or rad]."""
+        return self.stroke_margin_angle if dimension is Dimension.ANGLE else self.stroke_margin
 
 
 @dataclass(frozen=True)
@@ -202,6 +219,13 @@ class ConstraintChecker:
                 Violation("limit-exceeded", (("limit", limit.name),)),
                 ~(limit.margin[0] >= -slack),
             )
+            needed = required.stroke_margin_of(limit.dimension) if limit.is_stroke else 0.0
+            if needed > 0.0:
+                shown = robot.to_quantity(needed, limit.dimension)
+                yield (
+                    Violation("near-stroke-end", (("limit", limit.name), ("needed", str(shown)))),
+                    ~(limit.margin[0] >= needed - slack),
+                )
         near = analyze_singularity(robot, solution, self.medians)
         yield Violation("other-mode"), ~solution.converged
         margin = required.min_margin
@@ -224,7 +248,36 @@ class ConstraintChecker:
 
 def build_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
     """Return the checker of a robot's poses; None stands for the default constraints."""
-    return ConstraintChecker(robot, constraints or Constraints(), compute_median_margins(robot))
+    required = constraints or Constraints()
+    _check_stroke_margins(robot, required)
+    return ConstraintChecker(robot, required, compute_median_margins(robot))
+
+
+def _check_stroke_margins(robot: Mechanism, constraints: Constraints) -> None:
+    """Raise DataError for a margin without a stroke, or as large as half of one."""
+    for dimension in (Dimension.LENGTH, Dimension.ANGLE):
+        margin = constraints.stroke_margin_of(dimension)
+        if not margin > 0.0:
+            continue
+        strokes = {
+            a.name: a.stroke[1] - a.stroke[0]
+            for a in robot.actuators
+            if a.dimension is dimension and a.stroke is not None
+        }
+        if not strokes:
+            raise DataError(
+                report_finding("plan.no-stroke", robot=robot.name, dimension=dimension.value)
+            )
+        name = min(strokes, key=strokes.__getitem__)
+        if not 2.0 * margin < strokes[name]:
+            raise DataError(
+                report_finding(
+                    "plan.margin-exceeds-stroke",
+                    actuator=name,
+                    margin=robot.to_quantity(margin, dimension),
+                    stroke=robot.to_quantity(strokes[name], dimension),
+                )
+            )
 
 
 def list_reasons(counts: Mapping[Violation, int]) -> tuple[dict[str, Any], ...]:

@@ -12,8 +12,10 @@ import numpy as np
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure import KINDS, Gaussian, Instrument, Noise, Sensor, Uniform
+from loopcal.measure.kinds.points.target_kind import TargetKind
+from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
+from loopcal.units import Dimension, find_unit
 
 FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
 """A frame that may be unknown -> the names that kinds have for it."""
@@ -35,6 +37,7 @@ class InstrumentDescription:
         measures. orientation : form of measured angles; None for the default of the kind.
     sigma_position, sigma_angle : standard deviations of each length [m] and angle [rad].
     unknown_frames : of "base" (the frame of the instrument in the base) and "tool".
+    targets : names of targets on the platform whose places are unknown; none leaves the tool.
     distribution : of simulated noise, one of DISTRIBUTIONS; both have the stated standard
         deviations. Uniform noise lies within sqrt(3) of them.
     """
@@ -45,6 +48,7 @@ class InstrumentDescription:
     sigma_position: float = 1e-5
     sigma_angle: float = 5e-5
     unknown_frames: Sequence[str] = ()
+    targets: Sequence[str] = ()
     distribution: str = "normal"
 
 
@@ -63,9 +67,11 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
         _check_kind(name, description.kinds[:i])
         fields = _setting_names(name)
         kind: Any = KINDS[name](**{k: v for k, v in settings.items() if k in fields})
-        noise = np.array([sigma[column.dimension] for column in kind.noise_columns])
         if description.unknown_frames:
             kind = replace(kind, unknown=_name_unknown_frames(description.unknown_frames, kind))
+        if description.targets:
+            kind = _add_targets(kind, description.targets)
+        noise = np.array([sigma[column.dimension] for column in kind.noise_columns])
         sensors.append(Sensor(kind, DISTRIBUTIONS[description.distribution](noise)))
     for setting in settings:
         if not any(setting in _setting_names(name) for name in description.kinds):
@@ -112,3 +118,36 @@ def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]
             )
         names.append(names_of_frame[0])
     return tuple(names)
+
+
+def _add_targets(kind: Any, targets: Sequence[str]) -> Any:
+    """Return a kind with these targets, whose places are unknown."""
+    if not isinstance(kind, TargetKind):
+        able = ", ".join(name for name, known in KINDS.items() if issubclass(known, TargetKind))
+        raise DataError(
+            f"the kind {kind.name!r} measures no targets; leave out the targets, or choose one of "
+            f"{able}"
+        )
+    unknown = tuple(dict.fromkeys((*kind.unknown, "targets")))
+    return replace(kind, targets=tuple(targets), unknown=unknown)
+
+
+def place_targets(instrument: Instrument, robot: Mechanism) -> Instrument:
+    """Return the instrument with assumed places of unknown targets that state none.
+
+    Several targets are evenly on a circle around the tool, in the xy plane of the platform; its
+    radius is half of the robot's size, to two digits in the robot's unit of length. One target is
+    at the tool.
+    """
+    unit = find_unit(robot.units[Dimension.LENGTH]).factor_to_si
+    radius = float(f"{robot.size / 2.0 / unit:.2g}")
+    sensors = []
+    for sensor in instrument.sensors:
+        kind = sensor.kind
+        if isinstance(kind, TargetKind) and "targets" in kind.unknown and len(kind.targets) > 1:
+            angles = 2.0 * np.pi * np.arange(len(kind.targets)) / len(kind.targets)
+            circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+            places = np.round(radius * circle, 1 if radius < 100.0 else 0) * unit
+            kind = kind if kind.has_tool else replace(kind, places=places + robot.tool[:3, 3])
+        sensors.append(replace(sensor, kind=kind))
+    return Instrument(tuple(sensors))

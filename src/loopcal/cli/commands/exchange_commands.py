@@ -12,18 +12,21 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
+from loopcal.cli.commands.sheet_commands import convert_instrument_export
 from loopcal.cli.hints import hint_for
 from loopcal.cli.options.shared_options import (
     FILE,
     LENGTH,
     POSITIVE_LENGTH,
     add_options,
+    decimal_option,
     file_option,
     force_option,
     format_option,
     json_option,
     name_option,
     print_convention_note,
+    profile_option,
     read_measurements,
     refuse_given,
 )
@@ -39,22 +42,22 @@ if TYPE_CHECKING:
 
 READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
 WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
+CORRECTED_ALONE = (
+    "--corrected calibrates with the measurements in the file; state where to write them, such as "
+    "--data data.csv"
+)
 TAPED = (
     "lengths measured by hand, which become prior knowledge: lines at the origin (hangprinter), "
     "arms (klipper, marlin, reprap), joint centers (linuxcnc)"
 )
 """What the option --sigma-tape is for."""
 
-SHOWN = 20
-"""Lines that do not match a profile that are listed."""
-
 
 @click.command("import")
 @click.argument("file", metavar="FILE", type=FILE)
 @format_option(READ_FORMATS, "Format of FILE; by default chosen by the ending of its name.")
-@file_option(
-    "--profile", help="Instead of --format: how to read FILE, the export of an instrument."
-)
+@profile_option("Instead of --format: how to read FILE, the export of an instrument.")
+@decimal_option
 @file_option(
     "-o",
     "--output",
@@ -91,7 +94,7 @@ SHOWN = 20
     "--unit",
     "length_unit",
     type=click.Choice(list_symbols(Dimension.LENGTH)),
-    help="Unit of lengths (linuxcnc).",
+    help="Unit of lengths (linuxcnc; with --profile, in place of the one it states).",
 )
 @click.option("--home-z", "home_height", type=LENGTH, help="Height of the home pose (linuxcnc).")
 @file_option(
@@ -107,7 +110,8 @@ SHOWN = 20
 def import_(
     file: Path,
     format_name: str | None,
-    profile: Path | None,
+    profile: str | None,
+    decimal: str | None,
     output: Path,
     data: Path | None,
     corrected: Path | None,
@@ -131,6 +135,7 @@ def import_(
       loopcal import config-override.g --format reprap -o printer.yaml
       loopcal import m503.txt --format marlin --probes g30.txt -o printer.yaml --data heights.csv
       loopcal import export.txt --profile tracker.yaml -o measurements.csv
+      loopcal import export.txt --profile spatial-analyzer --unit in -o measurements.csv
       loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
@@ -142,15 +147,13 @@ def import_(
     from loopcal.report.calibration_view import with_hint
 
     if profile is not None:
-        _convert_export(file, profile, output, force, as_json)
-        return 0
+        local = (settings["length_unit"], decimal == "comma")
+        return convert_instrument_export(file, profile, local, output, force, as_json)
+    refuse_given(("decimal",), "without --profile")
     source = choose_format(file, format_name)
     read = _find_reader(source)
     if corrected is not None and data is None:
-        raise DataError(
-            "--corrected calibrates with the measurements in the file; state where to write them, "
-            "such as --data data.csv"
-        )
+        raise DataError(CORRECTED_ALONE)
     beside = file.with_suffix(".yaml") if source.name == "urdf" else None
     inputs = (file, settings["closures"] or beside, *settings["probes"])
     refuse_outputs((output, data), inputs, force)
@@ -190,47 +193,6 @@ def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
             "docs/exports.md)"
         )
     return source.read
-
-
-def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_json: bool) -> None:
-    """Write the measurements of an export; report lines that were skipped or do not match."""
-    from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.exports import convert_export, read_profile, save_conversion
-    from loopcal.report.calibration_view import with_hint
-
-    used = {"file", "profile", "output", "force", "as_json"}
-    names = (option.name or "" for option in click.get_current_context().command.params)
-    refuse_given(
-        (name for name in names if name not in used),
-        "with --profile, which states how the file is read",
-    )
-    refuse_outputs((output,), (file, profile), force)
-    converted = convert_export(file, read_profile(profile))
-    save_conversion(converted, output)
-    if as_json:
-        misfits = [{"line": line, "reason": reason} for line, reason in converted.misfits]
-        document = {
-            "measurements": output,
-            "rows": converted.rows,
-            "passed": converted.passed,
-            "misfits": misfits,
-            "notes": [str(finding) for finding in converted.findings],
-            "findings": converted.findings,
-        }
-        terminal.print_json(document)
-        return
-    page = [
-        f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
-        *(f"note: {with_hint(finding, hint_for)}" for finding in converted.findings),
-        *(
-            f"note: {file}:{line} does not match: {reason}"
-            for line, reason in converted.misfits[:SHOWN]
-        ),
-    ]
-    more = len(converted.misfits) - SHOWN
-    if more > 0:
-        page.append(f"note: {more} more lines do not match; {output} lists them")
-    terminal.print_page(page)
 
 
 def _make_import_options(source: Format, name: str, settings: dict[str, Any]) -> ImportOptions:

@@ -34,6 +34,7 @@ from loopcal.cli.options.shared_options import (
     is_given,
     json_option,
     leave_out_held_out,
+    name_option,
     read_checked_measurements,
     refuse_given,
     robot_argument,
@@ -145,7 +146,7 @@ def identifiability(
             drawn = [_name_drawn_poses(machine, draw, seed)]
         measurements = predict_noise_free(
             machine,
-            make_instrument(options),
+            make_instrument(options, machine),
             **_read_poses(poses, draw, machine),
             reading_sigma=parse_reading_sigma(sigma_reading, machine),
             seed=seed,
@@ -182,11 +183,11 @@ def _refuse_beside_data(poses: Path | None) -> None:
     """Refuse options that describe measurements where data do."""
     if poses is not None:
         raise DataError("DATA and --poses exclude each other; give one of the two")
-    for name in ("measure", "frames"):
+    for name in ("measure", "frames", "targets"):
         if is_given(name):
             raise DataError(
-                "DATA states what is measured and what is unknown; leave out --measure and "
-                "--frames, or DATA"
+                "DATA states what is measured and what is unknown; leave out "
+                f"{name_option(name)}, or DATA"
             )
     if is_given("sigma_reading"):
         raise DataError(
@@ -320,7 +321,7 @@ def _fill_in(
     from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(
-        ("poses", "draw", *DESCRIPTION[2:], "distribution", "sigma_reading"),
+        ("poses", "draw", *DESCRIPTION[3:], "distribution", "sigma_reading"),
         f"because --fill {sheet} states poses and instrument",
     )
     instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}

@@ -57,6 +57,7 @@ EXCLUDED_BY_PLANE_LINE = {
     "hold_out": "where every point is fitted",
     "measured": "which plans without earlier measurements",
     "frames": "whose surfaces are unknown in every group",
+    "targets": "which checks the tool",
 }
 """Options that have no effect with --measure plane-line, and why."""
 
@@ -195,7 +196,7 @@ def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, 
     from loopcal.io.data.measurement_file import load_instrument_to_plan
 
     if like is None:
-        return make_instrument(options)
+        return make_instrument(options, robot)
     for name in DESCRIPTION:
         if is_given(name):
             raise DataError(

@@ -11,7 +11,11 @@ from typing import Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.options.instrument_options import instrument_options, make_instrument
+from loopcal.cli.options.instrument_options import (
+    instrument_options,
+    make_instrument,
+    unknown_options,
+)
 from loopcal.cli.options.shared_options import (
     file_option,
     flag_option,
@@ -25,6 +29,7 @@ from loopcal.cli.options.shared_options import (
 @click.argument("family", metavar="FAMILY")
 @file_option("-o", "--output", help="Robot file to write; the robot gets its name.", required=True)
 @file_option("--measurements", help="Also write a measurement file with columns but no rows.")
+@unknown_options
 @instrument_options
 @force_option("an output file")
 @json_option
@@ -42,6 +47,8 @@ def new(
       loopcal new gough -o my-hexapod.yaml --measurements tracker.csv
       loopcal new linear-delta -o printer.yaml --measurements heights.csv \\
           --kind component --components z
+      loopcal new gough -o my-hexapod.yaml --measurements tracker.csv \\
+          --kind position --targets SMR1,SMR2,SMR3 --frames base --sigma-position 15um
     """  # noqa: D301
     from loopcal.io.core.csv_table import refuse_settings_beside
     from loopcal.io.core.names import make_name
@@ -53,10 +60,11 @@ def new(
     from loopcal.io.robot.derived_robots import format_new_robot
     from loopcal.io.robot.robot_file import build_robot, write_robot
 
-    instrument = make_instrument(options)
+    make_instrument(options)  # refuses wrong options before anything is written
     refuse_outputs((output, measurements), (), force)
     robot_text = format_new_robot(family, make_name(output.stem))
     robot = build_robot(parse_yaml(robot_text, output, "robot file"))
+    instrument = make_instrument(options, robot)
     template = format_template(robot, instrument)
     if measurements is not None:
         refuse_settings_beside(measurements)

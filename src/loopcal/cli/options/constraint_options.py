@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Goal(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
-    """An accuracy with its unit: a length for positions, an angle for orientations."""
+    """A length or an angle with its unit: of positions ("position") or of orientations."""
 
     name = "quantity"
 
@@ -44,6 +44,12 @@ constraint_options = add_options(
         type=float,
         default=0.1,
         help="Smallest distance from a singularity, as a share of the median of the workspace.",
+    ),
+    click.option(
+        "--stroke-margin",
+        type=Goal(),
+        help="Distance of all readings from both ends of their strokes, such as 5mm; 2deg for "
+        "actuators that turn.",
     ),
     click.option("--max-tilt", type=ANGLE, help="Largest tilt of the platform, such as 20deg."),
     click.option(
@@ -80,6 +86,8 @@ def make_constraints(options: Mapping[str, Any]) -> Constraints:
     """Return the constraints of the library from those of `constraint_options`."""
     from loopcal.planning import Constraints, LineOfSight
 
+    margin, measured = options["stroke_margin"] or (0.0, "position")
+    margins = {"stroke_margin" if measured == "position" else "stroke_margin_angle": margin}
     if options["seen_from"] is None:
         for name in ("facing", "cone", "nearest", "farthest"):
             if is_given(name):
@@ -87,7 +95,7 @@ def make_constraints(options: Mapping[str, Any]) -> Constraints:
                     f"--{name} belongs to a line of sight; state the position of the instrument "
                     "with --seen-from"
                 )
-        return Constraints(options["min_margin"], options["max_tilt"])
+        return Constraints(options["min_margin"], options["max_tilt"], None, **margins)
     sight = LineOfSight(
         _parse_three(options["seen_from"], "--seen-from", Dimension.LENGTH),
         _parse_three(options["facing"], "--facing", None),
@@ -95,7 +103,7 @@ def make_constraints(options: Mapping[str, Any]) -> Constraints:
         options["nearest"],
         math.inf if options["farthest"] is None else options["farthest"],
     )
-    return Constraints(options["min_margin"], options["max_tilt"], sight)
+    return Constraints(options["min_margin"], options["max_tilt"], sight, **margins)
 
 
 def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatArray:

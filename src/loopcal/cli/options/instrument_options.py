@@ -24,6 +24,7 @@ TILT = {"phi", "theta", "psi"}
 DESCRIPTION = (
     "measure",
     "frames",
+    "targets",
     "kind",
     "components",
     "orientation",
@@ -76,8 +77,14 @@ unknown_options = add_options(
         metavar="NAMES",
         help="Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
     ),
+    click.option(
+        "--targets",
+        metavar="NAMES",
+        help="Targets at unknown places on the platform, of a kind such as position: "
+        "SMR1,SMR2,SMR3.",
+    ),
 )
-"""Decorator for the short form of components, and for the unknown frames of an instrument."""
+"""Decorator for the short form of components, and for unknown frames and targets."""
 
 draw_option = click.option(
     "--draw",
@@ -104,15 +111,21 @@ sigma_reading_option = click.option(
 )
 
 
-def make_instrument(options: Mapping[str, Any]) -> Instrument:
+def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) -> Instrument:
     """Return the instrument of `instrument_options`, and of `unknown_options` if there are any.
+
+    `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
 
     Raises
     ------
     DataError
         Options that contradict each other, or an unknown kind, frame or component.
     """
-    from loopcal.workflow.instrument_description import InstrumentDescription, build_instrument
+    from loopcal.workflow.instrument_description import (
+        InstrumentDescription,
+        build_instrument,
+        place_targets,
+    )
 
     kind, components = options["kind"], options["components"]
     orientation, measure = options["orientation"], options.get("measure")
@@ -124,8 +137,8 @@ def make_instrument(options: Mapping[str, Any]) -> Instrument:
         kind, components = "component", measure
         if orientation is None and TILT & set(measure.split(",")):
             orientation = "tilt-torsion"
-    frames = options.get("frames")
-    return build_instrument(
+    frames, targets = options.get("frames"), options.get("targets")
+    instrument = build_instrument(
         InstrumentDescription(
             kinds=tuple(kind.split(",")),
             components=tuple(components.split(",")) if components else (),
@@ -133,9 +146,11 @@ def make_instrument(options: Mapping[str, Any]) -> Instrument:
             sigma_position=options["sigma_position"],
             sigma_angle=options["sigma_angle"],
             unknown_frames=tuple(frames.split(",")) if frames is not None else (),
+            targets=tuple(targets.split(",")) if targets is not None else (),
             distribution=options.get("distribution", "normal"),
         )
     )
+    return instrument if robot is None else place_targets(instrument, robot)
 
 
 def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None:

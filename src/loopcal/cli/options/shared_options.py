@@ -143,6 +143,29 @@ def flag_option(*names: str, help: str) -> Decorator:  # noqa: A002
     return click.option(*names, is_flag=True, help=help)
 
 
+SHIPPED_PROFILES = ("faro", "leica", "spatial-analyzer")
+"""Profiles that come with loopcal."""
+
+
+def profile_option(help_text: str, *, required: bool = False) -> Decorator:
+    """Return the option for the profile of an export: a file, or the name of a shipped one."""
+    names = ", ".join(SHIPPED_PROFILES)
+    return click.option(
+        "--profile",
+        metavar="FILE|NAME",
+        required=required,
+        help=f"{help_text} A file (docs/exports.md), or one of {names}.",
+    )
+
+
+decimal_option = click.option(
+    "--decimal",
+    type=click.Choice(("point", "comma")),
+    help="Decimal mark of the export; with comma, semicolons separate columns in place of commas.  "
+    "[default: as the profile states]",
+)
+
+
 def force_option(what: str, more: str = "") -> Decorator:
     """Return the option that lets a command replace what exists, and `more`."""
     return flag_option(

@@ -39,6 +39,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "sampling": ("sampling",),
     "studies": ("study",),
     "plan": ("plan",),
+    "sheets": ("sheet",),
     "study_folders": ("store", "workers"),
     "engine": ("engine",),
     "files": ("files",),

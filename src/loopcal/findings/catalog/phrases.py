@@ -28,7 +28,6 @@ MOST_ALTERNATIVES = 4
 
 SHOWN_REASONS = 3
 """Violated constraints that a sentence lists, most frequent first."""
-
 EQUAL = 1e-6
 """Relative difference up to which two changes are equal."""
 
@@ -69,6 +68,7 @@ TRIED: Mapping[str, str] = {
 CONSTRAINTS = {
     "loops-open": "the loops cannot be closed",
     "limit-exceeded": "{limit} exceeded",
+    "near-stroke-end": "less than {needed} from the end of the {limit}",
     "other-mode": "in another mode than home",
     "near-singularity": "near a singularity (margin below {min_margin} of the median)",
     "tilt-exceeded": "tilt above {max_tilt_deg:.4g} deg",

@@ -49,6 +49,9 @@ NOISE_UNITS = {
 ASSUMED = "assumed"
 """Word for noise that a program assumed."""
 
+MANY_SIGMAS = 3
+"""Number of columns above which an equal noise is written once."""
+
 LENGTHS = Annotated[list[Any], Dimension.LENGTH]
 LENGTH = Annotated[float, Dimension.LENGTH]
 NUMBERS = Annotated[list[Any], Dimension.RATIO]
@@ -166,6 +169,8 @@ def format_kind(
         units = {column.name: NOISE_UNITS[column.dimension] for column in kind.noise_columns}
         # nine digits: more would be rounding
         sigmas = {name: f"{s / units[name][1]:.9g} {units[name][0]}" for name, s in noise.items()}
+        if len(sigmas) > MANY_SIGMAS and len(set(sigmas.values())) == 1:
+            sigmas = {"*": next(iter(sigmas.values()))}
         texts["noise"] = format_flow_mapping(sigmas)
     return {**texts, "noise_source": ASSUMED} if is_noise_assumed else texts
 

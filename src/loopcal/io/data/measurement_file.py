@@ -22,7 +22,7 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.csv_table import Table, read_table, require_columns
+from loopcal.io.core.csv_table import Table, read_table, read_template, require_columns
 from loopcal.io.core.references import find_reference
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.data.columns import get_dimension, read_context
@@ -331,7 +331,7 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
         As `load_instrument`; or each group of rows has setup parameters of its own, such as a
         surface, which a choice of poses does not determine.
     """
-    table = read_table(path)
+    table = read_template(path)
     kinds = read_kinds(table, robot)
     groups, poses = table.text("group"), table.pose_names()
     apart = len({frozenset(poses[row] for row in entry.rows) for entry in kinds}) > 1

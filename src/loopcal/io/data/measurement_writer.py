@@ -62,6 +62,17 @@ COMPARED = f"""\
 # readings empty. Each of these poses needs a row of its own with its readings."""
 """Remark of a template on a kind that compares poses."""
 
+UNKNOWN_TARGETS = """\
+# Replace the places of the targets above by yours: measured by hand from the origin of the platform
+# frame, to a few millimeters. A plan uses them; a calibration identifies them. A plan
+# needs no rows: it takes the instrument from the settings above."""
+"""Remark of a template on targets of unknown place."""
+
+UNKNOWN_FRAME = """\
+# The instrument may stand anywhere; its frame ({}) is identified. If it is moved, even a
+# little, give the rows before and after it different names in a column session."""
+"""Remark of a template on an instrument whose frame is unknown."""
+
 
 def save_measurements(
     data: Measurements, path: str | Path, robot: Mechanism, remark: str = ""
@@ -164,7 +175,16 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
     ]
     texts = [format_kind(kind, of, robot.tool) for kind, of in zip(kinds, noise, strict=True)]
     settings = _format_settings(robot, list(zip(labels, texts, strict=True)), "")
-    return "\n".join([*settings, header, ADDED, *compared]) + "\n"
+    unknown = _describe_unknowns(kinds)
+    return "\n".join([*settings, header, ADDED, *unknown, *compared]) + "\n"
+
+
+def _describe_unknowns(kinds: Sequence[Kind]) -> list[str]:
+    """Return the remarks of a template on unknown frames and targets."""
+    unknown = [(kind, getattr(kind, "unknown", ())) for kind in kinds]
+    frames = [getattr(kind, "frame", "") for kind, names in unknown if "frame" in names]
+    remarks = [UNKNOWN_FRAME.format(quote_scalar(name)) for name in dict.fromkeys(frames)]
+    return remarks + [UNKNOWN_TARGETS] * any("targets" in names for _, names in unknown)
 
 
 def format_data_sheet(

@@ -100,7 +100,9 @@ def _split_row(row: Row, profile: Profile) -> tuple[Row, Row]:
     if "target" not in row or not targets:
         return row, {}
     target = row["target"]
-    if target not in targets:
+    if target not in targets and (target or len(targets) > 1):
+        if not target:
+            raise Misfit(f"it names the pose {quote(row['pose'])}, but no target")
         raise Misfit(f"the target {quote(target)} is not one of {', '.join(targets)}")
     shared = {name: cell for name, cell in row.items() if name != "target"}
     if len(targets) == 1:
@@ -235,8 +237,6 @@ def convert_export(
             raise FileError("the profile skips every line of this export; correct it", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
-        if lines[0].header is None:  # nothing shows that the profile is meant for this file
-            raise FileError(f"{sentence}; compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
     settings = {"format": FORMAT, **profile.record.settings}
     lines = _format_remarks(path, profile, misfits, findings)

@@ -92,7 +92,7 @@ def read_profile(path: str | Path) -> Profile:
     _check_encoding(file, record.encoding)
     profile = Profile(file, record, kind)
     _check_matrix(profile)
-    _check_columns(profile)
+    check_columns(profile)
     return profile
 
 
@@ -110,7 +110,7 @@ def _read_kind(file: YamlFile, record: ProfileRecord) -> Kind | None:
     return None
 
 
-def _check_columns(profile: Profile) -> None:
+def check_columns(profile: Profile) -> None:
     """Raise FileError for columns that a measurement file of this kind cannot have, or lacks."""
     file, record = profile.file, profile.record
     several = len(profile.targets) > 1

@@ -34,7 +34,7 @@ class Limit:
     Attributes
     ----------
     name : e.g. `stroke of q3`. dimension : length or angle. low, high : bounds [m or rad].
-    value : (t, n) [m or rad].
+    value : (t, n) [m or rad]. is_stroke : whether it is the stroke of an actuator.
     """
 
     name: str
@@ -42,6 +42,7 @@ class Limit:
     low: float
     high: float
     value: FloatArray
+    is_stroke: bool = False
 
     @property
     def margin(self) -> FloatArray:
@@ -55,7 +56,9 @@ def evaluate_limits(
     """Return all limits of a machine at readings q (t | 1, n, a) and their states (t, n)."""
     shape = state.status.shape
     limits = [
-        Limit(f"stroke of {a.name}", a.dimension, *a.stroke, np.broadcast_to(q[..., i], shape))
+        Limit(
+            f"stroke of {a.name}", a.dimension, *a.stroke, np.broadcast_to(q[..., i], shape), True
+        )
         for i, a in enumerate(robot.actuators)
         if a.stroke is not None
     ]

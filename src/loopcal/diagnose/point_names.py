@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether measured points have the names of the poses and targets at which they were measured.
+
+The nominal robot predicts each point, up to the frame of the instrument and the places of the
+targets, which are fitted in closed form. Points that are much farther from their prediction than
+the median are left out, and the fit is repeated. A point that was left out and lies where another
+one is predicted has the wrong name. Geometric errors of the robot are small beside the distance of
+two poses, so the nominal robot suffices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.errors import DataError
+from loopcal.measure import Position
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+FAR = 8.0
+"""Distance from its prediction, in medians, above which a point is not where its name says."""
+
+FITS = 6
+"""Repetitions of the fit without the points that are far."""
+
+MOVED = 8.0
+"""Ratio of the distances with one instrument frame to those with two, above which it has moved.
+Also of those with names as they are to those with shifted names.
+"""
+
+GRID = 8
+"""Moments between which a move is sought at first."""
+
+SCALE_SHARE = 0.02
+"""Share of the extent of the poses by which points are away, above which units are doubted."""
+
+FEWEST_POSES = 4
+"""Poses on each side of a moment at which an instrument may have moved."""
+
+LEAST_SHARE = 1e-9
+"""Share of the extent of all points below which a distance is rounding."""
+
+
+@dataclass(frozen=True)
+class PointCheck:
+    """The points of a table against their predictions.
+
+    Attributes
+    ----------
+    distance : median distance of a point from its prediction [m]. limit : of near points [m].
+    renamed : (row, target) of points and the (row, target) whose prediction they fit.
+    far : (row, target) of points that fit no prediction, and their distance [m].
+    moved_before : first row after the instrument has moved; None where it stood still.
+    shift : 1 where the points of each row fit the row before, -1 where they fit the next one.
+    distance_as_named : median distance with the names as they are [m], where they are shifted.
+    """
+
+    distance: float
+    limit: float
+    renamed: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = ()
+    far: tuple[tuple[tuple[int, int], float], ...] = ()
+    moved_before: int | None = None
+    shift: int = 0
+    distance_as_named: float = float("nan")
+
+
+def check_point_names(kind: Position, T: FloatArray, measured: FloatArray) -> PointCheck | None:
+    """Compare measured points with the predictions of the nominal robot.
+
+    Parameters
+    ----------
+    kind : of the rows, mounted on the robot's tool. T : (r, 4, 4) platform pose of each row.
+    measured : (r, 3 k) [m] points of k targets in the frame of the instrument, NaN where missing.
+
+    Returns
+    -------
+    None where there are too few points.
+    """
+    points = measured.reshape(len(T), len(kind.targets), 3)
+    is_present: BoolArray = np.asarray(~np.isnan(points).any(axis=2))
+    unknowns = 6 * ("frame" in kind.unknown) + 3 * len(kind.targets) * ("targets" in kind.unknown)
+    if 3 * is_present.sum() < 2 * unknowns + 6:
+        return None
+    extent = float(np.ptp(points[is_present], axis=0).max(initial=0.0))
+    fitted = _fit_without_far_points(kind, T, points, is_present, LEAST_SHARE * extent)
+    if fitted is None:
+        return None
+    predicted, distance, limit = fitted
+    is_far = is_present & ~(distance <= limit)
+    typical = float(np.median(distance[is_present & ~is_far]))
+    shift = _find_shift(kind, T, points, is_present, typical)
+    if shift is not None:
+        return PointCheck(shift[1], limit, shift=shift[0], distance_as_named=typical)
+    split = _find_move(kind, T, points, is_present)
+    if split is not None:
+        return PointCheck(typical, limit, moved_before=split)
+    places = np.argwhere(is_far)
+    if not len(places):
+        return PointCheck(typical, limit)
+    return _rename(points, predicted, places, distance, typical, limit)
+
+
+def _rename(
+    points: FloatArray,
+    predicted: FloatArray,
+    places: IntArray,
+    distance: FloatArray,
+    typical: float,
+    limit: float,
+) -> PointCheck:
+    """Return which of the far points at `places` fit the prediction of another one.
+
+    A point may also have the place of a point that was not measured.
+    """
+    from scipy.optimize import linear_sum_assignment  # loaded late: only few points are far
+
+    is_open = np.isnan(points).any(axis=2)
+    candidates = np.concatenate([places, np.argwhere(is_open)])
+    found = points[tuple(places.T)]
+    expected = predicted[tuple(candidates.T)]
+    between = np.linalg.norm(found[:, None] - expected[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(between, limit))
+    renamed, far = [], []
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        place = (int(places[row][0]), int(places[row][1]))
+        if between[row, column] <= limit and column != row:
+            other = (int(candidates[column][0]), int(candidates[column][1]))
+            renamed.append((place, other))
+        else:
+            far.append((place, float(distance[place])))
+    return PointCheck(typical, limit, tuple(renamed), tuple(far))
+
+
+def _fit_without_far_points(
+    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, least: float
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return predictions (r, k, 3), distances (r, k) and the limit of near points [m].
+
+    None where the points do not determine frame and targets.
+    """
+    used, result = is_present, None
+    for _ in range(FITS):
+        fitted = _fit(kind, T, points, used)
+        if fitted is None:
+            return None
+        predicted, distance = fitted
+        limit = FAR * max(float(np.median(distance[is_present])), least)
+        result = (predicted, distance, limit)
+        near: BoolArray = is_present & (distance <= limit)
+        if (near == used).all():
+            break
+        used = near
+    return result
+
+
+def _fit(
+    kind: Position, T: FloatArray, points: FloatArray, used: BoolArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return predictions (r, k, 3) with the best frame and targets, and distances (r, k)."""
+    measured = np.where(used[..., None], points, np.nan).reshape(len(T), -1)
+    try:
+        candidates = kind.guess_values(T, measured)
+    except DataError:  # collinear points
+        return None
+    best = None
+    for values in np.atleast_2d(candidates):
+        predicted = kind.locate_targets(T, values)[0]
+        distance = np.linalg.norm(predicted - points, axis=2)
+        if best is None or np.median(distance[used]) < np.median(best[1][used]):
+            best = (predicted, distance)
+    return best
+
+
+def _find_shift(
+    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, typical: float
+) -> tuple[int, float] | None:
+    """Return by how many rows names are shifted, and the median distance then; None where the names
+    as they are fit nearly as well.
+    """
+    best = None
+    for shift in (1, -1):
+        poses = T[:-1] if shift > 0 else T[1:]
+        of_rows = slice(1, None) if shift > 0 else slice(None, -1)
+        fitted = _fit(kind, poses, points[of_rows], is_present[of_rows])
+        if fitted is None or not is_present[of_rows].any():
+            continue
+        distance = float(np.median(fitted[1][is_present[of_rows]]))
+        if distance * MOVED < typical and (best is None or distance < best[1]):
+            best = (shift, distance)
+    return best
+
+
+def _find_move(
+    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray
+) -> int | None:
+    """Return the row before which the instrument has moved; None where it has not.
+
+    Both sides are fitted with frames and targets of their own. The best moment must reduce the root
+    mean square by `MOVED`.
+    """
+    if "frame" not in kind.unknown:
+        return None
+
+    def measure(start: int, end: int) -> float:
+        fitted = _fit(kind, T[start:end], points[start:end], is_present[start:end])
+        if fitted is None:
+            return np.inf
+        return float((fitted[1][is_present[start:end]] ** 2).sum())
+
+    whole = measure(0, len(T))
+    per_pose = max(1, 3 * len(kind.targets))
+    fewest = max(FEWEST_POSES, -(-3 * (6 + 3 * len(kind.targets)) // per_pose))
+    low, high = fewest, len(T) - fewest
+    sums: dict[int, float] = {}
+    while low <= high:  # the sum falls towards the true moment: a grid, then a finer one around
+        step = max(1, -(-(high - low) // GRID))
+        for split in range(low, high + 1, step):
+            if split not in sums:
+                sums[split] = measure(0, split) + measure(split, len(T))
+        best = min(sums, key=sums.__getitem__)
+        if step == 1:
+            break
+        low, high = max(low, best - step + 1), min(high, best + step - 1)
+    if not sums or not min(sums.values()) * MOVED**2 < whole:
+        return None
+    return min(sums, key=sums.__getitem__)
+
+
+def find_other_scale(
+    kind: Position, T: FloatArray, measured: FloatArray, scales: Mapping[str, float]
+) -> tuple[str, float, float] | None:
+    """Return which scale explains points that the nominal robot does not; None where it does.
+
+    Parameters
+    ----------
+    kind, T, measured : see `check_point_names`. scales : name -> factor [1] that may be missing.
+
+    Returns
+    -------
+    Name, median distance with this factor, and median distance without it [m].
+    """
+    points = measured.reshape(len(T), len(kind.targets), 3)
+    used: BoolArray = np.asarray(~np.isnan(points).any(axis=2))
+
+    def measure(scale: float) -> float:
+        fitted = _fit(kind, T, scale * points, used)
+        return np.inf if fitted is None else float(np.median(fitted[1][used]))
+
+    as_written = measure(1.0)
+    extent = float(np.ptp(T[:, :3, 3], axis=0).max(initial=0.0))
+    if not as_written > SCALE_SHARE * extent:
+        return None
+    distances = {name: measure(scale) for name, scale in scales.items()}
+    if not distances:
+        return None
+    name = min(distances, key=distances.__getitem__)
+    if not distances[name] * MOVED < as_written:
+        return None
+    return name, distances[name], as_written

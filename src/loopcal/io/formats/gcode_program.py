@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""G-code that moves a machine to the poses of a plan: RS-274, as LinuxCNC and others read it.
+
+    G21 G90 G94 G40 G49 G61     millimeters, absolute, feed per minute, exact path
+    G53 G1 X.. Y.. Z.. A.. B.. C.. F..    one straight move for each stop, in machine coordinates
+    M0 or G4 P..                wait for the measurement
+
+X Y Z are the platform's origin in the base frame. A B C are roll, pitch and yaw in degrees, with
+R = Rz(C) Ry(B) Rx(A), as in the kinematics genhexkins of LinuxCNC. All words change evenly along a
+move, as on the paths that a plan checks. Source: LinuxCNC, "G-Codes" (G4, G53, G61, G94, M0).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from loopcal.errors import DataError, FileError
+from loopcal.findings import report_finding
+from loopcal.io.core.csv_table import read_table, require_columns
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import read_text
+from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
+from loopcal.io.runs.plan_folder import SHEET, VIA
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension, find_unit
+
+WORDS = {"x": "X", "y": "Y", "z": "Z", "roll": "A", "pitch": "B", "yaw": "C"}
+"""Controlled coordinate -> word of RS-274."""
+
+DECIMALS = 6
+"""Decimals of coordinates: a nanometer, a microdegree."""
+
+ANGLES = "(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"
+UNIT_CODES = {"mm": "G21", "in": "G20"}
+ROUNDING = 2e-8
+"""Difference of coordinates that were written with these decimals [m, rad]."""
+
+_MOVE = re.compile(r"^G53 G1 (?P<words>[^F(]*) F")
+_WORD = re.compile(r"([A-Z])(-?[\d.]+)")
+
+
+@dataclass(frozen=True)
+class GcodeSettings:
+    """Settings of a program.
+
+    Attributes
+    ----------
+    feed : of moves [m/s]; of moves that only rotate the same number in degrees per minute.
+    pause : time at each pose [s]; None stops until the operator continues.
+    unit : of lengths in the program.
+    """
+
+    feed: float
+    pause: float | None = None
+    unit: Literal["mm", "in"] = "mm"
+
+    def __post_init__(self) -> None:
+        for name, value in (("feed", self.feed), ("pause", self.pause)):
+            if value is not None and not 0.0 < value < np.inf:
+                raise DataError(f"the {name} is {value:g}; give a finite number above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedStops:
+    """The stops of an operator's sheet.
+
+    Attributes
+    ----------
+    labels : of the poses, or "home". uses : fit, held-out or via. coordinates : (n, c) [m, rad].
+    """
+
+    labels: tuple[str, ...]
+    uses: tuple[str, ...]
+    coordinates: FloatArray
+
+
+def read_stops(path: str | Path, robot: Mechanism) -> PlannedStops:
+    """Read the stops of a plan: its folder, or its sheet plan.csv.
+
+    Raises
+    ------
+    FileError : there is no sheet of this robot.
+    """
+    path = Path(path)
+    file = path / SHEET if path.is_dir() else path
+    table = read_table(file)
+    why = f"a coordinate of {robot.name}; name the folder of a plan, or its {SHEET}"
+    require_columns(table, ("pose", USE_COLUMN.name, *robot.controlled), why)
+    uses = table.text(USE_COLUMN.name)
+    for row, use in enumerate(uses):
+        if use not in (FIT, HELD_OUT, VIA):
+            raise table.row_error(row, f"the use {use!r} is not {FIT}, {HELD_OUT} or {VIA}")
+    columns = [table.numbers(n, get_dimension(n), empty=False) for n in robot.controlled]
+    return PlannedStops(table.text("pose"), uses, np.column_stack(columns))
+
+
+def refuse_coordinates(robot: Mechanism) -> None:
+    """Raise DataError for a robot with a controlled coordinate that has no word."""
+    others = tuple(name for name in robot.controlled if name not in WORDS)
+    if others:
+        code = "files.no-gcode-word"
+        raise DataError(report_finding(code, robot=robot.name, names=others, words=tuple(WORDS)))
+
+
+def format_gcode(
+    robot: Mechanism, stops: PlannedStops, home: FloatArray, settings: GcodeSettings
+) -> str:
+    """Return a program that starts at home, visits all stops in order, and returns to home.
+
+    `home` : (c,) of `loopcal.planning.check_route`, which has checked all of these paths.
+    """
+    refuse_coordinates(robot)
+    poses = sum(use != VIA for use in stops.uses)
+    feed = settings.feed * 60.0 / find_unit(settings.unit).factor_to_si
+    wait = "M0" if settings.pause is None else f"G4 P{_format(settings.pause, 3)}"
+
+    def move(coordinates: FloatArray) -> str:
+        return f"G53 G1 {_format_words(robot, coordinates, settings.unit)} F{_format(feed, 3)}"
+
+    lines = [
+        f"({_clean(robot.name)}: {poses} poses of a plan, in its order, and back to home)",
+        "(X Y Z: origin of the platform frame in the base frame, in machine coordinates, G53.)",
+        "(Work offsets and the tool length do not count.)",
+        *(
+            ["(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"]
+            if "roll" in robot.controlled
+            else []
+        ),
+        f"(Lengths in {settings.unit}. The paths from home are checked; the way to home is not.)",
+        f"{UNIT_CODES[settings.unit]} G90 G94 G40 G49 G61",
+        "(MSG, the next move goes to home: check that the way is free)",
+        "M0",
+        move(home),
+    ]
+    for label, use, coordinates in zip(stops.labels, stops.uses, stops.coordinates, strict=True):
+        if use == VIA:
+            lines += ["(via home)", move(coordinates)]
+            continue
+        lines += [f"(pose {_clean(label)})", move(coordinates)]
+        lines += [f"(MSG, measure pose {_clean(label)})", wait]
+    return "\n".join([*lines, "(back to home)", move(home), "M2"]) + "\n"
+
+
+def check_written_gcode(
+    path: Path, text: str, robot: Mechanism, stops: PlannedStops, unit: str
+) -> None:
+    """Read a program; raise LoopcalError where it is not this text, or its moves are not home, the
+    stops, and home.
+    """
+    require_same("text", text, read_text(path, "program"))
+    factors = _get_factors(robot, unit)
+    letters = [WORDS[name] for name in robot.controlled]
+    moves = []
+    for line in read_text(path, "program").splitlines():
+        if match := _MOVE.match(line):
+            words = dict(_WORD.findall(match["words"]))
+            moves.append([float(words[w]) * f for w, f in zip(letters, factors, strict=True)])
+    if len(moves) != len(stops.labels) + 2:
+        raise FileError(f"{len(moves)} moves were written for {len(stops.labels)} stops", path)
+    difference = np.abs(np.array(moves[1:-1]) - stops.coordinates)
+    require_same("rounded moves", True, bool((difference <= ROUNDING).all()))
+
+
+def _get_factors(robot: Mechanism, unit: str) -> list[float]:
+    """Return SI per unit of each controlled coordinate in a program."""
+    symbols = {Dimension.LENGTH: unit, Dimension.ANGLE: "deg"}
+    return [find_unit(symbols[get_dimension(name)]).factor_to_si for name in robot.controlled]
+
+
+def _format_words(robot: Mechanism, coordinates: FloatArray, unit: str) -> str:
+    """Return the words of a move."""
+    numbers: Sequence[float] = coordinates.tolist()
+    triples = zip(robot.controlled, numbers, _get_factors(robot, unit), strict=True)
+    return " ".join(f"{WORDS[name]}{_format(value / f, DECIMALS)}" for name, value, f in triples)
+
+
+def _format(value: float, decimals: int) -> str:
+    """Return a number without exponent and without zeros at its end."""
+    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
+    return "0" if text in {"-0", ""} else text
+
+
+def _clean(text: str) -> str:
+    """Return text that a comment of RS-274 can hold: without brackets and further lines."""
+    return re.sub(r"[^\x20-\x7e]|[()]", "_", text)

@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sheets of a plan are filled in from exports in the formats of the shipped profiles.
+
+The exports are written here as the profiles describe them: the points of a simulated hexapod in the
+frame of a tracker that stands two meters away.
+"""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal import geometry
+from loopcal.cli import main
+from loopcal.cli.options.shared_options import SHIPPED_PROFILES
+from loopcal.diagnose import examine_points
+from loopcal.errors import DataError, FileError
+from loopcal.io import load_measurements, load_robot
+from loopcal.io.data.measurement_writer import format_data_sheet
+from loopcal.io.exports import (
+    find_profile_file,
+    list_shipped_profiles,
+    read_profile,
+    with_local_settings,
+)
+from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
+from loopcal.measure import Gaussian, Instrument, Position, Sensor
+from loopcal.workflow.instrument_description import (
+    InstrumentDescription,
+    build_instrument,
+    place_targets,
+)
+from loopcal.workflow.simulated_measurements import simulate_measurements
+
+TARGETS = ("SMR1", "SMR2", "SMR3")
+N = 14
+Points = Sequence[tuple[str, np.ndarray]]
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("hexapod-42")
+
+
+@pytest.fixture(scope="module")
+def instrument(robot):
+    description = InstrumentDescription(
+        ("position",), sigma_position=15e-6, unknown_frames=("base",), targets=TARGETS
+    )
+    return place_targets(build_instrument(description), robot)
+
+
+@pytest.fixture(scope="module")
+def simulated(robot, instrument):
+    return simulate_measurements(robot, instrument, poses=N, draw_errors=True, seed=3).data
+
+
+@pytest.fixture(scope="module")
+def points(simulated) -> Points:
+    """The points of all poses in the tracker's frame [mm], by name."""
+    rows = simulated.observations[0]
+    R = geometry.exp_so3(np.array([0.05, -0.03, 0.7]))
+    measured = rows.measured.reshape(N, 3, 3) @ R.T + [2.5, -0.3, -0.7]
+    return [
+        (f"{simulated.labels[i]}_{target}", measured[i, k] * 1e3)
+        for i in range(N)
+        for k, target in enumerate(TARGETS)
+    ]
+
+
+@pytest.fixture
+def sheet(robot, instrument, simulated, tmp_path) -> Path:
+    path = tmp_path / "sheet.csv"
+    text = format_data_sheet(
+        robot, instrument, simulated.readings, simulated.labels, np.arange(N) >= N - 3
+    )
+    path.write_text(text)
+    return path
+
+
+def write_spatial_analyzer(path: Path, points: Points, end: str = "\n", scale: float = 1.0) -> Path:
+    lines = ["// SpatialAnalyzer 2023.2.0621.4", "// Working frame: A::WORLD"]
+    lines += ["// Collection,  Group,  Point,  X,  Y,  Z", ""]
+    for name, xyz in points:
+        lines.append(f"A,  Hexapod,  {name},  " + ",  ".join(f"{v * scale:.6f}" for v in xyz))
+    path.write_bytes((end.join(lines) + end).encode())
+    return path
+
+
+def write_leica(path: Path, points: Points) -> Path:
+    """Write blanks and decimal commas, with a comment and further columns."""
+    lines = ["# Punkt X Y Z sX sY sZ"]
+    for name, xyz in points:
+        numbers = " ".join(f"{v:12.4f}".replace(".", ",") for v in (*xyz, 0.006, 0.006, 0.009))
+        lines.append(f"P{name:10} {numbers}")
+    path.write_text("\r\n".join(lines) + "\r\n", encoding="utf-8-sig")
+    return path
+
+
+def write_faro(path: Path, points: Points, separator: str = ",") -> Path:
+    """Write a header below two lines, and columns in another order."""
+    lines = ["CAM2 Measure", "", separator.join(["Label", "Name", "Z", "Y", "X", "RMS"])]
+    for name, (x, y, z) in points:
+        cells = ["SMR", name, *(f"{v:.5f}" for v in (z, y, x)), "0.004"]
+        mark = "." if separator == "," else ","
+        lines.append(separator.join(cell.replace(".", mark) for cell in cells))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def fill(robot, sheet: Path, *exports: Path, profile: str = "spatial-analyzer", **options):
+    unit, comma = options.pop("unit", None), options.pop("comma", False)
+    read = with_local_settings(read_profile(find_profile_file(profile)), unit, comma)
+    return fill_sheet(robot, sheet, exports, read, **options)
+
+
+def examine(robot, sheet: Path, *exports: Path, **options):
+    """Fill in a sheet and examine its points."""
+    filled = fill(robot, sheet, *exports, **options)
+    return examine_points(robot, filled.data, filled.unit)
+
+
+def list_codes(filled) -> list[str]:
+    return [finding.code for finding in filled.findings]
+
+
+def rename(points: Points, names: dict[str, str]) -> Points:
+    return [(names.get(name, name), xyz) for name, xyz in points]
+
+
+def test_help_lists_the_shipped_profiles() -> None:
+    assert tuple(list_shipped_profiles()) == SHIPPED_PROFILES
+
+
+@pytest.mark.parametrize("name", SHIPPED_PROFILES)
+def test_shipped_profile_reads_and_states_its_source(name) -> None:
+    path = find_profile_file(name)
+    assert read_profile(path).kind is not None
+    assert "# Source: " in path.read_text()
+
+
+def test_unknown_profile_is_refused_with_the_shipped_ones() -> None:
+    with pytest.raises(FileError, match=r"did you mean 'faro'.*faro, leica and spatial-analyzer"):
+        find_profile_file("farro")
+
+
+@pytest.mark.parametrize("form", ["windows", "inches", "leica", "faro", "faro-comma"])
+def test_every_format_fills_the_sheet_with_the_same_points(
+    form, robot, sheet, points, tmp_path
+) -> None:
+    path = tmp_path / "export.txt"
+    if form == "windows":
+        filled = fill(robot, sheet, write_spatial_analyzer(path, points, "\r\n"))
+    elif form == "inches":
+        export = write_spatial_analyzer(path, points, scale=1 / 25.4)
+        filled = fill(robot, sheet, export, unit="in")
+    elif form == "leica":
+        filled = fill(robot, sheet, write_leica(path, points), profile="leica", comma=True)
+    else:
+        export = write_faro(path, points, ";" if form == "faro-comma" else ",")
+        filled = fill(robot, sheet, export, profile="faro", comma=form == "faro-comma")
+    assert list_codes(filled) == ["sheet.filled"]
+    assert examine_points(robot, filled.data, filled.unit) == ()
+    assert not filled.misfits
+    output = tmp_path / "measured.csv"
+    save_filled_sheet(filled, output)
+    data = load_measurements(output, robot)
+    assert data.is_held_out.sum() == 3
+    wanted = np.array([xyz for _, xyz in points]).reshape(N, 9) / 1e3
+    np.testing.assert_allclose(data.observations[0].measured, wanted, atol=1e-7)  # [m], digits
+
+
+def test_missing_unknown_and_repeated_points_are_listed(robot, sheet, points, tmp_path) -> None:
+    again = [("3_SMR1", points[6][1] + 0.012)]
+    exported = [*points[:9], *again, *points[10:], points[12], ("99_SMR1", points[0][1])]
+    filled = fill(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", exported))
+    found = {finding.code: finding for finding in filled.findings}
+    assert found["sheet.points-missing"].data["names"] == ("4_SMR1",)
+    assert found["sheet.points-repeated"].data["names"] == ("3_SMR1",)
+    assert found["sheet.points-identical"].data["names"] == ("5_SMR1",)
+    assert found["sheet.points-unknown"].data["names"] == ("99_SMR1",)
+    rows = [row for row in filled.table[1:] if row[0] == "3"]
+    assert len(rows) == 2
+    assert f"{points[6][1][0] + 0.012:.6f}" in rows[1]
+
+
+def test_points_sorted_by_target_come_to_their_poses(robot, sheet, points, tmp_path) -> None:
+    by_target = sorted(points, key=lambda point: point[0].split("_")[1])
+    filled = fill(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", by_target))
+    assert list_codes(filled) == ["sheet.filled"]
+    assert len(filled.table) == N + 1
+
+
+def test_unknown_target_is_a_misfit_with_its_line(robot, sheet, points, tmp_path) -> None:
+    export = write_spatial_analyzer(tmp_path / "e.txt", rename(points, {"2_SMR1": "2_SMR4"}))
+    filled = fill(robot, sheet, export)
+    assert filled.misfits == ((str(export), 8, "the target 'SMR4' is not one of SMR1, SMR2, SMR3"),)
+
+
+def test_inches_without_the_unit_are_refused(robot, sheet, points, tmp_path) -> None:
+    export = write_spatial_analyzer(tmp_path / "e.txt", points, scale=1 / 25.4)
+    with pytest.raises(DataError, match=r"unit mm, but its points fit .* the unit in "):
+        examine(robot, sheet, export)
+
+
+def test_swapped_poses_and_targets_are_refused_by_name(robot, sheet, points, tmp_path) -> None:
+    names = {f"{a}_{t}": f"{b}_{t}" for a, b in ((4, 9), (9, 4)) for t in TARGETS}
+    path = write_spatial_analyzer(tmp_path / "e.txt", rename(points, names))
+    with pytest.raises(DataError, match=r"6 points .* wrong names: 4_SMR1 lies at 9_SMR1; "):
+        examine(robot, sheet, path)
+    swapped = rename(points, {"2_SMR2": "2_SMR3", "2_SMR3": "2_SMR2"})
+    path = write_spatial_analyzer(tmp_path / "f.txt", swapped)
+    with pytest.raises(DataError, match=r"2 points .*: 2_SMR2 lies at 2_SMR3; 2_SMR3 lies at 2_S"):
+        examine(robot, sheet, path)
+
+
+@pytest.mark.parametrize(("shift", "words"), [(1, "too early: .* next pose"), (-1, "too late")])
+def test_shifted_names_are_refused(shift, words, robot, sheet, points, tmp_path) -> None:
+    places = [xyz for _, xyz in points]
+    kept = points[: -3 * shift] if shift > 0 else points[3:]
+    moved = places[3:] if shift > 0 else places[:-3]
+    late = [(name, xyz) for (name, _), xyz in zip(kept, moved, strict=True)]
+    with pytest.raises(DataError, match=words):
+        examine(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", late))
+
+
+def test_a_point_far_from_its_place_is_reported(robot, sheet, points, tmp_path) -> None:
+    far = [(name, xyz + 20.0 * (name == "4_SMR2")) for name, xyz in points]
+    (found,) = examine(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", far))
+    assert found.code == "sheet.points-far"
+    assert "4_SMR2 by 34.6 mm" in str(found)
+
+
+def test_moved_tracker_is_refused_and_two_files_are_two_sessions(
+    robot, sheet, points, tmp_path
+) -> None:
+    moved = [
+        (name, xyz + np.array([3.0, 2.0, -1.0]) * (i >= 21)) for i, (name, xyz) in enumerate(points)
+    ]
+    whole = write_spatial_analyzer(tmp_path / "all.txt", moved)
+    with pytest.raises(DataError, match="up to pose 7 and those from pose 8 fit two positions"):
+        examine(robot, sheet, whole)
+    days = [
+        write_spatial_analyzer(tmp_path / f"{day}.txt", some)
+        for day, some in (("monday", moved[:21]), ("tuesday", moved[21:]))
+    ]
+    with pytest.raises(DataError, match="two positions"):
+        examine(robot, sheet, *days, has_one_session=True)
+    save_filled_sheet(fill(robot, sheet, *days), tmp_path / "measured.csv")
+    rows = load_measurements(tmp_path / "measured.csv", robot).observations[0]
+    assert rows.session.tolist() == ["monday"] * 7 + ["tuesday"] * 7
+
+
+def test_points_without_matching_names_are_filled_by_order_or_refused(
+    robot, sheet, points, tmp_path
+) -> None:
+    anonymous = [(f"A{i}", xyz) for i, (_, xyz) in enumerate(points)]
+    path = write_spatial_analyzer(tmp_path / "e.txt", anonymous)
+    with pytest.raises(FileError, match="first one: it names the pose 'A0', but no target"):
+        fill(robot, sheet, path)
+    wrong = [(f"A{name}", xyz) for name, xyz in points]
+    with pytest.raises(FileError, match="no point of the export has the name of a pose"):
+        fill(robot, sheet, write_spatial_analyzer(tmp_path / "f.txt", wrong))
+    by_name = fill(robot, sheet, write_spatial_analyzer(tmp_path / "g.txt", points))
+    assert fill(robot, sheet, path, by_order=True).table == by_name.table
+    write_spatial_analyzer(path, anonymous[:-1])
+    with pytest.raises(FileError, match=r"needs 42 points \(14 poses, 3 targets\).* has 41"):
+        fill(robot, sheet, path, by_order=True)
+
+
+def test_one_target_needs_no_name_of_a_target(robot, simulated, points, tmp_path) -> None:
+    kind = Position(targets=("SMR",), unknown=("frame", "targets")).with_tool(robot.tool)
+    one = Instrument((Sensor(kind, Gaussian(np.full(3, 15e-6))),))
+    sheet = tmp_path / "sheet.csv"
+    sheet.write_text(format_data_sheet(robot, one, simulated.readings, simulated.labels))
+    single = [(name.split("_")[0], xyz) for name, xyz in points if name.endswith("SMR2")]
+    filled = fill(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", single))
+    assert list_codes(filled) == ["sheet.filled"]
+    assert filled.table[0][-3:] == ("x [mm]", "y [mm]", "z [mm]")
+
+
+def test_filled_sheet_is_refused(robot, sheet, points, tmp_path) -> None:
+    path = write_spatial_analyzer(tmp_path / "e.txt", points)
+    save_filled_sheet(fill(robot, sheet, path), tmp_path / "measured.csv")
+    with pytest.raises(FileError, match="this sheet has measured values already"):
+        fill(robot, tmp_path / "measured.csv", path)
+
+
+def test_command_prints_what_is_filled_in_and_what_is_not(
+    robot, sheet, points, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_spatial_analyzer(tmp_path / "points.txt", [*points[3:], ("floor", points[0][1])])
+    words = "fill hexapod-42 sheet.csv points.txt --profile spatial-analyzer -o measured.csv"
+    assert main(words.split()) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "measured.csv: 39 points at 13 of 14 poses filled in" in said
+    assert "the export lacks 3 of the 42 points of the sheet: 1_SMR1, 1_SMR2 and 1_SMR3" in said
+    assert "points.txt:44 does not match: it names the pose 'floor', but no target" in said
+    assert main([*words.split(), "--force", "--profile", "leicca"]) == 1
+    assert "faro, leica and spatial-analyzer" in capsys.readouterr().err
+
+
+def test_import_takes_a_shipped_profile_and_a_unit(points, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_spatial_analyzer(tmp_path / "points.txt", points)
+    words = "import points.txt --profile spatial-analyzer --unit in -o measured.csv"
+    assert main(words.split()) == 0
+    text = (tmp_path / "measured.csv").read_text()
+    assert "SMR1.x [in]" in text
+    assert len(list(csv.reader(line for line in text.splitlines() if line[0] != "#"))) == N + 1
+    assert main(["import", "a.hal", "--unit", "mm", "--decimal", "comma", "-o", "r.yaml"]) == 1
+    assert "--decimal has no effect without --profile" in capsys.readouterr().err
