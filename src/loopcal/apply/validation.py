@@ -195,8 +195,11 @@ class Validation(TableResult):
 
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
-        rows = "row" if len(self.poses) == 1 else "rows"
-        lines = [f"Validation on {len(self.poses)} {rows}, {self.frame}:", *self.describe_rms()]
+        rows, poses = len(self.poses), self.judged
+        words = f"{rows} {'row' if rows == 1 else 'rows'}, {self.frame}"
+        if not rows:
+            words = f"the actuator readings of {poses} {'pose' if poses == 1 else 'poses'}"
+        lines = [f"Validation on {words}:", *self.describe_rms()]
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
 
     def describe_rms(self) -> list[str]:

@@ -134,10 +134,10 @@ def _draw_row(
         unbounded = part.chosen & ~np.isfinite(values)
         beyond = bounded & accuracy.extrapolated
         points = axes.scatter(
-            x[bounded], y[bounded], c=values[bounded], cmap=SEQUENTIAL, s=16.0,
+            x[bounded], y[bounded], c=values[bounded], cmap=SEQUENTIAL, s=20.0,
             vmin=limits[0], vmax=limits[1],
         )  # fmt: skip
-        axes.scatter(x[beyond], y[beyond], s=30.0, fc="none", ec=COLORS[1], lw=0.8)
+        axes.scatter(x[beyond], y[beyond], s=52.0, fc="none", ec=COLORS[1], lw=0.6)
         axes.plot(x[unbounded], y[unbounded], "s", color=REFERENCE, ms=4.0)
         place = measured[part.measured]
         axes.plot(place[:, i] / scale[0], place[:, j] / scale[1], "x", color=DARK, ms=4.5)

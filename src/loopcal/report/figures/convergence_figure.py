@@ -16,8 +16,10 @@ from loopcal.report.figures.style import (
     REFERENCE,
     SMALL,
     THIN,
+    VERY_WIDE,
     finish_figure,
     label_axes,
+    label_logarithmic,
     start_figure,
 )
 
@@ -82,9 +84,13 @@ def _set_steps(axes: Axes, count: int) -> None:
 
 
 def _thin_decades(axes: Axes) -> None:
-    """Write a few powers of ten as numbers."""
+    """Write a few powers of ten as numbers; more numbers on a short axis."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+    low, high = axes.yaxis.get_view_interval()
+    if high < VERY_WIDE * low:
+        label_logarithmic(axes.yaxis)
+        return
     axes.yaxis.set_major_locator(LogLocator(numticks=8))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())

@@ -40,6 +40,9 @@ MOST_ROWS = 50
 MOST_NAMES = 110
 """Parameters up to which a picture of correlations names each one."""
 
+RATIO = "1"
+"""Symbol of a ratio, which stands at no number."""
+
 SHIFT, WIDTH = COLORS[0], COLORS[1]
 """Colors of shifts and of uncertainties."""
 
@@ -151,14 +154,15 @@ def _draw_uncertainties(axes: Axes, fit: FittedParameters, chunk: IntArray) -> N
         axes.set_xscale("log")
         label_logarithmic(axes.xaxis, FEW_TICKS)
     factor, symbols = fit.free_parameters.display()
+    symbols = ["" if symbol == RATIO else f" {symbol}" for symbol in symbols]
     widths = half * fit.free_parameters.tolerance[chunk] / factor[chunk]
     estimate = (fit.estimate / factor).tolist()
     numbers = [
-        f"{format_with_uncertainty(estimate[i], width)} ± {format_uncertainty(width)} {symbols[i]}"
+        f"{format_with_uncertainty(estimate[i], width)} ± {format_uncertainty(width)}{symbols[i]}"
         for i, width in zip(chunk, widths.tolist(), strict=True)
     ]
     if not fit.converged:
-        numbers = [f"{estimate[i]:.3g} {symbols[i]}" for i in chunk]
+        numbers = [f"{estimate[i]:.3g}{symbols[i]}" for i in chunk]
     axes.yaxis.tick_right()
     _set_rows(axes, numbers)
     label_axes(axes, "half-width [tolerance]", "", "uncertainty (95 %)")

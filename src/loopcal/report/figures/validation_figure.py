@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 BEFORE, AFTER, LIMIT = COLORS[1], COLORS[0], COLORS[3]
 """Colors of errors before and after calibration, and of a limit."""
 
+FEWEST_BARS = 5
+"""Kinds of measurement for which there is room, so that the bars of a single one are narrow."""
+
 LOGARITHMIC = 8.0
 """Ratio of the largest errors before and after from which their axis is logarithmic."""
 
@@ -120,10 +123,28 @@ def _draw_kinds(axes: Axes, validation: Validation, with_before: bool) -> None:
         axes.hlines(kind.noise_floor, i - 0.45, i + 0.45, color=REFERENCE, lw=LINE, ls="--")
     names = ["all kinds" if k.kind == "all" else k.kind for k in kinds]
     axes.set_xticks(x, [f"{n}\n{k.count} values" for n, k in zip(names, kinds, strict=True)])
+    drawn = [("before", x - shift)] if with_before else []
+    for name, places in [*drawn, ("after", x + shift)]:
+        for place, kind in zip(places, kinds, strict=True):
+            value: float = getattr(kind, name)
+            if np.isfinite(value):
+                axes.annotate(
+                    f"{value:.3g}",
+                    (place, value),
+                    xytext=(0, 2),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=SMALL,
+                )
+    axes.set_xlim(-0.5 * max(FEWEST_BARS - len(kinds), 0) - 0.6, None)
+    axes.set_xlim(right=len(kinds) - 1 - axes.get_xlim()[0])
     values = [v for k in kinds for v in (k.before, k.after) if np.isfinite(v) and v > 0.0]
     if with_before and values and max(values) > LOGARITHMIC * min(values):
         axes.set_yscale("log")
+        axes.set_ylim(0.5 * min(*values, 1.0), 2.0 * max(values))
         label_logarithmic(axes.yaxis)
+    elif values:
+        axes.set_ylim(0.0, 1.15 * max(*values, 1.0))
     label_axes(axes, "", "rms error [sigma]", "by kind of measurement, over sigma")
     axes.tick_params(axis="x", labelsize=SMALL)
 

@@ -47,6 +47,18 @@ def state_question(answered: AnsweredQuestion) -> str:
     )
 
 
+def describe_answers(answered: AnsweredQuestion) -> str:
+    """Return a question as text, and one line for each answer with the shares that decide it."""
+    lines = [f"{state_question(answered)}:"]
+    for answer in answered.answers:
+        levels = [f"{factor} {level}" for factor, level in answer.levels.items()]
+        named = ", ".join([*levels, *([answer.chain] if answer.chain else [])])
+        said = say_answer(answer, answered.question.wanted)
+        shares = "; ".join(_say_share(share) for share in list_deciding_shares(answer))
+        lines.append(f"  {named}: {said} ({shares})" if named else f"  {said} ({shares})")
+    return "\n".join(lines)
+
+
 def tabulate_answers(answered: AnsweredQuestion) -> Table:
     """Return a row for each combination of the other factors: the answer, and the shares that
     decide it.

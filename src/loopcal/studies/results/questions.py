@@ -89,6 +89,12 @@ class AnsweredQuestion:
     score_unit: str
     answers: tuple[Answer, ...]
 
+    def __str__(self) -> str:
+        """Return the question, and one line for each answer with the shares that decide it."""
+        from loopcal.studies.results.question_view import describe_answers
+
+        return describe_answers(self)
+
 
 def answer_question(
     study: Study, store: StudyStore, question: Question, name: str = ""
