@@ -62,7 +62,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "write_computation_times": False,
     "image_scrapers": ("tools.site_gallery.scrape_figures",),
-    "ignore_repr_types": r"matplotlib",
+    "ignore_repr_types": r"matplotlib|NotebookFigure",
 }
 
 # --- appearance

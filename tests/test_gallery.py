@@ -24,7 +24,7 @@ TOPICS = """
 """
 """What users look for in the gallery; each is a script."""
 
-LONGEST_LINE, LONGEST_BLOCK = 100, 45
+LONGEST_LINE, LONGEST_BLOCK = 100, 55
 """Characters of a line, and lines of a code block between two comments."""
 
 of_each_example = pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

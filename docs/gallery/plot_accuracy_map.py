@@ -35,8 +35,8 @@ fit = report.identification
 print(report.headline)
 
 # %%
-# The uncertainty of the tool over the whole workspace. A ring marks poses that are less certain than
-# every measured one: there the calibration extrapolates.
+# The uncertainty of the tool over the whole workspace. A ring marks poses that are less certain
+# than every measured one: there the calibration extrapolates.
 
 accuracy = lc.accuracy_map(fit, data.readings)
 print(accuracy)

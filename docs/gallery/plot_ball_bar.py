@@ -9,8 +9,8 @@ places it determines everything about this hexapod but where its frames are.
 """
 
 # %%
-# The three places of the table ball are three sessions, each with an unknown place of its own. The
-# ball on the platform is not known exactly either.
+# The three places of the table ball are three sessions, each with an unknown place of its own.
+# The ball on the platform is not known exactly either.
 
 import numpy as np
 

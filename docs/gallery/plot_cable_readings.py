@@ -9,8 +9,9 @@ the robot these angles determine, and what a few measured positions add.
 """
 
 # %%
-# Each line has its anchor and a length. The file states ``sigma`` of every motor, so that the poses
-# are unknowns of the fit: four angles for three coordinates leave one equation for each pose.
+# Each line has its anchor and a length. The file states ``sigma`` of every motor, so that the
+# poses are unknowns of the fit: four angles for three coordinates leave one equation for each
+# pose.
 
 import numpy as np
 
@@ -30,9 +31,9 @@ tape = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-3)), rows=np.arange(3)
 data = lc.simulate(machine, poses, lc.Instrument((tape,)), seed=2)
 
 # %%
-# First the angles alone, without any measured position. They determine the shape of the robot, but
-# neither where its frame is (six combinations) nor its size: a robot of twice the size with spools
-# of twice the size has the same motor angles.
+# First the angles alone, without any measured position. They determine the shape of the robot,
+# but neither where its frame is (six combinations) nor its size: a robot of twice the size with
+# spools of twice the size has the same motor angles.
 
 angles = lc.Measurements(robot.name, data.readings, (), reading_sigma=data.reading_sigma)
 result = lc.identifiability(robot, angles)
@@ -40,27 +41,23 @@ print(f"{result.rank} of {result.n_parameters} parameter combinations")
 result.plot()
 
 # %%
-# Calibrate from angles alone. At poses that were kept out of the fit, the four angles now agree with
-# each other to the stated sigma.
+# Calibrate from angles alone. At poses that were kept out of the fit, the four angles now agree
+# with each other to the stated sigma.
 
 report = lc.calibrate(robot, angles, lc.CalibrationOptions(hold_out=0.25))
 print(report)
 check = lc.compare_with_truth(report.identification, machine.values)
-print(
-    f"{check.compared} combinations: chi-square {check.chi_square:.1f} (p = {check.p_value:.2f})"
-)
+print(f"{check.compared} combinations: chi-square {check.chi_square:.1f} (p = {check.p_value:.2f})")
 
 # %%
 report.validation.plot()
 
 # %%
-# With the three measured positions, nothing is left open. The anchors are least certain along their
-# lines, where an anchor and a length of line act alike.
+# With the three measured positions, nothing is left open. The anchors are least certain along
+# their lines, where an anchor and a length of line act alike.
 
 fit = lc.identify(robot, data)
 check = lc.compare_with_truth(fit, machine.values)
 print(f"{fit.rank} of {len(fit.names)} parameter combinations")
-print(
-    f"{check.compared} combinations: chi-square {check.chi_square:.1f} (p = {check.p_value:.2f})"
-)
+print(f"{check.compared} combinations: chi-square {check.chi_square:.1f} (p = {check.p_value:.2f})")
 fit.plot.correlation()

@@ -10,7 +10,8 @@ from a certificate; where it lies is unknown. Here a hexapod probes five faces.
 
 # %%
 # Each face is a plane in the frame of the cube. All five share this unknown frame. Opposite faces
-# are 80 mm apart, as the certificate says, so they determine the scale. The probe repeats to 1 um.
+# are 80 mm apart, as the certificate says, so they determine the scale. The probe repeats to 1
+# um.
 
 import numpy as np
 

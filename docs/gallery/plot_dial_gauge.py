@@ -9,8 +9,8 @@ what it leaves open, and which cheap measurement closes the gap.
 """
 
 # %%
-# A gauge that reads the gap between the tool and a plane is the measurement kind ``Plane``. It has
-# a standard deviation of 3 um. The plate is probed at 36 points.
+# A gauge that reads the gap between the tool and a plane is the measurement kind ``Plane``. It
+# has a standard deviation of 3 um. The plate is probed at 36 points.
 
 import numpy as np
 
@@ -39,8 +39,8 @@ for suggestion in lc.suggest_measurements(result):
     print(suggestion)
 
 # %%
-# Calipers measure six distances between marks on paper to 20 um. Each row of
-# the sensor names two poses, here corners of the plate.
+# Calipers measure six distances between marks on paper to 20 um. Each row of the sensor names two
+# poses, here corners of the plate.
 
 pairs = np.array([[0, 5], [30, 35], [0, 30], [5, 35], [0, 35], [5, 30]])
 calipers = lc.Sensor(lc.Separation(), lc.Gaussian(np.array([20e-6])), rows=pairs)

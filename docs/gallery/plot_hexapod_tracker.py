@@ -11,8 +11,8 @@ The machine is simulated, so the result can be compared with the truth.
 """
 
 # %%
-# The robot file states the drawing and its tolerances. The true machine deviates from the drawing;
-# here its errors are drawn from the tolerances.
+# The robot file states the drawing and its tolerances. The true machine deviates from the
+# drawing; here its errors are drawn from the tolerances.
 
 import numpy as np
 

@@ -43,8 +43,9 @@ describe("Huber's loss", lc.identify(robot, data, loss=lc.Huber()))
 describe("Tukey's loss", lc.identify(robot, data, loss=lc.Tukey()))
 
 # %%
-# **Your own loss** is a class with a function ``weight``. It gets the distance of each pose from the
-# fit, in standard deviations, and how many numbers were measured there. This is Cauchy's loss.
+# **Your own loss** is a class with a function ``weight``. It gets the distance of each pose from
+# the fit, in standard deviations, and how many numbers were measured there. This is Cauchy's
+# loss.
 
 
 class Cauchy:
@@ -78,30 +79,33 @@ describe("my rule, clean data", ridge)
 print(ridge.regularization)
 
 # %%
-# **Your own estimator.** ``lc.forward`` and ``lc.jacobian`` are all that an optimizer needs. This one
-# minimizes absolute values, nearly. Without a loss, it agrees with loopcal's least squares. Neither
-# knows the tolerances, so both are further from the truth than the fits above.
+# **Your own estimator.** ``lc.forward`` and ``lc.jacobian`` are all that an optimizer needs. This
+# one minimizes absolute values, nearly. Without a loss, it agrees with loopcal's least squares.
+# Neither knows the tolerances, so both are further from the truth than the fits above.
 
 sigma = 20e-6
 
 
-def residual(values):
+def residual(values, measured):
     """Return predicted minus measured positions over sigma, for these parameter values."""
     solution = lc.forward(robot.with_values(values), data.readings)
     return ((solution.T[:, :2, 3] - measured) / sigma).ravel()
 
 
-def derivative(values):
+def derivative(values, measured):
     """Return the derivatives: rows x and y of the twist of the platform."""
     twist = lc.jacobian(robot.with_values(values), data.readings).parameters
     return (twist[:, 3:5] / sigma).reshape(-1, len(values))
 
 
 settings = {"x_scale": robot.parameters.tolerance, "xtol": 1e-12, "ftol": 1e-12}
-for name, measured, loss in (("clean data", rows.measured, "linear"), ("wrong", wrong, "soft_l1")):
-    result = least_squares(residual, robot.values, derivative, loss=loss, **settings)
+tries = {"linear": rows.measured, "soft_l1": wrong}
+for loss, measured in tries.items():
+    result = least_squares(
+        residual, robot.values, derivative, loss=loss, args=(measured,), **settings
+    )
     errors = (result.x - truth) / reference.standard_deviations
-    print(f"scipy, {name}, {loss}: rms error {np.sqrt(np.mean(errors**2)):.2f} sd")
+    print(f"scipy, loss {loss}: rms error {np.sqrt(np.mean(errors**2)):.2f} sd")
     if loss == "linear":
         own = lc.identify(robot, clean, lc.LeastSquares())
         print(f"  largest difference from loopcal: {np.abs(result.x - own.estimate).max():.1e}")

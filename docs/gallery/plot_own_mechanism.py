@@ -4,14 +4,14 @@ My own mechanism, which no program knows
 ========================================
 
 A desktop plotter moves its pen with two slides and two rods, as a planar parallel robot. No program
-has a model of it. Its description takes twenty lines: chains of joints and how each one ends. From
+has a model of it. Its description takes thirty lines: chains of joints and how each one ends. From
 this loopcal derives kinematics, parameters and calibration, without a line of code.
 """
 
 # %%
-# Two slides run along x at y = 0 and y = 300 mm. Each pushes a rod, and both rods meet in the pen.
-# ``errors`` and ``unknown`` name what may differ from the drawing: where each slide is, how far it is
-# tilted, how long its rod is, and the zero and the scale of each drive.
+# Two slides run along x at y = 0 and y = 300 mm. Each pushes a rod, and both rods meet in the
+# pen. ``errors`` and ``unknown`` name what may differ from the drawing: where each slide is, how
+# far it is tilted, how long its rod is, and the zero and the scale of each drive.
 
 import tempfile
 from dataclasses import replace
@@ -29,7 +29,12 @@ units: {length: mm, angle: deg}
 freedoms: [x, y]
 controlled: [x, y]
 actuators:
-  left: &drive {reads: length, stroke: [-200, 200], unknown: [offset, gain], length: {sd: 0.3}, ratio: {sd: 0.001}}
+  left: &drive
+    reads: length
+    stroke: [-200, 200]
+    unknown: [offset, gain]
+    length: {sd: 0.3}
+    ratio: {sd: 0.001}
   right: *drive
 limbs:
   - name: lower
@@ -65,8 +70,9 @@ sheet = lc.sample_workspace(robot, 200, seed=1)
 print(f"{100 * sheet.reachable_share:.0f} % of the stated workspace is reachable")
 
 # %%
-# A scanner reads where the pen drew 40 crosses, to 20 um. The sheet lies in the scanner somehow, so
-# its frame is unknown: two coordinates and an angle. It lies flat, so the other three are stated.
+# A scanner reads where the pen drew 40 crosses, to 20 um. The sheet lies in the scanner somehow,
+# so its frame is unknown: two coordinates and an angle. It lies flat, so the other three are
+# stated.
 
 machine = robot.with_values(lc.sample_truth(robot, 1, seed=6)[0])
 scanner = lc.Component(("x", "y"), unknown=("frame",), frame="scanner")
@@ -87,7 +93,5 @@ report.validation.plot()
 # The truth, in standard deviations of the estimate, and what a scan cannot determine.
 
 check = lc.compare_with_truth(report.identification, machine.values)
-print(
-    f"{check.compared} combinations: chi-square {check.chi_square:.1f} (p = {check.p_value:.2f})"
-)
+print(f"{check.compared} combinations: chi-square {check.chi_square:.1f} (p = {check.p_value:.2f})")
 report.identification.plot.parameters()

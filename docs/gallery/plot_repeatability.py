@@ -9,8 +9,8 @@ computes both, each with the interval that thirty visits leave.
 """
 
 # %%
-# The simulated delta robot scatters by 10 um in x, y and z, and its geometry has errors of the size
-# of its tolerances. The tracker is five times better than the scatter, as the standard asks.
+# The simulated delta robot scatters by 10 um in x, y and z, and its geometry has errors of the
+# size of its tolerances. The tracker is five times better than the scatter, as the standard asks.
 
 import numpy as np
 

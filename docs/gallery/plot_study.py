@@ -9,8 +9,8 @@ how many points a delta robot needs with a cheap and with a good camera.
 """
 
 # %%
-# A study is a file. Each combination of its levels is a cell, here four numbers of points times two
-# cameras, with 100 machines in each.
+# A study is a file. Each combination of its levels is a cell, here four numbers of points times
+# two cameras, with 100 machines in each.
 
 import tempfile
 from pathlib import Path
@@ -37,21 +37,21 @@ if __name__ == "__main__":  # needed only where worker processes compute
     result = lc.study(folder / "study.yaml", folder / "results")
 
 # %%
-# The error of the calibrated machines at poses that were not measured: median and range of the 100
-# machines. The truth of every machine is known, so these are true errors.
+# The error of the calibrated machines at poses that were not measured: median and range of the
+# 100 machines. The truth of every machine is known, so these are true errors.
 
 result.draw("position")
 
 # %%
-# The question of the file: how many points keep the largest error of 95 % of the machines below 100
-# um?
+# The question of the file: how many points keep the largest error of 95 % of the machines below
+# 100 um?
 
 for answer in result.answer_questions():
     print(answer)
 
 # %%
-# Are the stated uncertainties true? Intervals of 95 % must contain the truth in 95 % of all cases.
-# All trials are one table, for any other question.
+# Are the stated uncertainties true? Intervals of 95 % must contain the truth in 95 % of all
+# cases. All trials are one table, for any other question.
 
 table = result.to_frame()
 print(table.groupby(["noise", "poses"])[["covered_parameters", "covered_position"]].mean())

@@ -41,8 +41,8 @@ comparison = lc.compare_runs([lc.load_run(folder / "may"), lc.load_run(folder / 
 print(comparison)
 
 # %%
-# Each shift is divided by its standard deviation, while all other parameters may have changed, too.
-# One of 42 shifts is too large for noise: that of the repaired joint.
+# Each shift is divided by its standard deviation, while all other parameters may have changed,
+# too. One of 42 shifts is too large for noise: that of the repaired joint.
 
 comparison.plot()
 

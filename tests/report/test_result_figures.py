@@ -3,12 +3,16 @@
 # matplotlib's types do not say that lines and images contain arrays.
 """Repeatability, uncertainty budgets, setup parameters and compared runs as figures and tables."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
 from tests.report.test_figures import check
+
+FIVE_BAR = Path(lc.__file__).parent / "robots" / "five-bar.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +107,37 @@ def test_compared_runs_show_and_list_the_shifts_in_standard_deviations(runs) -> 
 
 def test_regularization_curves_draw_themselves(five_bar) -> None:
     check(lc.compute_regularization_curves(five_bar.robot, five_bar.fitted, folds=3).plot())
+
+
+def test_validation_by_readings_alone_has_narrow_bars_with_their_numbers() -> None:
+    robot = lc.load_robot("cable-4")
+    machine = robot.with_values(lc.sample_truth(robot, 1, seed=3)[0])
+    poses = lc.sample_workspace(robot, 24, seed=1).coordinates
+    tape = lc.Sensor(lc.Position(), lc.Gaussian(np.full(3, 1e-3)), rows=np.arange(3))
+    data = lc.simulate(machine, poses, lc.Instrument((tape,)), seed=2)
+    readings = lc.Measurements(robot.name, data.readings, (), reading_sigma=data.reading_sigma)
+    fitted, held_out = readings.split(hold_out=0.25, seed=1)
+    validation = lc.validate(lc.identify(robot, fitted), held_out)
+    assert str(validation).startswith("Validation on the actuator readings of 6 poses:")
+    figure = validation.plot()
+    check(figure)
+    (axes,) = figure.axes
+    before, after = axes.patches
+    assert after.get_width() < 0.1 * np.ptp(axes.get_xlim())
+    numbers = [float(text.get_text()) for text in axes.texts]
+    assert_allclose(numbers, [before.get_height(), after.get_height()], rtol=0.01)
+
+
+def test_a_ratio_stands_without_the_unit_1(tmp_path) -> None:
+    """The gain of a drive is a number, not a number of ones."""
+    text = FIVE_BAR.read_text().replace("unknown: [offset]", "unknown: [offset, gain]")
+    path = tmp_path / "ratios.yaml"
+    path.write_text(text.replace("angle: {sd: 0.1}}", "angle: {sd: 0.1}, ratio: {sd: 0.001}}"))
+    robot = lc.load_robot(path)
+    poses = lc.sample_workspace(robot, 20, seed=1).coordinates
+    camera = lc.Instrument((lc.Sensor(lc.Component(("x", "y")), lc.Gaussian(np.full(2, 2e-5))),))
+    figure = lc.identify(robot, lc.simulate(robot, poses, camera, 1)).plot.parameters()
+    labels = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    gains = [label for label in labels if label.startswith(("0.99", "1.00"))]
+    assert len(gains) == 2
+    assert not [label for label in gains if label.endswith(" 1")]

@@ -69,6 +69,10 @@ def test_the_smallest_number_of_poses_is_found_for_every_other_combination(
         ("2", "map"): "no level",
         ("2", "least-squares"): "no level",
     }
+    question, *lines = str(answered).splitlines()
+    assert "smallest level of poses" in question
+    assert len(lines) == 4
+    assert lines[0].startswith("  noise 1, method map: 20 (10: 50 %")
     first = answered.answers[0]
     assert (first.quantity, first.unit, first.best) == ("count", "1", "20")
     assert [(s.level, s.value, s.reached, s.state) for s in first.shares] == [
