@@ -11,15 +11,19 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.page_commands import check_shown_lines, list_blocks, run_page
+from tests.cli.page_commands import check_shown_lines, list_blocks, run_command, run_page
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-STUDIES = ("instrument", "method", "poses")
+FOLDERS = ("questions", "machines", "instruments")
+STUDIES = [f"questions/{name}" for name in ("instrument", "method", "poses")]
 PAGES = [
-    f"{folder}/{path.stem}"
-    for folder in ("questions",)
-    for path in sorted((DOCS / folder).glob("*.md"))
-    if path.stem not in (*STUDIES, "README")
+    name
+    for path in [
+        *(p for folder in FOLDERS for p in sorted((DOCS / folder).glob("*.md"))),
+        DOCS / "controllers.md",
+    ]
+    if (name := path.relative_to(DOCS).with_suffix("").as_posix()) not in STUDIES
+    and "```sh" in path.read_text("utf-8")
 ]
 
 
@@ -54,11 +58,22 @@ def check_table_of_rods(page: str) -> None:
         assert found == arms
 
 
-def test_readme_of_questions_lists_every_page() -> None:
-    listed = re.findall(r"\]\(([\w-]+)\.md\)", read_page("questions/README"))
-    assert sorted(listed) == sorted(
-        path.stem for path in (DOCS / "questions").glob("*.md") if path.stem != "README"
-    )
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_readme_of_a_folder_lists_every_page(folder) -> None:
+    listed = re.findall(r"\]\(([\w-]+)\.md\)", read_page(f"{folder}/README"))
+    names = {path.stem for path in (DOCS / folder).glob("*.md")} - {"README"}
+    assert set(listed) == names
+
+
+def test_table_of_instruments_states_the_ranks_of_the_hexapod() -> None:
+    rows = re.findall(r"\| `(\w+)` \| (\d+) of 42 \|", read_page("instruments/README"))
+    assert len(rows) == 7
+    for kind, rank in rows:
+        command = f"loopcal identifiability hexapod-42 --kind {kind} --draw 40 --json"
+        found = json.loads(run_command(command))
+        assert (kind, found["rank"]) == (kind, int(rank))
+        frames = [one["meaning"] for one in found["unidentifiable"]]
+        assert all(frames), "what is not determined only moves a frame"
 
 
 def test_line_that_was_not_printed_is_an_error() -> None:
