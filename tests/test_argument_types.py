@@ -137,6 +137,7 @@ UNCHECKED = {
     *("suggest_measurements(sigma)", "validate(uncertainty)"),
     *("sample_truth(seed)", "simulate_trials(seed)"),
     *("write_report(path)", "write_report(report)"),
+    *("write_comparison(path)", "write_comparison(comparison)"),
     *("load_study(path)", "study(source)", "study(folder)", "study(executor)"),
 }
 """Parameters of public functions that check them themselves, or use objects of any class."""

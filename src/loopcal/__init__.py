@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import find_outliers as find_outliers
     from loopcal.diagnose import identifiability as identifiability
     from loopcal.diagnose import suggest_measurements as suggest_measurements
+    from loopcal.documents import write_comparison as write_comparison
     from loopcal.documents import write_report as write_report
     from loopcal.errors import ArgumentTypeError as ArgumentTypeError
     from loopcal.errors import DataError as DataError
@@ -180,7 +181,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
             compare_with_values compute_regularization_curves cross_validate examine_fit
             find_outliers identifiability suggest_measurements
         """,
-        "loopcal.documents": "write_report",
+        "loopcal.documents": "write_comparison write_report",
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
             MissingPackageError StudyError UnitError

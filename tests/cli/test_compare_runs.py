@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -187,3 +189,76 @@ def test_the_page_shows_what_its_commands_print(root, tmp_path, monkeypatch, cap
     assert shown.split("\n...\n")[0] in printed
     for part in shown.split("\n...\n"):
         assert part.strip("\n") in printed
+
+
+HOSTILE = "<script>alert(1)</script>=1+1\x1b[31m$\\frac{"
+
+
+def read_policy(text: str) -> str:
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert policy is not None
+    return policy[1].replace("&#39;", "'")
+
+
+def test_page_shows_the_comparison_without_programs_and_requests(compare) -> None:
+    code, out, err = compare("may june july -o page.html")
+    assert (code, err) == (0, "")
+    assert "Written to page.html" in out
+    text = Path("page.html").read_text("utf-8")
+    headings = re.findall(r'<h2 id="([a-z]+)">', text)
+    assert headings == ["result", "parameters", "shifts", "errors"]
+    for words in (
+        "Comparison of calibrations: may, june, july",
+        "A machine differs from that of may, beyond the noise.",
+        "A change of tower2.stop alone explains it",
+        "linear-delta: undecided, MAP",
+        "No held-out pose is common to all runs",
+    ):
+        assert words in text
+    assert len(re.findall(r"<figure>\s*<svg", text)) == 3
+    assert "<script" not in text
+    assert re.search(r"\sstyle=|\son[a-z]+=|https?://", text) is None
+    assert read_policy(text).startswith("default-src 'none'; style-src 'sha256-")
+    compare("may plain -o methods.html")
+    text = Path("methods.html").read_text("utf-8")
+    assert "Whether a machine has changed was not tested." in text
+    assert "so no shift was tested" in text
+    assert "4 common poses" in text
+
+
+def test_ending_of_the_file_chooses_its_format(compare) -> None:
+    assert compare("may june -o both.json")[0] == 0
+    printed = json.loads(compare("may june --json")[1])
+    assert json.loads(Path("both.json").read_text("utf-8")) == printed
+    assert compare("may june -o both.csv")[0] == 0
+    assert Path("both.csv").read_text("utf-8").startswith("run,parameter,")
+    code, _, err = compare("may june -o both.xlsx")
+    assert code == 1
+    assert "ends in .html, .json or .csv, but this one has '.xlsx'" in err
+    assert not Path("both.xlsx").exists()
+    code, _, err = compare("may june -o both.csv")
+    assert code == 1
+    assert "--force" in err
+    with pytest.raises(lc.LoopcalError, match="comparison is str; pass the result of"):
+        lc.write_comparison("both.html", "may")  # pyright: ignore[reportArgumentType]
+
+
+def test_hostile_names_are_text_in_all_formats(runs, monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    comparison = lc.compare_runs([lc.load_run(runs / name) for name in ("may", "june")])
+    first = replace(comparison.runs[0], name=HOSTILE, robot=HOSTILE)
+    (pair,) = comparison.pairs
+    changed = replace(
+        comparison,
+        runs=(first, comparison.runs[1]),
+        pairs=(replace(pair, first=HOSTILE),),
+        errors=(replace(comparison.errors[0], run=HOSTILE), comparison.errors[1]),
+    )
+    for name in ("page.html", "rows.csv", "all.json"):
+        lc.write_comparison(name, changed)
+        text = Path(name).read_text("utf-8")
+        assert "\x1b" not in text
+    page = Path("page.html").read_text("utf-8")
+    assert "<script" not in page
+    assert "&lt;script&gt;alert(1)" in page
+    assert all(not row.startswith("=") for row in Path("rows.csv").read_text("utf-8").splitlines())

@@ -7,12 +7,14 @@ These tests need Chromium, which `.ci/run` installs, and the packages of the ext
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import loopcal as lc
 from loopcal.cli import main
 from loopcal.documents.printing import find_browser, is_root
 
@@ -77,6 +79,26 @@ def test_page_opens_without_requests_errors_and_javascript(browser, page) -> Non
         assert box["height"] > 150.0
     assert tab.locator("main p").first.is_visible()
     assert count_pages(tab.pdf(prefer_css_page_size=True)) <= MOST_PAGES
+    context.close()
+
+
+def test_page_of_a_comparison_opens_without_requests_and_passes_axe(browser, run, tmp_path) -> None:
+    second = tmp_path / "second"
+    shutil.copytree(run.path, second)
+    comparison = lc.compare_runs([run, lc.load_run(second)])
+    written = lc.write_comparison(tmp_path / "comparison.html", comparison)
+    context = browser.new_context(
+        offline=True, bypass_csp=True, viewport={"width": 420, "height": 800}
+    )
+    tab, logged, asked = context.new_page(), [], []
+    tab.on("console", lambda message: logged.append(message.text))
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.goto(written.as_uri())
+    assert (asked, logged) == ([written.as_uri()], [])
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 420
+    tab.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text("utf-8"))
+    answer = tab.evaluate(f"axe.run({EVERY_RULE})")
+    assert [(v["id"], v["nodes"][0]["html"]) for v in answer["violations"]] == []
     context.close()
 
 

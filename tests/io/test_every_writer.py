@@ -99,6 +99,10 @@ COMMANDS = {
     "studies/files/template.py:write_study_text": ("study new --robot five-bar F.yaml",),
     "papers/paper_studies.py:write": ("study new --paper hexapod-42 F.yaml",),
     "io/runs/curves_folder.py:write_curves": ("regularize five-bar data.csv -o F",),
+    "documents/comparison.py:write_comparison": (
+        "compare run second -o F.html",
+        "compare run second -o F.json",
+    ),
     "documents/writing.py:write_report": ("report run -o F.html",),
 }
 """Commands that write the file or folder F, by the function that writes it."""

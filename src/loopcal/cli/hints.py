@@ -94,7 +94,8 @@ HINTS = {
     "workflow.limit-needs-held-out-poses": "add --hold-out 0.25",
     "workflow.next-hold-out": "use --hold-out 0.25, or loopcal validate RUN OTHER-DATA",
     "workflow.next-hold-out-more": "use a larger --hold-out, or loopcal validate RUN OTHER-DATA",
-    "workflow.next-check-height-sign": "loopcal import reads the heights of a firmware with their sign",
+    "workflow.next-check-height-sign": "loopcal import reads the heights of a firmware with their "
+    "sign",
     "workflow.next-state-noise": "use --noise estimated, or state noise in the measurement file",
     "workflow.no-held-out-poses": "use --hold-out 0.25",
     "workflow.undetermined-combinations": "see loopcal identifiability ROBOT DATA",

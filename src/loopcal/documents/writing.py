@@ -60,7 +60,7 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     document = build_document(load_record(report))
     html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
     with restore_on_failure((path, data)):
-        write_text(path, html, lambda file: _check_html(file, html))
+        write_text(path, html, lambda file: check_html(file, html))
         write_text(data, json_text, lambda file: read_json(file, "report", "", TABLE_SIZE))
     return path
 
@@ -79,6 +79,6 @@ def name_files(path: Path) -> tuple[Path, Path]:
     return path, path.with_suffix(".json")
 
 
-def _check_html(file: Path, html: str) -> None:
+def check_html(file: Path, html: str) -> None:
     """Read a written page; raise LoopcalError where it is not the one that was made."""
     require_same("page", html, read_text(file, "report", limit=TABLE_SIZE))

@@ -40,11 +40,8 @@ def view_comparison(comparison: RunComparison, show_unit: Callable[[str], Unit])
     findings = [(f.severity.value, str(f)) for f in sort_by_importance(comparison.findings)]
     names = ", ".join(run.name for run in comparison.runs)
     blocks: list[Block] = [f"Comparison of {names}.", "", *format_list(findings), ""]
-    runs = (
-        (run.name, f"{run.robot}: {run.verdict}, {run.method.partition('(')[0]}")
-        for run in comparison.runs
-    )
-    blocks += [*format_list(list(runs)), "", build_estimates(comparison), ""]
+    runs = [(run.name, _describe_run(run)) for run in comparison.runs]
+    blocks += [*format_list(runs), "", build_estimates(comparison), ""]
     if any(pair.moved is not None for pair in comparison.pairs):
         blocks += [build_shifts(comparison), ""]
     return [*blocks, build_errors(comparison, show_unit)]
@@ -53,6 +50,13 @@ def view_comparison(comparison: RunComparison, show_unit: Callable[[str], Unit])
 def _describe_run(run: RunSummary) -> str:
     """Return the robot of a run, its verdict and its method."""
     return f"{run.robot}: {run.verdict}, {run.method.partition('(')[0]}"
+
+
+def build_runs(comparison: RunComparison) -> Table:
+    """Return robot, verdict and method of each run."""
+    columns = tuple(word_column(title, wraps=True) for title in ("run", "robot, verdict, method"))
+    rows = tuple((run.name, _describe_run(run)) for run in comparison.runs)
+    return Table("The compared runs", columns, rows)
 
 
 def build_estimates(comparison: RunComparison) -> Table:

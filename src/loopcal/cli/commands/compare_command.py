@@ -29,7 +29,12 @@ from loopcal.cli.options.shared_options import (
     metavar="DATA",
     help="Measurements at which the errors of all runs are compared. May be given several times.",
 )
-@file_option("-o", "--output", help="CSV file to write, one row for each run and parameter.")
+@file_option(
+    "-o",
+    "--output",
+    help="File to write: .html (a page with figures), .json, or .csv (one row for each run and "
+    "parameter).",
+)
 @data_options
 @force_option("the output file")
 @json_option
@@ -55,26 +60,23 @@ def compare(
     Examples:
       loopcal compare may june
       loopcal compare map ridge --data more.csv
+      loopcal compare may june july -o sessions.html
       loopcal compare may june july -o sessions.csv
     """  # noqa: D301
     from loopcal.apply import compare_runs
+    from loopcal.documents.comparison import check_ending, write_comparison
     from loopcal.io import load_run
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.runs.comparison_file import save_comparison
-    from loopcal.report.run_comparison_view import (
-        find_error_units,
-        tabulate_comparison,
-        view_comparison,
-    )
+    from loopcal.report.run_comparison_view import find_error_units, view_comparison
 
     if output is not None:
+        check_ending(output)
         refuse_outputs((output,), (*runs, *data), force)
     loaded = [load_run(run) for run in runs]
     measurements = read_checked_measurements(data, loaded[0].robot, **flags) if data else None
     comparison = compare_runs(loaded, measurements)
     if output is not None:
-        table = tabulate_comparison(comparison)
-        save_comparison(output, [column.title for column in table.columns], table.rows)
+        write_comparison(output, comparison)
     if as_json:
         terminal.print_json(comparison.to_dict())
         return 0

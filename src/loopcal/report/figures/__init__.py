@@ -5,6 +5,8 @@
 """
 
 from loopcal.report.figures.accuracy_figure import draw_accuracy_map as draw_accuracy_map
+from loopcal.report.figures.comparison_figures import draw_run_errors as draw_run_errors
+from loopcal.report.figures.comparison_figures import draw_run_parameters as draw_run_parameters
 from loopcal.report.figures.convergence_figure import draw_convergence as draw_convergence
 from loopcal.report.figures.height_figure import draw_height_errors as draw_height_errors
 from loopcal.report.figures.identifiability_figure import (

@@ -146,16 +146,16 @@ def draw_runs(comparison: RunComparison) -> Figure:
     figure = start_figure(7.2, 1.8 + 0.2 * len(names))
     axes: Any = figure.add_subplot()
     handles, y = [], np.arange(len(names))
-    for k, pair in enumerate(comparison.pairs):
+    for k, pair in enumerate(comparison.pairs, 1):  # the first run has color and marker 0
         color, marker = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
         shifts = [find_shift(pair, name) for name in names]
         size = np.array([shift / sd if sd > 0.0 else np.nan for shift, sd, _ in shifts])
         significant = np.array([flag for _, _, flag in shifts])
-        offset = 0.5 * (k + 1) / (len(comparison.pairs) + 1) - 0.25
+        offset = 0.5 * k / (len(comparison.pairs) + 1) - 0.25
         for chosen, face in ((significant, color), (~significant, "white")):
             axes.plot(size[chosen], (y + offset)[chosen], marker, color=color, mfc=face, ms=DOT + 2)
         handles.append(
-            Line2D([], [], color=color, marker=marker, ls="none", label=f"{pair.second}")
+            Line2D([], [], color=color, marker=marker, ls="none", label=shorten(pair.second))
         )
     axes.axvspan(-1.96, 1.96, color=PALE, alpha=0.35, lw=0.0, zorder=0)
     axes.axvline(0.0, color=REFERENCE, lw=THIN)

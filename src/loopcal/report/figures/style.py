@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from loopcal.plain_text import escape
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -122,7 +124,10 @@ def label_poses(axes: Axes, labels: Sequence[str]) -> None:
 
 
 def shorten(name: str, length: int = LONGEST) -> str:
-    """Return a name of at most so many characters; three dots stand for its middle."""
+    """Return a name of at most so many characters; three dots stand for its middle. Characters that
+    are not plain text are shown as escapes.
+    """
+    name = escape(name)
     if len(name) <= length:
         return name
     half = (length - 1) // 2

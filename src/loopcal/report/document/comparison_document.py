@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several calibrations side by side as a document: result, parameters, shifts, held-out errors."""
+
+from __future__ import annotations
+
+from loopcal.apply import RunComparison
+from loopcal.findings.importance import sort_by_importance
+from loopcal.report.document.elements import Document, Element, Listing, Section
+from loopcal.report.document.inline_svg import make_picture
+from loopcal.report.figures import draw_run_errors, draw_run_parameters, draw_runs
+from loopcal.report.run_comparison_view import (
+    build_errors,
+    build_estimates,
+    build_runs,
+    build_shifts,
+    find_error_units,
+)
+
+HEADS = {True: "not_calibrated", False: "calibrated", None: "undecided"}
+"""Whether a machine has changed -> the color of the head, as of a verdict."""
+SUMMARIES = {
+    True: "A machine differs from that of {first}, beyond the noise.",
+    False: "The machines do not differ from that of {first} beyond the noise.",
+    None: "Whether a machine has changed was not tested.",
+}
+MEANING = (
+    "The first run is the reference of all others. A change is tested where the data of two runs "
+    "are independent, in the directions that both data sets determine. If nothing has changed, a "
+    "change is reported in 5 % of cases, for all runs together."
+)
+NO_SHIFTS = (
+    "The data of the runs are not independent, or have no direction in common, so no shift was "
+    "tested."
+)
+
+
+def build_comparison_document(comparison: RunComparison, made_by: str) -> Document:
+    """Return a comparison as a document.
+
+    Parameters
+    ----------
+    made_by : program and version.
+    """
+    names = ", ".join(run.name for run in comparison.runs)
+    summary = SUMMARIES[comparison.moved].format(first=comparison.runs[0].name)
+    sections = (
+        _build_result(comparison),
+        _build_parameters(comparison),
+        _build_shifts(comparison),
+        _build_errors(comparison),
+    )
+    return Document(
+        title=f"Comparison of calibrations: {names}",
+        verdict=HEADS[comparison.moved],
+        summary=summary,
+        made_by=made_by,
+        sections=sections,
+    )
+
+
+def _build_result(comparison: RunComparison) -> Section:
+    """Return the findings, the most important first, and the runs."""
+    findings = sort_by_importance(comparison.findings)
+    listed = Listing(tuple((finding.severity.value, str(finding)) for finding in findings))
+    elements: list[Element] = [MEANING, *([listed] if findings else []), build_runs(comparison)]
+    return Section("result", "Whether and where the machine changed", tuple(elements))
+
+
+def _build_parameters(comparison: RunComparison) -> Section:
+    """Return estimates with intervals, side by side."""
+    picture = make_picture(
+        draw_run_parameters(comparison),
+        "estimates-figure",
+        "Estimates of all runs with their 95 % intervals.",
+        "For each parameter the figure shows the estimate of each run minus that of the first run, "
+        "with its interval, in half-widths of the first run's interval. The table has the numbers.",
+    )
+    elements = (build_estimates(comparison), picture)
+    return Section("parameters", "Parameters side by side", elements)
+
+
+def _build_shifts(comparison: RunComparison) -> Section:
+    """Return the tested shifts in standard deviations."""
+    title = "Shifts in standard deviations"
+    if all(pair.moved is None for pair in comparison.pairs):
+        return Section("shifts", title, (NO_SHIFTS,))
+    picture = make_picture(
+        draw_runs(comparison),
+        "shift-figure",
+        "Shift of each parameter from the first run.",
+        "For each parameter the figure shows the shift in standard deviations while all others may "
+        "have changed, too. Filled markers are significant at 5 % for all parameters and runs "
+        "together. A parameter without a marker is not determined by both data sets.",
+    )
+    return Section("shifts", title, (picture, build_shifts(comparison)))
+
+
+def _build_errors(comparison: RunComparison) -> Section:
+    """Return the errors after calibration, at common poses or at those of each run."""
+    units = find_error_units(comparison)
+    table = build_errors(comparison, units.__getitem__)
+    elements: list[Element] = [table]
+    if any(one.common or one.own for one in comparison.errors):
+        picture = make_picture(
+            draw_run_errors(comparison, units.__getitem__),
+            "errors-figure",
+            "Errors of each run after calibration.",
+            "Bars are root mean squares and dots are the largest errors of each run. Errors at "
+            "poses that are not common to all runs also differ because the poses do.",
+        )
+        elements.append(picture)
+    return Section("errors", "Held-out errors", tuple(elements))
