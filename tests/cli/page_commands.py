@@ -8,7 +8,7 @@
 * All `python` blocks share their names.
 * A `text` block below them has lines of what the commands and the code above it have printed, in
   this order; `...` stands for lines that are left out.
-* `<!-- file: NAME -->` above a block of another language makes it a file of this name.
+* `<!-- file: NAME -->` above a block makes it a file of this name. A block `none` is only read.
 """
 
 from __future__ import annotations

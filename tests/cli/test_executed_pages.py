@@ -66,10 +66,13 @@ def test_readme_of_a_folder_lists_every_page(folder) -> None:
 
 
 def test_table_of_instruments_states_the_ranks_of_the_hexapod() -> None:
-    rows = re.findall(r"\| `(\w+)` \| (\d+) of 42 \|", read_page("instruments/README"))
-    assert len(rows) == 7
-    for kind, rank in rows:
-        command = f"loopcal identifiability hexapod-42 --kind {kind} --draw 40 --json"
+    rows = re.findall(
+        r"\| `(\w+)`(?: \((\w)\))? \| (\d+) of 42 \|", read_page("instruments/README")
+    )
+    assert len(rows) == 8
+    for kind, component, rank in rows:
+        options = f"--kind {kind}" + (f" --components {component}" if component else "")
+        command = f"loopcal identifiability hexapod-42 {options} --draw 40 --json"
         found = json.loads(run_command(command))
         assert (kind, found["rank"]) == (kind, int(rank))
         frames = [one["meaning"] for one in found["unidentifiable"]]
