@@ -9,8 +9,10 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import loopcal as lc
 from tests.cli.page_commands import check_shown_lines, list_blocks, run_command, run_page
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -46,6 +48,34 @@ def test_page_runs_and_prints_what_it_shows(name, tmp_path, monkeypatch) -> None
     assert shown, "a page shows what its commands print"
     if name == "questions/rods-get-shorter":
         check_table_of_rods(page)
+
+
+def test_rods_of_20_mm_stay_flat_and_are_off_center_as_the_page_states(
+    tmp_path, monkeypatch
+) -> None:
+    """Check the sentences on 20 mm of docs/questions/flat-but-off-center.md."""
+    monkeypatch.chdir(tmp_path)
+    page = read_page("questions/flat-but-off-center")
+    files = {block.file: block.text for block in list_blocks(page) if block.file}
+    Path("seven.csv").write_text(files["seven.csv"])
+    machine_text = files["wrong-rods.yaml"].replace("225", "240").replace("215", "200")
+    Path("machine.yaml").write_text(machine_text)
+    nominal_text = machine_text[: machine_text.index("identified:")]
+    Path("firmware.yaml").write_text(nominal_text + "fixed: [arm*.length]\n")
+    run_command(
+        "loopcal simulate machine.yaml --poses seven.csv --kind component --components z "
+        "--sigma-position 0.02mm -o heights.csv"
+    )
+    printed = run_command("loopcal calibrate firmware.yaml heights.csv -o run")
+    largest = re.search(r"^position z +largest +7 +\S+ +(\S+)", printed, re.MULTILINE)
+    assert largest
+    assert float(largest[1]) < 0.04  # [mm]
+    firmware, machine = lc.load_robot("run/robot.yaml"), lc.load_robot("machine.yaml")
+    targets = np.array([[0, 0, 0], [0.06, 0, 0], [0, 0.06, 0], [-0.06, 0, 0], [0, -0.06, 0]])
+    nozzle = lc.forward(machine, lc.inverse(firmware, targets).q).T[:, :3, 3]
+    shift = 1e3 * np.linalg.norm((nozzle - targets)[:, :2], axis=1)
+    sentence = "the center is {:.0f} mm and the edge up to {:.0f} mm off"
+    assert sentence.format(shift[0], shift.max()) in " ".join(page.split())
 
 
 def check_table_of_rods(page: str) -> None:
