@@ -47,8 +47,9 @@ def watch(event, arguments):
     elif event == "open" and arguments[0] is not None:
         path, mode, flags = arguments
         is_written = flags & (os.O_WRONLY | os.O_RDWR) if mode is None else set(mode) & set("wax+")
-        if is_written and is_outside(path) and "__pycache__" not in str(path):
+        if is_written and is_outside(path):
             events.append((event, repr(arguments)[:200]))
+sys.dont_write_bytecode = True
 sys.addaudithook(watch)
 codes = [main(command.split()) for command in sys.argv[1].splitlines()]
 found = list(events)

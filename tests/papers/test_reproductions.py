@@ -10,6 +10,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.errors import DataError, FileError
+from loopcal.io.core.json_text import to_json
 from loopcal.papers import PAPERS, Paper, paper
 from loopcal.papers.drawing import choose_styles, draw
 from loopcal.papers.reproduction import Figure, Series, Verdict
@@ -185,5 +186,7 @@ def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     assert "figures/figure_4.png" in written.pop("files")
     assert written == document
     assert (folder / "figures" / "figure_4.png").is_file()
-    assert main(["reproduce", "hexapod-42", "--trials", "2"]) == 0
+    again = PAPERS["hexapod-42"].run(0, 2)  # the same seed gives the same numbers
+    assert json.loads(to_json(again.to_dict())) == document
+    assert main(["reproduce", "hexapod-42", "--trials", "2", "--seed", "8"]) == 0
     assert "DOES NOT AGREE" in capsys.readouterr().out

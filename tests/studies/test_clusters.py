@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same study computed in one process, by two, by dask and by ray has identical blocks."""
+"""The same study computed in one process, by dask and by ray has identical blocks; by two
+processes: test_driver.py.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import pytest
 
 from evidence.study_interruption import Contents, read_contents
 from loopcal.errors import FileError
-from loopcal.studies.execution import Dask, Executor, Processes, Ray, Serial
+from loopcal.studies.execution import Dask, Executor, Ray, Serial
 from loopcal.studies.running import read_source, run_study
 from tests.studies.block_functions import (
     die_once,
@@ -39,7 +41,6 @@ def test_every_kind_of_worker_computes_identical_blocks(tmp_path, monkeypatch) -
     expected = compute(tmp_path / "serial", Serial())
     assert len(expected) == CELLS * 4
     assert len(set(expected.values())) == len(expected)
-    assert compute(tmp_path / "processes", Processes(2)) == expected
     with make_cluster(2) as cluster:
         assert compute(tmp_path / "dask", Dask(cluster.scheduler_address)) == expected
     assert compute(tmp_path / "ray", Ray(processors=2)) == expected

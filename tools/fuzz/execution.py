@@ -117,6 +117,7 @@ def prepare_worker() -> None:
     signal.signal(signal.SIGPROF, _stop)
     signal.signal(signal.SIGALRM, _stop_waiting)
     platform.uname().processor  # noqa: B018  # starts a program once, which is not the run's doing
+    sys.dont_write_bytecode = True  # Python compiles a module where the first run imports it
     sys.addaudithook(watch_writes)
     os.environ["COLUMNS"] = "100"
 
