@@ -6,6 +6,7 @@
 
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import matplotlib.figure
 import numpy as np
@@ -262,6 +263,39 @@ def test_plan_that_goes_via_home_says_so(plan) -> None:
     figure = figures.draw_plan(replace(plan, poses=replace(plan.poses, via_home=via)))
     assert "path via home" in [text.get_text() for text in figure.legends[0].texts]
     assert sum(line.get_linestyle() == "--" for line in figure.axes[0].lines) == 2
+
+
+def test_plan_of_surfaces_shows_the_line_and_the_plane_of_each_group() -> None:
+    options = lc.SurfaceOptions(groups=4, points=5)
+    plan = lc.plan_surfaces(lc.load_robot("linear-delta"), options)
+    figure = plan.plot()
+    check(figure)
+    assert len(figure.axes) == 3
+    for axes, view in zip(figure.axes, ([0, 1], [0, 2], [1, 2]), strict=True):
+        lines = [line.get_xydata() for line in axes.lines if line.get_linewidth() == 2.2]
+        assert_allclose(np.stack(lines), 1e3 * plan.positions[:, :2][:, :, view])
+        numbers = ", ".join(text.get_text() for text in axes.texts)
+        assert sorted(map(int, numbers.split(", "))) == [1, 2, 3, 4]
+    assert "4 planes with a perpendicular line, n = 5 points" in figure.get_suptitle()
+    labels = [text.get_text() for text in figure.legends[0].texts]
+    assert "group 4, line along " in labels[-1]
+
+
+def test_one_parameter_and_one_pose_are_singular(five_bar, tmp_path) -> None:
+    robot, data = five_bar.robot, five_bar.fitted
+    source = (Path(lc.__file__).parent / "robots" / "five-bar.yaml").read_text()
+    fixed = [name for name in robot.parameters.names if name != "left.offset"]
+    (tmp_path / "five-bar.yaml").write_text(f"{source}fixed: [{', '.join(fixed)}]\n")
+    single = lc.load_robot(tmp_path / "five-bar.yaml")
+    fit = lc.identify(single, data)
+    assert "five-bar: 1 parameter" in fit.plot.parameters().get_suptitle()
+    assert fit.plot.correlation().get_suptitle().endswith("correlation of 1 parameter")
+    spectrum = lc.identifiability(single, data).plot().axes[0]
+    assert all(tick == round(tick) for tick in spectrum.get_xticks())
+    one = lc.identify(robot, data.take([0]))
+    assert "residuals of 1 pose;" in one.plot.residuals().get_suptitle()
+    for figure in (fit.plot.parameters(), one.plot.parameters(), one.plot.residuals()):
+        check(figure)
 
 
 @pytest.mark.parametrize(("name", "panels"), [("five-bar", 1), ("3-rrr", 1), ("linear-delta", 2)])

@@ -153,8 +153,8 @@ class SurfacePlan(TableResult):
         )
 
     def plot(self) -> Figure:
-        """Draw the poses, numbered in their order, with the path between them."""
-        return draw("draw_plan", self)
+        """Draw where the tool is at the points of each group, in three views."""
+        return draw("draw_surface_plan", self)
 
     def __repr__(self) -> str:
         u, k = self.poses.groups.shape

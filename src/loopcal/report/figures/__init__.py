@@ -24,4 +24,5 @@ from loopcal.report.figures.result_figures import draw_repeatability as draw_rep
 from loopcal.report.figures.result_figures import draw_runs as draw_runs
 from loopcal.report.figures.robot_figure import draw_robot as draw_robot
 from loopcal.report.figures.scene_figure import draw_scene as draw_scene
+from loopcal.report.figures.surface_plan_figure import draw_surface_plan as draw_surface_plan
 from loopcal.report.figures.validation_figure import draw_validation as draw_validation

@@ -75,7 +75,9 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
         figure.axes[-1].set_ylabel(f"{name} uncertainty (rms) [{unit.symbol}]", fontsize=LABEL)
     add_legend(figure, _list_handles(accuracy))
     n = len(accuracy.coordinates)
-    outside = f"{int(accuracy.extrapolated.sum())} of {n} poses are extrapolated"
+    outside = (
+        f"{int(accuracy.extrapolated.sum())} of {n} {'pose' if n == 1 else 'poses'} extrapolated"
+    )
     return finish_figure(figure, f"{outside}\n{accuracy.uncertainty.frame}")
 
 

@@ -17,6 +17,7 @@ from loopcal.report.figures.style import (
     REFERENCE,
     SMALL,
     THIN,
+    add_legend,
     finish_figure,
     label_axes,
     shorten,
@@ -46,13 +47,14 @@ def draw_identifiability(analysis: Identifiability) -> Figure:
     combinations = (*analysis.unidentifiable, *analysis.weak)[:MOST_COMBINATIONS]
     names = _list_names(combinations)
     width = 5.2 + (2.2 + 0.42 * len(combinations) + 0.8 if combinations else 0.0)
-    figure = start_figure(width, max(4.4, 1.9 + 0.17 * len(names)))
+    figure = start_figure(width, max(4.7, 2.2 + 0.17 * len(names)))
     if not combinations:
         _draw_spectrum(figure.add_subplot(), analysis)
     else:
         panels: Any = figure.subplots(1, 2, width_ratios=[5.0, width - 5.0])
         _draw_spectrum(panels[0], analysis)
         _draw_combinations(figure, panels[1], analysis, combinations, names)
+    add_legend(figure, figure.axes[0].get_legend_handles_labels()[0])
     robot = analysis.free_parameters.robot.name
     rank = f"rank {analysis.rank} of {analysis.n_parameters}"
     return finish_figure(figure, f"{robot}: {rank}, {analysis.n_equations} equations")
@@ -85,9 +87,9 @@ def _draw_spectrum(axes: Axes, analysis: Identifiability) -> None:
         _mark_gap(axes, analysis, drawn)
     from matplotlib.ticker import MaxNLocator
 
-    axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    axes.set_xlim(0.4 - 0.02 * len(s), len(s) + 0.6 + 0.02 * len(s))
+    axes.xaxis.set_major_locator(MaxNLocator(10, integer=True, min_n_ticks=1))
     label_axes(axes, "direction [1]", "singular value [sigma per tolerance]", "singular values")
-    axes.legend(frameon=False, fontsize=SMALL, loc="best")
 
 
 def _set_powers(axes: Axes) -> None:
@@ -108,7 +110,7 @@ def _mark_gap(axes: Axes, analysis: Identifiability, drawn: np.ndarray) -> None:
     ends = (x, float(drawn[rank - 1])), (x, float(drawn[rank]))
     axes.annotate("", *ends, arrowprops={"arrowstyle": "<->", "color": DARK, "lw": THIN})
     axes.annotate(
-        f"gap {analysis.gap:.2g}",
+        f"gap {analysis.gap:.2g}" if np.isfinite(analysis.gap) else "infinite gap",
         (x, float(np.sqrt(drawn[rank - 1] * drawn[rank]))),
         xytext=(-4, 0),
         textcoords="offset points",

@@ -111,7 +111,12 @@ def draw_parameters(fit: FittedParameters) -> Figure:
     status = "" if fit.converged else "; not converged: last values, no estimates"
     n_assumed = int(fit.free_parameters.assumed.sum())
     assumed = f"; {n_assumed} tolerances are assumed" if n_assumed else ""
-    return finish_figure(figure, f"{fit.robot.name}: {p} parameters{assumed}{status}")
+    return finish_figure(figure, f"{fit.robot.name}: {_count(p)}{assumed}{status}")
+
+
+def _count(parameters: int) -> str:
+    """Return a number of parameters in words."""
+    return "1 parameter" if parameters == 1 else f"{parameters} parameters"
 
 
 def _half_widths(fit: FittedParameters) -> FloatArray:
@@ -153,6 +158,8 @@ def _draw_uncertainties(axes: Axes, fit: FittedParameters, chunk: IntArray) -> N
         axes.set_xlim(0.6 * min(half[drawn].min(), 1.0), 1.7 * max(half[drawn].max(), 1.0))
         axes.set_xscale("log")
         label_logarithmic(axes.xaxis, FEW_TICKS)
+    else:
+        axes.set_xticks([])
     factor, symbols = fit.free_parameters.display()
     symbols = ["" if symbol == RATIO else f" {symbol}" for symbol in symbols]
     widths = half * fit.free_parameters.tolerance[chunk] / factor[chunk]
@@ -165,7 +172,9 @@ def _draw_uncertainties(axes: Axes, fit: FittedParameters, chunk: IntArray) -> N
         numbers = [f"{estimate[i]:.3g}{symbols[i]}" for i in chunk]
     axes.yaxis.tick_right()
     _set_rows(axes, numbers)
-    label_axes(axes, "half-width [tolerance]", "", "uncertainty (95 %)")
+    label = "half-width [tolerance]" if drawn.any() else ""
+    title = "uncertainty (95 %)" if drawn.any() else "without an interval"
+    label_axes(axes, label, "", title)
 
 
 def _set_rows(axes: Axes, labels: list[str]) -> None:
@@ -215,7 +224,7 @@ def _describe_correlation(fit: FittedParameters, step: int) -> str:
     """Return the strongest correlation in words, and what grey means where there is any."""
     correlation = compute_correlation(fit)
     off = np.abs(np.nan_to_num(correlation - np.diag(np.diag(correlation))))
-    words = f"correlation of {len(fit.free_parameters.names)} parameters"
+    words = f"correlation of {_count(len(fit.free_parameters.names))}"
     if off.size and off.max() > 0.0:
         i, j = np.unravel_index(int(off.argmax()), off.shape)
         value = f"{correlation[i, j]:+.2f}"

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.mechanism import POSITION, Mechanism
-from loopcal.planning import SurfacePlan
 from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import DIMENSIONS
 from loopcal.planning.result import Plan, PlannedPoses
@@ -45,7 +44,7 @@ DISK, CLOSE = 9.5, 0.02
 """Size of the disk of a pose [pt], and distance of two overlapping ones as a share of an axis."""
 
 
-def draw_plan(plan: Plan | SurfacePlan) -> Figure:
+def draw_plan(plan: Plan) -> Figure:
     """Draw the poses of a plan in pairs of controlled coordinates, numbered in the order of
     visiting, with the path between them.
 

@@ -95,7 +95,8 @@ def draw_residual_rows(
         place = grid[n + 1 + row, 2 * column : 2 * column + 2]
         _draw_against(figure.add_subplot(place), robot, measured, styles, name)
     add_legend(figure, _list_handles(series, styles))
-    count = f"{sum(len(s.raw) for s in series)} residuals of {len(list_poses(residuals))} poses"
+    n = len(list_poses(residuals))
+    count = f"{sum(len(s.raw) for s in series)} residuals of {n} {'pose' if n == 1 else 'poses'}"
     return finish_figure(figure, f"{robot.name}: {count}; {describe_residual_frame(setup)}")
 
 
