@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README.md: its Python example and its command lines run; docs/commands.md lists every command."""
+"""README.md: its examples run, and its picture is that of the demo. Lists are complete."""
 
 import re
 import shutil
+import tomllib
 from pathlib import Path
 
 import click
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from loopcal.cli import command_line, main
 from loopcal.io import load_robot
+from tests.cli.page_commands import list_commands
 
 README = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
 
@@ -38,26 +41,43 @@ def test_python_example_of_the_readme_runs_and_improves_the_robot(tmp_path, caps
     assert "42 of 42 parameter combinations" in capsys.readouterr().out
 
 
-def test_every_command_of_the_first_half_hour_runs(capsys) -> None:
-    part = README[README.index("## The first half hour") : README.index("## Status")]
-    lines = [
-        line
-        for block in re.findall(r"^```sh\n(.*?)^```", part, re.MULTILINE | re.DOTALL)
-        for line in block.splitlines()
-    ]
-    assert len(lines) == 5
-    for line in lines:
-        assert line.startswith("loopcal ")
-        assert main(line.split()[1:]) == 0, capsys.readouterr().err
+def test_commands_of_the_readme_run(capsys) -> None:
+    part = README[README.index("## On the command line") : README.index("## In Python")]
+    for words in list_commands(part):
+        assert main(words) == 0, capsys.readouterr().err
         assert capsys.readouterr().err == ""
+    assert Path("report.html").stat().st_size > 100_000
 
 
-def test_demo_prints_what_the_readme_shows(capsys) -> None:
-    block = re.search(r"^```\n(Calibrated: .*?)^```", README, re.MULTILINE | re.DOTALL)
-    assert block
-    data = "examples/hexapod-42/measurements.csv"
-    assert main(["calibrate", "hexapod-42", data, "-o", "run", "--hold-out", "0.25"]) == 0
-    assert capsys.readouterr().out.startswith(block[1])
+def test_picture_is_small_and_its_numbers_are_those_of_the_demo(root) -> None:
+    """`tools.readme_picture` draws it; that the demo prints these lines: the page's own test."""
+    match = re.search(r"!\[(.*)\]\((docs/pictures/\S+\.png)\)", README)
+    assert match
+    picture = (root / match[2]).read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) < 150_000
+    page = (root / "docs" / "getting-started.md").read_text("utf-8")
+    line = re.search(r"^position +rms +(\d+) +(\S+) +(\S+) +(\S+) +mm$", page, re.MULTILINE)
+    assert line
+    count, before, after, floor = line.groups()
+    assert f"errors at {count} held-out poses" in match[1]
+    assert f"position {before} mm and {after} mm rms, noise floor {floor} mm" in match[1]
+
+
+def test_citation_file_is_valid_cff(root) -> None:
+    """Required keys of CFF 1.2.0, types and versions; `authors` of an entity have a `name`."""
+    citation = YAML(typ="safe").load((root / "CITATION.cff").read_text("utf-8"))
+    project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["message"]
+    assert citation["title"].startswith("loopcal: ")
+    assert citation["authors"] == [{"name": "The loopcal developers"}]
+    assert citation["type"] == "software"
+    assert citation["license"] in project["license"].split(" AND ")  # the other: three.js
+    assert citation["version"] == project["version"]
+    assert citation["keywords"] == project["keywords"]
+    allowed = {"cff-version", "message", "title", "authors", "type", "license", "version"}
+    assert set(citation) <= allowed | {"keywords", "abstract", "date-released", "doi", "url"}
 
 
 def test_table_of_commands_is_complete(root) -> None:

@@ -13,6 +13,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from pygments.lexers.special import TextLexer
+
 from tools.api_reference import SECTIONS, describe_name, list_names
 from tools.site_commands import write_command_pages
 from tools.site_docstrings import convert_docstring
@@ -33,6 +35,7 @@ COMMAND_ROW = re.compile(r"^\| (`loopcal ([\w-]+)[^`]*`) \|", re.MULTILINE)
 
 def setup(app: Any) -> dict[str, bool]:
     """Connect the functions of this module with a build."""
+    app.add_lexer("csv", TextLexer)
     app.connect("builder-inited", write_pages_of_the_code)
     app.connect("source-read", add_contents)
     app.connect("autodoc-process-docstring", rewrite_docstring)
