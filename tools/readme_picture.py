@@ -34,7 +34,9 @@ def main() -> int:
     draw_errors_in_space(left.add_subplot(projection="3d"), report.robot, poses)
     draw_errors_by_pose(right.add_subplot(), report.validation)
     PICTURE.parent.mkdir(exist_ok=True)
-    figure.savefig(PICTURE, dpi=130, metadata={"Software": None})
+    figure.savefig(
+        PICTURE, dpi=130, bbox_inches="tight", pad_inches=0.15, metadata={"Software": None}
+    )
     print(f"wrote {PICTURE.relative_to(ROOT)}: {PICTURE.stat().st_size / 1024:.0f} kB")
     return 0
 
