@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the site has beside the Markdown pages of docs/: tables of contents, and pages of the code.
 
-* A README.md below docs/ is an index. The pages that its tables and lists link first become its
-  table of contents, so that the order of pages is stated once, in a form that every reader of the
-  repository sees.
+* A README.md below docs/ is an index. The pages that its tables and lists link become its table of
+  contents, so that the order of pages is stated once, in a form that every reader of the repository
+  sees.
 * Each section of docs/api.md has a page with the docstrings of its names, and each command of
   docs/commands.md has one with its help. They are written into docs/generated, which git ignores.
 """
@@ -22,8 +22,9 @@ from tools.site_docstrings import convert_docstring
 ROOT = Path(__file__).resolve().parent.parent
 GENERATED = ROOT / "docs" / "generated"
 
-ENTRY = re.compile(r"^(?:\||[*-]) .*?\[([^]]+)\]\(([^)#]+\.(?:md|rst))\)", re.MULTILINE)
-"""The first link of a line of a table or of a list."""
+LINE = re.compile(r"^(?:\||[*-]) .*$", re.MULTILINE)
+LINK = re.compile(r"\]\(([^)#]+\.(?:md|rst))\)")
+"""A line of a table or of a list, and a link to a page."""
 
 WHOLE_INDEX = re.compile(r"^- \[All [^]]+\]\((\w+)/README\.md\)\n", re.MULTILINE)
 """A line that stands for the table of another index, which the site shows in its place."""
@@ -73,8 +74,14 @@ def rewrite_docstring(
 
 
 def list_entries(text: str) -> list[str]:
-    """Return the files that the tables and lists of a text link first in a line, each once."""
-    return list(dict.fromkeys(match[2] for match in ENTRY.finditer(text)))
+    """Return the pages that a text links in the lines of its lists, and in those of its tables in
+    the first cell with a link; each once.
+    """
+    pages = []
+    for line in LINE.findall(text):
+        cells = (LINK.findall(cell) for cell in line.split("|"))
+        pages += next((links for links in cells if links), [])
+    return list(dict.fromkeys(pages))
 
 
 def read_table(folder: str) -> str:

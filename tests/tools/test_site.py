@@ -20,7 +20,8 @@ INDEX = """\
 
 | page | content |
 |---|---|
-| [one](one.md) | see also [two](two.md) |
+| [one](one.md), [two](two.md) | see also [three](three.md) |
+| - | [four](four.md) |
 
 ## Questions
 
@@ -30,7 +31,7 @@ INDEX = """\
 
 - [Examples](gallery/GALLERY_HEADER.rst)
 
-A paragraph that links [no page of its own](three.md).
+A paragraph that links [no page of its own](five.md).
 """
 
 
@@ -45,7 +46,7 @@ def test_links_of_an_index_become_its_contents_in_their_order() -> None:
     text = read_source("docs/README", INDEX)
     contents = [block.split("```")[0].split() for block in text.split("```{toctree}")[1:]]
     assert contents == [
-        [":hidden:", "one.md"],
+        [":hidden:", "one.md", "two.md", "four.md"],
         [":hidden:", ":caption:", "Questions", "questions/README.md"],
         [":hidden:", ":caption:", "Gallery", "generated/gallery/index.rst"],
     ]
