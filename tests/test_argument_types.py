@@ -45,6 +45,10 @@ def fit(data):
         (lambda fit, data: lc.identifiability(WRONG, data), "robot: .* give Mechanism"),
         (lambda fit, data: lc.identifiability(fit.robot, WRONG), "data: .* give Measurements"),
         (lambda fit, data: lc.suggest_measurements(fit), "give Identifiability"),
+        (
+            lambda fit, data: lc.suggest_measurements(lc.identifiability(fit.robot, data), data),
+            "sigma: got a Measurements; give dict, such as",
+        ),
         (lambda fit, data: lc.choose_identifiable_subset(fit), "give Identifiability"),
         (lambda fit, data: lc.check_conventions(fit.robot, WRONG), "data: .* give Measurements"),
         (lambda fit, data: lc.compare_conventions(WRONG, data), "robot: .* give Mechanism"),

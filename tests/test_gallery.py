@@ -6,6 +6,7 @@
 
 import ast
 import importlib
+import re
 import runpy
 import warnings
 from pathlib import Path
@@ -105,6 +106,14 @@ def test_example_is_short_and_readable(path) -> None:
     text = path.read_text()
     assert max(map(len, text.splitlines())) <= LONGEST_LINE
     assert max(len(block.splitlines()) for block in read_blocks(path)) <= LONGEST_BLOCK
+
+
+def test_site_shows_figures_as_pictures_and_not_as_text() -> None:
+    """The site leaves out the text of results whose type matches this pattern."""
+    text = (GALLERY.parent / "conf.py").read_text()
+    pattern = re.search(r'"ignore_repr_types": r"(.*)"', text)
+    assert pattern is not None
+    assert re.search(pattern[1], str(type(lc.load_robot("five-bar").plot())))
 
 
 @pytest.mark.evidence

@@ -128,7 +128,8 @@ def suggest_measurements(
     check_type(
         identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"
     )
-    check_type(sigma or {}, dict, "sigma", "a dictionary of standard deviations by dimension")
+    if sigma is not None:
+        check_type(sigma, dict, "sigma", "such as {Dimension.LENGTH: 1e-5} [SI]")
     combinations, factor = identifiability.unidentifiable, identifiability.factor
     if not combinations:
         return ()
