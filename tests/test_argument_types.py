@@ -140,7 +140,7 @@ UNCHECKED = {
     *("save_run(report)", "save_run(inputs)", "load_robot(source)", "identify(loss)"),
     *("suggest_measurements(sigma)", "validate(uncertainty)"),
     *("sample_truth(seed)", "simulate_trials(seed)"),
-    *("write_report(path)", "write_report(report)"),
+    *("write_report(path)", "write_report(report)", "write_view(path)", "write_view(source)"),
     *("write_comparison(path)", "write_comparison(comparison)"),
     *("load_study(path)", "study(source)", "study(folder)", "study(executor)"),
 }

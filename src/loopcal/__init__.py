@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import suggest_measurements as suggest_measurements
     from loopcal.documents import write_comparison as write_comparison
     from loopcal.documents import write_report as write_report
+    from loopcal.documents import write_view as write_view
     from loopcal.errors import ArgumentTypeError as ArgumentTypeError
     from loopcal.errors import DataError as DataError
     from loopcal.errors import EstimationError as EstimationError
@@ -181,7 +182,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
             compare_with_values compute_regularization_curves cross_validate examine_fit
             find_outliers identifiability suggest_measurements
         """,
-        "loopcal.documents": "write_comparison write_report",
+        "loopcal.documents": "write_comparison write_report write_view",
         "loopcal.errors": """
             ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
             MissingPackageError StudyError UnitError

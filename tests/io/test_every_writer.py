@@ -104,6 +104,10 @@ COMMANDS = {
         "compare run second -o F.json",
     ),
     "documents/writing.py:write_report": ("report run -o F.html",),
+    "documents/writing.py:write_html": (
+        "view five-bar -o F.html --no-browser",
+        "view run -o F.html --no-browser",
+    ),
 }
 """Commands that write the file or folder F, by the function that writes it."""
 

@@ -44,8 +44,8 @@ class Machine:
     words: list[str] = field(default_factory=list)
     trees: dict[str, Any] = field(default_factory=dict)
     """Files by name, parsed: YAML and JSON."""
-    left_out: frozenset[str] = frozenset()
-    """Options that are not added to its command lines."""
+    left_out: frozenset[str] = frozenset({"--live"})
+    """Options that are not added to its command lines; `view --live` runs until it is stopped."""
 
 
 @dataclass(frozen=True)
@@ -233,6 +233,8 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         1 budget run --json
         0.3 report run -o out.html
         0.3 report run -o out.html --json
+        0.3 view robot.yaml -o out.html --no-browser
+        0.3 view run -o out.html --no-browser --json
         1 compare run later
         0.5 compare run later --data more.csv --json
         1 repeatability robot.yaml data.csv

@@ -33,6 +33,7 @@ SECTIONS = {
     "Describe the robot": {
         "new": "Write a robot file, and a measurement file, to fill in.",
         "check": "Read a robot file and show what it contains.",
+        "view": "Show a robot, or a calibration, as a 3-D view in the browser.",
         "import": "Read the file of a controller as a robot file.",
         "export": "Write identified numbers into the file of a controller.",
     },
@@ -84,6 +85,7 @@ MODULES = {
     "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
     "compare_command": ("compare",),
     "report_command": ("report",),
+    "view_command": ("view",),
     "regularize_command": ("regularize",),
     "sampling_commands": ("bootstrap", "sample", "region"),
     "study_commands": ("study",),

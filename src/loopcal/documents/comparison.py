@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from loopcal.apply import RunComparison
-from loopcal.documents.writing import HTML, check_html
+from loopcal.documents.writing import HTML, write_html
 from loopcal.errors import ArgumentTypeError, FileError
 from loopcal.io.core.json_text import read_json, to_json
 from loopcal.io.core.limits import TABLE_SIZE
@@ -53,8 +53,7 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
     ending = check_ending(path)
     if ending in HTML:
         document = build_comparison_document(comparison, f"loopcal {version('loopcal')}")
-        html = render_html(document)
-        write_text(path, html, lambda file: check_html(file, html))
+        write_html(path, render_html(document))
     elif ending == ".json":
         text = to_json(comparison.to_dict())
         write_text(path, text, lambda file: read_json(file, "comparison", "", TABLE_SIZE))

@@ -60,7 +60,7 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     document = build_document(load_record(report))
     html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
     with restore_on_failure((path, data)):
-        write_text(path, html, lambda file: check_html(file, html))
+        write_html(path, html)
         write_text(data, json_text, lambda file: read_json(file, "report", "", TABLE_SIZE))
     return path
 
@@ -72,13 +72,23 @@ def name_files(path: Path) -> tuple[Path, Path]:
     ------
     FileError : the name does not end in .html.
     """
-    if path.suffix.lower() not in HTML:
-        ending = repr(path.suffix) if path.suffix else "no ending"
-        sentence = f"the name of a report ends in .html, but this one has {ending}"
-        raise FileError(f"{sentence}; choose another name, such as report.html", path)
+    check_ending(path, "report")
     return path, path.with_suffix(".json")
 
 
-def check_html(file: Path, html: str) -> None:
+def check_ending(path: Path, what: str) -> None:
+    """Raise FileError where the name of an HTML file has another ending; `what` is in the file."""
+    if path.suffix.lower() not in HTML:
+        ending = repr(path.suffix) if path.suffix else "no ending"
+        sentence = f"the name of a {what} ends in .html, but this one has {ending}"
+        raise FileError(f"{sentence}; choose another name, such as {what}.html", path)
+
+
+def write_html(path: Path, html: str) -> None:
+    """Write a page to a file, and read it back."""
+    write_text(path, html, lambda file: _check_html(file, html))
+
+
+def _check_html(file: Path, html: str) -> None:
     """Read a written page; raise LoopcalError where it is not the one that was made."""
     require_same("page", html, read_text(file, "report", limit=TABLE_SIZE))

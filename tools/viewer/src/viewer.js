@@ -40,7 +40,7 @@ function describePose(scene, choice) {
   if (choice < 0) return "The robot is at its home pose.";
   const { labels, rows, tools, errors } = scene.poses;
   const index = rows[choice];
-  const places = Math.max(0, 3 - Math.floor(Math.log10(scene.size)));
+  const places = Math.max(0, 4 - Math.floor(Math.log10(scene.size)));
   const place = pointOf(tools, index).map((value, k) => `${"xyz"[k]} ${value.toFixed(places)}`);
   const error = Math.hypot(...pointOf(errors, index));
   return `Pose ${labels[choice]}: tool at ${place.join(", ")} ${scene.unit}; error before calibration ${format(error)} ${scene.unit}.`;

@@ -25,7 +25,7 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 FILE = click.Path(path_type=Path)
 
 
-def _complete_robot(
+def complete_robot(
     _context: click.Context, _argument: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
     """Return the shipped robots that begin as a word; files where there is none."""
@@ -35,7 +35,7 @@ def _complete_robot(
     return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
-robot_argument = click.argument("robot", metavar="ROBOT", shell_complete=_complete_robot)
+robot_argument = click.argument("robot", metavar="ROBOT", shell_complete=complete_robot)
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
 )

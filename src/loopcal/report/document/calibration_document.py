@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from loopcal.report.document.elements import Document
 from loopcal.report.document.record import CalibrationRecord
 from loopcal.report.document.sections.data import (
@@ -48,12 +50,22 @@ SECTIONS = (
 def build_document(record: CalibrationRecord) -> Document:
     """Return the report of a calibration; a section without content is left out."""
     sections = (build(record) for build in SECTIONS)
-    verdict, versions = record.verdict, (record.result.get("made_by") or {}).get("versions", {})
-    summary = f"{verdict.value[0].upper()}{verdict.value[1:]}: {record.robot.name}."
     return Document(
         title=f"Calibration report: {record.robot.name}",
-        verdict=verdict.name.lower(),
-        summary=str(record.result.get("headline") or summary),
-        made_by=f"loopcal {versions.get('loopcal', '')}".strip(),
+        verdict=record.verdict.name.lower(),
+        summary=summarize(record),
+        made_by=describe_maker((record.result.get("made_by") or {}).get("versions", {})),
         sections=tuple(section for section in sections if section.elements),
     )
+
+
+def summarize(record: CalibrationRecord) -> str:
+    """Return the headline of a calibration; of older runs, which state none, the verdict."""
+    verdict = record.verdict.value
+    sentence = f"{verdict[0].upper()}{verdict[1:]}: {record.robot.name}."
+    return str(record.result.get("headline") or sentence)
+
+
+def describe_maker(versions: Mapping[str, str]) -> str:
+    """Return program and version, of the versions that a run names."""
+    return f"loopcal {versions.get('loopcal', '')}".strip()

@@ -77,7 +77,8 @@ class Document:
 
     Parameters
     ----------
-    verdict : name of the verdict, such as `not_calibrated`, which decides the color of the head.
+    verdict : name of the verdict, such as `not_calibrated`, which decides the color of the head;
+        empty without a verdict.
     summary : the one sentence below the title. made_by : program and version.
     """
 

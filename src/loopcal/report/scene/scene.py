@@ -92,6 +92,10 @@ def _choose_magnification(error: FloatArray, size: float) -> float:
     longest = float(np.sqrt((error**2).sum(axis=1)).max(initial=0.0))
     if longest <= 1e-9 * size:
         return 1.0
-    wanted = LONGEST * size / longest
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted)
+    return round_down(LONGEST * size / longest)
+
+
+def round_down(value: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, at most a value above zero."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value)

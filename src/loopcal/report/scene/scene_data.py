@@ -67,7 +67,7 @@ def write_scene(scene: Scene) -> str:
         "unit": unit.symbol,
         "size": robot.size / unit.factor_to_si,
         "planar": is_planar(robot),
-        "parts": [_describe_part(part) for part in parts],
+        "parts": [describe_part(part) for part in parts],
         "home": _encode(_join(parts) / unit.factor_to_si),
         "names": _list_names(robot, parts, unit),
         "poses": _describe_poses(scene, unit),
@@ -87,7 +87,7 @@ def _join(parts: tuple[Part, ...]) -> FloatArray:
     return np.concatenate([part.points for part in parts], axis=1)
 
 
-def _describe_part(part: Part) -> dict[str, Any]:
+def describe_part(part: Part) -> dict[str, Any]:
     """Return how a part is drawn."""
     colors = {"axis": BLACK, "tool": BLACK, "platform": BODY, "arm": BODY, "base": BODY}
     color = COLORS[part.index % len(COLORS)] if part.index >= 0 else BODY
@@ -105,7 +105,7 @@ def _describe_part(part: Part) -> dict[str, Any]:
 def _list_names(robot: Mechanism, parts: tuple[Part, ...], unit: Unit) -> list[dict[str, Any]]:
     """Return names beside the feet of limbs, and of the axes of the base frame."""
     feet = [(limb.name, part) for limb, part in zip(robot.assembly.limbs, parts, strict=False)]
-    marks = [(name, _describe_part(part)["color"], part.points[0, 0]) for name, part in feet]
+    marks = [(name, describe_part(part)["color"], part.points[0, 0]) for name, part in feet]
     axes = [part for part in parts if part.role == "frame"]
     seen = "xy" if is_planar(robot) else "xyz"
     marks += [(name, FRAME_COLORS[i], axes[i].points[0, 1]) for i, name in enumerate(seen)]

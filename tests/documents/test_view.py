@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""loopcal view: the scene of a robot and of a calibration as a page, and how it is opened."""
+
+from __future__ import annotations
+
+import json
+import re
+import webbrowser
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+from loopcal.documents.sources import load_record
+from loopcal.documents.view_writing import open_page
+from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.report.document.page import render_html
+from loopcal.report.document.view_document import build_calibration_view
+
+
+def read_scene(page: Path) -> dict:
+    """Return the scene of a page."""
+    text = page.read_text("utf-8")
+    matched = re.search(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert matched is not None
+    return json.loads(matched[1])
+
+
+def test_view_of_a_robot_shows_its_home_and_its_picture(tmp_path) -> None:
+    page = lc.write_view(tmp_path / "view.html", lc.load_robot("five-bar"))
+    scene = read_scene(page)
+    assert scene["planar"]
+    assert scene["unit"] == "mm"
+    assert [name["text"] for name in scene["names"]] == ["west", "east", "x", "y"]
+    assert scene["poses"]["labels"] == []
+    assert scene["map"] is None
+    text = page.read_text("utf-8")
+    assert text.count("<svg") == 1
+    assert "five-bar at its home pose." in text
+    assert "<nav" not in text
+
+
+def test_view_of_a_run_has_its_poses_errors_and_map(
+    run, calibration, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", str(run.path), "--no-browser"]) == 0
+    scene = read_scene(Path("view.html"))
+    assert len(scene["poses"]["labels"]) == 30
+    assert len(scene["map"]["colors"]) == 200
+    meanings = " ".join(row["text"] for row in scene["legend"])
+    assert re.search(r"before calibration, [0-9]+ times magnified", meanings)
+    assert re.search(r"over the workspace, [0-9.]+ to [0-9.]+ mm", meanings)
+    again = lc.write_view("again.html", calibration)
+    assert read_scene(again) == scene
+
+
+def test_view_of_a_fit_that_did_not_converge_shows_the_robot_before(run) -> None:
+    record = load_record(run)
+    fit = {**record.result["fit"], "status": "out_of_iterations"}
+    result = {**record.result, "verdict": "not_calibrated", "fit": fit, "headline": "Failed."}
+    text = render_html(build_calibration_view(replace(record, result=result, posterior=None)))
+    assert "The fit did not converge" in text
+    assert "The robot at home." in text
+    assert '<header class="not_calibrated">' in text
+
+
+def test_wrong_use_is_refused_and_writes_nothing(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words, sentence in (
+        ("five-bar -o view.png", "the name of a view ends in .html, but this one has '.png'"),
+        ("nowhere --no-browser", "nowhere"),
+        ("five-bar --live -o view.html", "--live writes no file; leave out -o and --force"),
+        ("five-bar --port 9000", "--port is for --live"),
+        ("five-bar --live --port 80", "1024<=x<=65535"),
+    ):
+        assert main(["view", *words.split()]) == 1
+        assert sentence in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(ArgumentTypeError, match="source is str; pass a robot"):
+        lc.write_view("view.html", "five-bar")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(FileError, match="ends in"):
+        lc.write_view("view", lc.load_robot("five-bar"))
+    assert list(tmp_path.iterdir()) == []
+    Path("view.html").write_text("mine")
+    assert main(["view", "five-bar", "--no-browser"]) == 1
+    assert Path("view.html").read_text() == "mine"
+
+
+def test_page_opens_in_a_browser_only_where_there_is_a_display(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: not opened.append(address))
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", "five-bar"]) == 0
+    assert capsys.readouterr().out == "Written to view.html; no browser could be started here\n"
+    assert opened == []
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert main(["view", "five-bar", "--force", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["opened"] is True
+    assert opened == [(tmp_path / "view.html").as_uri()]
+
+    def fail(address: str) -> bool:
+        raise webbrowser.Error(address)
+
+    monkeypatch.setattr(webbrowser, "open", fail)
+    assert not open_page("file:///nowhere.html")
