@@ -50,6 +50,14 @@ def test_page_runs_and_prints_what_it_shows(name, tmp_path, monkeypatch) -> None
         check_table_of_rods(page)
 
 
+@pytest.mark.parametrize("name", PAGES)
+def test_text_above_a_file_names_it_for_the_reader(name) -> None:
+    page = read_page(name)
+    for comment in re.finditer(r"<!-- file: (\S+) -->", page):
+        paragraph = page[: comment.start()].rstrip().split("\n\n")[-1]
+        assert f"`{comment[1]}`" in paragraph
+
+
 def test_rods_of_20_mm_stay_flat_and_are_off_center_as_the_page_states(
     tmp_path, monkeypatch
 ) -> None:
