@@ -23,7 +23,7 @@ from loopcal.report.document.figures import thin_rows
 from loopcal.report.document.page import render_html
 from loopcal.report.scene.scene_data import load_script
 from loopcal.report.tables import Table
-from loopcal.report.validation_view import view_errors
+from loopcal.report.validation_view import READING_NOISE, view_errors
 
 ORDER = (
     *("verdict", "determined", "outliers", "errors", "residuals", "workspace", "parameters"),
@@ -279,3 +279,16 @@ def test_report_of_a_printer_shows_the_heights_over_the_bed(root, tmp_path) -> N
         assert isinstance(picture, Picture)
         assert picture.name == "height-figure"
         assert len(by_point.rows) == 13
+
+
+def test_noise_floor_of_uncertain_readings_is_called_a_lower_bound(page, root) -> None:
+    assert READING_NOISE not in page.read_text("utf-8")  # the readings of this example are exact
+    machine = lc.load_robot("cable-4")
+    kind = lc.Position(places=np.zeros((1, 3)))
+    instrument = lc.Instrument((lc.Sensor(kind, lc.Gaussian(np.full(3, 1e-3))),))
+    poses = lc.sample_workspace(machine, 16, seed=2).coordinates
+    data = lc.simulate(machine, poses, instrument, seed=3)
+    report = lc.calibrate(machine, data, lc.CalibrationOptions(hold_out=0.4))
+    assert report.reading_errors is not None
+    assert READING_NOISE in str(build(load_record(report), "error").to_dict())
+    assert READING_NOISE in report._repr_html_()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from loopcal.cli import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.measure import check_instruments
@@ -136,3 +137,16 @@ def test_results_and_findings_have_the_instrument(robot, data) -> None:
 def test_dates_decide_which_finding(data, changed, code) -> None:
     findings = check_instruments(with_instrument(data, FACTS | changed).observations)
     assert [f.code for f in findings] == ([] if code is None else [code])
+
+
+def test_validation_as_json_has_the_findings_of_instruments(tmp_path, robot, data, capsys) -> None:
+    lc.save_robot(robot, tmp_path / "robot.yaml")
+    measured = with_instrument(data, FACTS | {"due": "2025-02-01"})
+    lc.save_measurements(measured, tmp_path / "data.csv", robot)
+    words = ["validate", str(tmp_path / "robot.yaml"), str(tmp_path / "data.csv"), "--json"]
+    assert main(words) == 0
+    printed = capsys.readouterr()
+    document = json.loads(printed.out)
+    assert "data.instrument-past-due" in {finding["code"] for finding in document["findings"]}
+    assert any("2025-02-01" in note for note in document["notes"])
+    assert "2025-02-01" in printed.err

@@ -24,7 +24,12 @@ from loopcal.report.numbers import (
 )
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block, format_list
-from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
+from loopcal.report.validation_view import (
+    READING_NOISE,
+    describe_improvements,
+    view_error_statistics,
+    view_errors,
+)
 from loopcal.workflow import CalibrationReport
 
 WHOLE, MANY = 100.0, 10_000.0
@@ -88,6 +93,8 @@ def _view_errors(report: CalibrationReport, verbose: bool) -> list[Block]:
         blocks = view_errors(report.fitted_errors, "fitted (optimistic)")
     else:
         blocks = []
+    if blocks and report.reading_errors is not None:
+        blocks.append(READING_NOISE)
     return [*blocks, *view_heights(report.height_errors, verbose)]
 
 

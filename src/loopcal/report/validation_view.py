@@ -17,6 +17,11 @@ from loopcal.report.text_page import Block, format_list
 CONFORMITY = "conformity."
 """Beginning of the codes of statements on limits, which follow the tables."""
 
+READING_NOISE = (
+    "The noise floor does not contain the noise of the actuator readings, so it is a lower bound."
+)
+"""Sentence for robots whose readings are uncertain."""
+
 SIMILAR = 5e-3
 """Relative difference up to which two errors are called equal."""
 

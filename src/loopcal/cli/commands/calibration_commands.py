@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -31,6 +32,9 @@ from loopcal.cli.options.shared_options import (
     seed_option,
     verbose_option,
 )
+
+if TYPE_CHECKING:
+    from loopcal.findings import Finding
 
 ALLOWED = ("allow_outside_stroke", "allow_duplicates")
 """Options that accept doubtful measurements."""
@@ -252,11 +256,12 @@ def validate(
 
     calibrated = load_run_or_robot(run)
     measurements = read_checked_measurements(data, calibrated.robot, **flags)
+    noted: list[Finding] = []
     if not allow_fitted_data:
         reused = report_reused_rows(calibrated.fitted_rows, measurements)
-        if reused is not None:
-            terminal.print_note(str(reused))
-    for finding in check_instruments(measurements.observations):
+        noted += [] if reused is None else [reused]
+    noted += check_instruments(measurements.observations)
+    for finding in noted:
         terminal.print_note(str(finding))
     validation = validate_robot(
         calibrated.robot,
@@ -270,7 +275,8 @@ def validate(
         uncertainty=calibrated.load_uncertainty(),
     )
     if as_json:
-        terminal.print_json(validation.to_dict())
+        complete = replace(validation, findings=(*validation.findings, *noted))
+        terminal.print_json(complete.to_dict())
     else:
         is_changed = bool((calibrated.robot.values != calibrated.initial_robot.values).any())
         page = view_validation(validation, is_changed, verbose)

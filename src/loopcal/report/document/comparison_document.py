@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from loopcal.apply import RunComparison
 from loopcal.findings.importance import sort_by_importance
 from loopcal.report.document.elements import Document, Element, Listing, Section
@@ -16,9 +18,9 @@ from loopcal.report.run_comparison_view import (
     find_error_units,
 )
 
-HEADS = {True: "not_calibrated", False: "calibrated", None: "undecided"}
+HEADS: Mapping[bool | None, str] = {True: "not_calibrated", False: "calibrated", None: "undecided"}
 """Whether a machine has changed -> the color of the head, as of a verdict."""
-SUMMARIES = {
+SUMMARIES: Mapping[bool | None, str] = {
     True: "A machine differs from that of {first}, beyond the noise.",
     False: "The machines do not differ from that of {first} beyond the noise.",
     None: "Whether a machine has changed was not tested.",

@@ -86,9 +86,12 @@ class CalibrationRecord:
 
     @property
     def fitted_labels(self) -> tuple[str, ...]:
-        """Labels of the fitted poses; none where an older version wrote the run."""
+        """Labels of the fitted poses, without those that options excluded; none where an older
+        version wrote the run.
+        """
         labels = self.arrays.get("poses")
-        return () if labels is None else tuple(labels.tolist())
+        excluded = self.result["fit"].get("dropped") or ()
+        return () if labels is None else tuple(n for n in labels.tolist() if n not in excluded)
 
     @property
     def held_out_labels(self) -> tuple[str, ...]:

@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from loopcal.report.document.elements import Element, Section
 from loopcal.report.document.figures import draw_residual_picture
 from loopcal.report.document.record import CalibrationRecord
-from loopcal.report.document.sections.verdict import CONFORMITY, list_findings, select_important
+from loopcal.report.document.sections.verdict import (
+    CONFORMITY,
+    OF_RESIDUALS,
+    OPEN,
+    OUTLYING,
+    list_findings,
+    select_important,
+)
 from loopcal.report.numbers import format_number
-
-OPEN = ("fit.unidentifiable", "fit.hardly", "workflow.undetermined", "workflow.frame", "setup.")
-OUTLYING = ("outliers.", "validation.blunder", "validation.unreachable", "fit.excluded", "fit.low")
-OF_RESIDUALS = ("noise.", "residuals.", "prior.")
-"""Beginnings of the codes of findings that a section lists."""
 
 NO_RESIDUALS = (
     "This run folder was written by an earlier version and does not contain the labels of its "

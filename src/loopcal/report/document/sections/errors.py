@@ -13,12 +13,17 @@ from loopcal.report.document.figures import (
 )
 from loopcal.report.document.record import CalibrationRecord
 from loopcal.report.height_view import build_height_map, build_height_summary
-from loopcal.report.validation_view import describe_improvements, view_error_statistics, view_errors
+from loopcal.report.validation_view import (
+    READING_NOISE,
+    describe_improvements,
+    view_error_statistics,
+    view_errors,
+)
 
 BASELINE = (
     "Before: the geometry before calibration, with frames, targets, surfaces and offsets fitted to "
     "the rows of the calibration. After: the calibrated geometry. Noise floor: the error that the "
-    "stated measurement noise alone causes."
+    "stated noise of the measured values alone causes."
 )
 STATED_FRAME = "The stated frame is the one in which the measurement files state their values."
 
@@ -48,6 +53,8 @@ def build_error_section(record: CalibrationRecord) -> Section:
             reason = "The errors at the held-out poses could not be computed; see the findings."
         return Section("errors", "Errors at held-out poses", (reason,))
     explained = f"{BASELINE} {STATED_FRAME}" if "stated frame" in errors.frame else BASELINE
+    if record.result.get("reading_errors"):
+        explained = f"{explained} {READING_NOISE}"
     elements: list[Element] = [explained, *view_errors(errors, "held-out")]
     elements += [" ".join(describe_improvements(errors)), *draw_validation_picture(record)]
     elements += [table for table in view_error_statistics(errors) if not isinstance(table, str)]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from loopcal.report.document.elements import Code, Element, Listing, Section
 from loopcal.report.document.record import CalibrationRecord
+from loopcal.report.document.stored_options import describe_call, list_options
 from loopcal.report.tables import Table, word_column
 from loopcal.workflow import Verdict
 
@@ -52,8 +53,8 @@ def build_provenance_section(record: CalibrationRecord) -> Section:
         ("command", command),
         *((_label_version(name), value) for name, value in made_by.get("versions", {}).items()),
         *((f"seed: {name}", str(seed)) for name, seed in made_by.get("seeds", {}).items()),
-        ("method", str(record.result["fit"].get("method") or "unknown")),
-        ("options", str(record.result.get("options") or "unknown")),
+        ("method", describe_call(str(record.result["fit"].get("method") or "unknown"))),
+        *list_options(str(record.result.get("options") or "")),
     ]
     files = [
         *((f"input: {i}", f["path"], f["sha256"]) for i, f in made_by.get("inputs", {}).items()),

@@ -31,6 +31,11 @@ SCOPE = (
 CONFORMITY = "conformity."
 """Beginning of the codes of statements on limits."""
 
+OPEN = ("fit.unidentifiable", "fit.hardly", "workflow.undetermined", "workflow.frame", "setup.")
+OUTLYING = ("outliers.", "validation.blunder", "validation.unreachable", "fit.excluded", "fit.low")
+OF_RESIDUALS = ("noise.", "residuals.", "prior.")
+"""Beginnings of the codes of findings that other sections list."""
+
 TOP = 3
 """Findings that this section shows, beside all failures and warnings."""
 
@@ -65,10 +70,14 @@ def build_verdict_section(record: CalibrationRecord) -> Section:
 
 
 def select_important(findings: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return failures and warnings, and as many of the others as make up the first TOP."""
+    """Return failures and warnings, which other sections repeat, and as many of the others that no
+    other section lists as make up TOP.
+    """
     listed = list(findings)
+    elsewhere = (CONFORMITY, *OPEN, *OUTLYING, *OF_RESIDUALS)
     urgent = [finding for finding in listed if finding["severity"] in IMPORTANT]
-    return urgent if len(urgent) >= TOP else listed[:TOP]
+    others = [f for f in listed if f not in urgent and not f["code"].startswith(elsewhere)]
+    return [*urgent, *others[: max(TOP - len(urgent), 0)]]
 
 
 def list_findings(findings: Iterable[Mapping[str, Any]]) -> Listing:

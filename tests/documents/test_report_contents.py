@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every content that a report must have is in its section, of one calibration that has them all."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.documents.sources import load_record
+from loopcal.report.document.calibration_document import build_document
+from loopcal.report.document.elements import Document, Listing, Picture, Section
+from loopcal.report.document.stored_options import describe_call, list_options
+from loopcal.report.tables import Table
+from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
+
+LIMIT = 60e-6
+"""Limit on the position error [m]."""
+
+
+@pytest.fixture(scope="module")
+def report(robot, data) -> lc.CalibrationReport:  # noqa: F811
+    """Return a calibration with an instrument, a limit, times, temperatures and an excluded row."""
+    (rows,) = with_instrument(data, FACTS | {"due": "2025-02-01"}).observations
+    count = len(rows)
+    measured = rows.measured.copy()
+    measured[3] += 0.4e-3
+    context = {"time": 60.0 * np.arange(count), "temperature": 20.0 + 0.1 * np.arange(count)}
+    changed = replace(data, observations=(replace(rows, measured=measured, context=context),))
+    held_out = tuple(data.labels[6::4])
+    fit = lc.FitOptions(excluded_poses=("4",))
+    options = lc.CalibrationOptions(fit=fit, held_out=held_out, limit_position=LIMIT)
+    return lc.calibrate(robot, changed, options)
+
+
+@pytest.fixture(scope="module")
+def document(report) -> Document:
+    return build_document(load_record(report))
+
+
+def get_section(document: Document, name: str) -> Section:
+    return next(section for section in document.sections if section.name == name)
+
+
+def write_text(section: Section) -> str:
+    """Return all text of a section."""
+    parts = []
+    for element in section.elements:
+        if isinstance(element, str):
+            parts.append(element)
+        elif isinstance(element, Table):
+            parts.append(element.to_text())
+        elif isinstance(element, Listing):
+            parts += [text for _, text in element.items]
+        elif isinstance(element, Picture):
+            parts += [element.caption, element.description, *re.findall(r">([^<>]+)<", element.svg)]
+        else:
+            parts.append(element.text)
+    return "\n".join(parts)
+
+
+CONTENTS = [
+    ("verdict", r"Scope: the verdict concerns the geometry of five-bar .*fitted.*held out"),
+    ("verdict", r"Expected error over the workspace: position"),
+    ("verdict", r"Share of each source in the variance"),
+    (
+        "verdict",
+        r"against the limit 0.06 mm: .*with (?:more than )?[\d.]+ % probability",
+    ),  # guard-banded
+    ("determined", r"The data determine all \d+ parameters"),
+    ("outliers", r"No outliers among .*Excluded from the fit by its options: 4\."),
+    ("errors", r"Before: .*frames.*After: .*Noise floor: "),
+    ("errors", r"rms +\d+ +[\d.]+ +[\d.]+ +[\d.]+"),
+    ("residuals", r"Chi-square is [\d.]+ with"),
+    ("residuals", r"histogram"),
+    ("residuals", r"normal"),
+    ("residuals", r"time \["),
+    ("residuals", r"temperature \["),
+    ("residuals", r"reading left \[deg\]"),
+    ("workspace", r"Slices of the workspace"),
+    ("workspace", r"less certain than every measured pose"),
+    ("parameters", r"shift \[tolerances\]"),
+    ("parameters", r"Correlations of the parameters"),
+    ("budget", r"JCGM|type A"),
+    ("budget", r"D-K-15123-01"),  # traceability
+    ("budget", r"0750123"),
+    ("budget", r"2025-01-15"),
+    ("controller", r"loopcal export"),
+    ("verdict", r"AT960.*2025-02-01"),
+    ("provenance", r"version of loopcal"),
+    ("provenance", r"seed: hold_out"),
+    ("poses", r"18 fitted poses: "),
+    ("poses", r"5 held-out poses: 7, 11, 15, 19, 23\."),
+]
+
+
+@pytest.mark.parametrize(("name", "pattern"), CONTENTS, ids=[f"{n}: {p}" for n, p in CONTENTS])
+def test_section_has_its_content(document, name, pattern) -> None:
+    assert re.search(pattern, write_text(get_section(document, name)), re.DOTALL)
+
+
+def test_a_note_is_in_one_section_only(document, report) -> None:
+    listed = [
+        (label, text)
+        for section in document.sections
+        for element in section.elements
+        if isinstance(element, Listing)
+        for label, text in element.items
+    ]
+    notes = [text for label, text in listed if label == "info"]
+    assert notes
+    assert len(notes) == len(set(notes))
+    shown = {text for _, text in listed}
+    assert {str(finding) for finding in report.findings} <= shown
+
+
+def test_provenance_words_options_and_method_without_python(document) -> None:
+    text = write_text(get_section(document, "provenance"))
+    assert re.search(r"option: limit position +6e-05 m", text)
+    assert re.search(r"option: held out +7, 11, 15, 19, 23", text)
+    assert re.search(r"option: check conventions +yes", text)
+    assert re.search(r"method +\w+", text)
+    assert not re.search(r"CalibrationOptions|None|True|False|\(\)|='", text)
+
+
+def test_stored_calls_are_worded_and_other_text_is_kept() -> None:
+    assert describe_call("Ridge(parameter=0.1, free=())") == "Ridge (parameter 0.1)"
+    assert describe_call("LeastSquares()") == "LeastSquares"
+    assert describe_call("<script>") == "<script>"
+    assert describe_call("a; b(") == "a; b("
+    text = "CalibrationOptions(fit=FitOptions(noise='estimated', loss=Huber(k=1.345)), seed=3, "
+    text += "prior=<Posterior of x: 3 parameters>, choose_model=True, compare_with=None)"
+    assert list_options(text) == [
+        ("option: noise", "estimated"),
+        ("option: loss", "Huber (k 1.345)"),
+        ("option: seed", "3"),
+        ("option: prior", "Posterior"),
+        ("option: choose model", "yes"),
+    ]
+    assert list_options("") == [("options", "unknown")]
