@@ -30,7 +30,7 @@ quick: .venv/dev.stamp  ## the tests that together take under 30 s
 
 evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
 	$(BIN)/python -m tools.evidence
-	$(BIN)/pytest -m evidence
+	$(BIN)/pytest $(PARALLEL) -m evidence
 
 docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json and from the code
 	$(BIN)/python -m tools.evidence --tables
