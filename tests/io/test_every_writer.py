@@ -86,6 +86,7 @@ COMMANDS = {
         "export run -o F.json",
         "export run -o F.csv",
         "export hexapod.yaml --into hexapod.hal -o F.hal",
+        "export hexapod-42 -o F.ini",
         "export tripod.yaml --into robot.urdf -o F.urdf",
     ),
     "cli/commands/exchange_commands.py:_correct_file": (

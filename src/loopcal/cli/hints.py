@@ -31,6 +31,8 @@ HINTS = {
     "files.output-exists": "use --force to replace it",
     "files.folder-in-use": "use --force to replace it",
     "files.groups-in-plan": "use --kind and the sigmas instead of --like",
+    "files.strut-length": "use --format linuxcnc-ini --into machine.ini",
+    "files.ini-needed": "use --into machine.ini",
     "files.format-unknown": "use --format NAME",
     "files.format-takes-no-file": "leave out --into",
     "files.no-measurements": "leave out --data and --corrected",

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from loopcal.workflow import CalibrationReport
 
 READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
-WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
+WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "linuxcnc-ini", "urdf", "json", "csv")
 CORRECTED_ALONE = (
     "--corrected calibrates with the measurements in the file; state where to write them, such as "
     "--data data.csv"

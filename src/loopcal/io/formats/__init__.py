@@ -6,7 +6,15 @@ A format is a `Format` with `read`, `write` or both, in a module of its own, and
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import delta_gcode, hangprinter, klipper, linuxcnc, parameter_table, urdf
+from loopcal.io.formats import (
+    delta_gcode,
+    hangprinter,
+    klipper,
+    linuxcnc,
+    linuxcnc_ini,
+    parameter_table,
+    urdf,
+)
 from loopcal.io.formats.program_format import Format
 
 FORMATS: Mapping[str, Format] = {
@@ -16,6 +24,7 @@ FORMATS: Mapping[str, Format] = {
         delta_gcode.MARLIN,
         delta_gcode.REPRAP,
         linuxcnc.FORMAT,
+        linuxcnc_ini.FORMAT,
         urdf.FORMAT,
         hangprinter.FORMAT,
         parameter_table.JSON,

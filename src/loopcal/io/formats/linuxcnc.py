@@ -210,7 +210,7 @@ def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> I
     for n in range(6):
         length = values.pop(f"leg{n + 1}.length", 0.0) / factor
         if abs(length) > ROUNDING:
-            text = f"{format_scaled(length, 1.0)} {symbol}"
+            text = f"{length:.{DECIMALS}f} {symbol}"
             yield report_finding("files.strut-length", strut=n, length=text)
     expressed = re.compile(r"leg\d\.(base|platform)\.[xyz]$")
     table = source.robot.parameters
