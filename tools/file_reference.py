@@ -20,6 +20,7 @@ from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
+from loopcal.io.exports import list_shipped_profiles
 from loopcal.io.exports.profile import ColumnSource, ProfileRecord
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
@@ -191,9 +192,9 @@ def format_profile_columns() -> str:
     return format_record(ColumnSource)
 
 
-def format_example(name: str) -> Callable[[], str]:
-    """Return what gives a profile of the examples."""
-    return lambda: f"```yaml\n{(EXAMPLES / name).read_text('utf-8')}```\n"
+def format_example(path: Path) -> Callable[[], str]:
+    """Return what gives a profile."""
+    return lambda: f"```yaml\n{path.read_text('utf-8')}```\n"
 
 
 def format_study() -> str:
@@ -228,8 +229,10 @@ BLOCKS = {
     "counts": format_counts,
 }
 EXPORT_BLOCKS = {"profile": format_profile, "profile-columns": format_profile_columns} | {
-    name: format_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")
+    name: format_example(EXAMPLES / f"{name}.yaml")
+    for name in ("tracker-points", "six-dof", "cmm-spheres")
 }
+EXPORT_BLOCKS |= {name: format_example(path) for name, path in list_shipped_profiles().items()}
 
 
 def fill_page(text: str) -> str:

@@ -276,9 +276,10 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
 def _build_sources() -> Iterator[Machine]:
     """Yield the machines that come from files of other programs, and commands without a machine."""
     with work_in_folder("exports"):
-        for path in sorted((EXAMPLES / "exports").iterdir()):
-            if path.suffix != ".md":
-                shutil.copy(path, path.name)
+        for folder in ("exports", "hexapod-tracker"):
+            for path in sorted((EXAMPLES / folder).iterdir()):
+                if path.suffix != ".md":
+                    shutil.copy(path, path.name)
         pairs = (
             ("tracker-points.txt", "tracker-points"),
             ("six-dof.txt", "six-dof"),
@@ -288,6 +289,13 @@ def _build_sources() -> Iterator[Machine]:
             Line(("import", file, "--profile", f"{profile}.yaml", "-o", "out.csv"), 3)
             for file, profile in pairs
         ]
+        filling = "fill hexapod.yaml sheet.csv points.txt --profile spatial-analyzer -o out.csv"
+        lines.append(Line(tuple(filling.split())))
+        lines.append(Line((*filling.split(), "--by-order", "--allow-implausible"), 0.5))
+        lines.append(Line(tuple(["gcode", "hexapod.yaml", "plan.csv", "-o", "out.ngc"])))
+        lines.append(
+            Line(tuple(["export", "hexapod.yaml", "--into", "machine.ini", "-o", "out.ini"]))
+        )
     yield collect_files(Machine("exports", lines=lines, words=["SMR1", "1"]), "exports")
     with work_in_folder("programs"):
         for name, text in SOURCES.items():
