@@ -292,10 +292,8 @@ def _build_sources() -> Iterator[Machine]:
         filling = "fill hexapod.yaml sheet.csv points.txt --profile spatial-analyzer -o out.csv"
         lines.append(Line(tuple(filling.split())))
         lines.append(Line((*filling.split(), "--by-order", "--allow-implausible"), 0.5))
-        lines.append(Line(tuple(["gcode", "hexapod.yaml", "plan.csv", "-o", "out.ngc"])))
-        lines.append(
-            Line(tuple(["export", "hexapod.yaml", "--into", "machine.ini", "-o", "out.ini"]))
-        )
+        lines.append(Line(("gcode", "hexapod.yaml", "plan.csv", "-o", "out.ngc")))
+        lines.append(Line(("export", "hexapod.yaml", "--into", "machine.ini", "-o", "out.ini")))
     yield collect_files(Machine("exports", lines=lines, words=["SMR1", "1"]), "exports")
     with work_in_folder("programs"):
         for name, text in SOURCES.items():
