@@ -9,9 +9,10 @@ from pathlib import Path
 from loopcal.apply import RunComparison
 from loopcal.documents.writing import HTML, write_html
 from loopcal.errors import ArgumentTypeError, FileError
-from loopcal.io.core.json_text import read_json, to_json
+from loopcal.io.core.json_text import to_json
 from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.text_file import as_path, write_text
+from loopcal.io.core.read_back import require_same
+from loopcal.io.core.text_file import as_path, read_text, write_text
 from loopcal.io.runs.comparison_file import save_comparison
 from loopcal.report.document.comparison_document import build_comparison_document
 from loopcal.report.document.page import render_html
@@ -56,11 +57,16 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
         write_html(path, render_html(document))
     elif ending == ".json":
         text = to_json(comparison.to_dict())
-        write_text(path, text, lambda file: read_json(file, "comparison", "", TABLE_SIZE))
+        write_text(path, text, lambda file: _check_json(file, text))
     else:
         table = tabulate_comparison(comparison)
         save_comparison(path, [column.title for column in table.columns], table.rows)
     return path
+
+
+def _check_json(file: Path, text: str) -> None:
+    """Read a written file; raise LoopcalError where it is not the one that was made."""
+    require_same("comparison", text, read_text(file, "comparison", limit=TABLE_SIZE))
 
 
 def check_ending(path: Path) -> str:
