@@ -30,7 +30,8 @@ def main() -> int:
     labels = tuple(str(i) for i in range(len(data.readings)))
     poses = compute_pose_errors(report.robot, robot, data.readings, labels)
     figure = Figure(figsize=(9.6, 3.7), layout="constrained", facecolor="white")
-    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.25))
+    parts: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.25))
+    left, right = parts
     draw_errors_in_space(left.add_subplot(projection="3d"), report.robot, poses)
     draw_errors_by_pose(right.add_subplot(), report.validation)
     PICTURE.parent.mkdir(exist_ok=True)

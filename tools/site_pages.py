@@ -111,8 +111,9 @@ def write_pages_of_the_code(app: Any) -> None:
     for name, text in write_command_pages():
         pages[GENERATED / "commands" / f"{name}.rst"] = text
     for path in GENERATED.rglob("*.rst"):
-        if path not in pages and path.parent.name != "gallery":
-            path.unlink()  # of a section or a command that no longer exists
+        example = ROOT / "docs" / "gallery" / f"{path.stem}.py"
+        if path not in pages and path.stem != "index" and not example.exists():
+            path.unlink()  # of a section, a command or an example that no longer exists
     for path, text in pages.items():
         write_if_changed(path, text)
 

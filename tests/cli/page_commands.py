@@ -5,7 +5,7 @@
 
 * Each line of an `sh` block is a command of loopcal, with exit code 0 or with the one in its
   comment (`# exit code 2`).
-* All `python` blocks share their names.
+* All `python` blocks share their names; those that begin with `>>>` also show what they print.
 * A `text` block below them has lines of what the commands and the code above it have printed, in
   this order; `...` stands for lines that are left out.
 * `<!-- file: NAME -->` above a block makes it a file of this name. A block `none` is only read.
@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import contextlib
+import doctest
 import io
 import re
 import shlex
@@ -62,6 +63,8 @@ def run_page(page: str) -> dict[str, Any]:
             Path(block.file).write_text(block.text, "utf-8")
         elif block.language == "sh":
             printed = "".join(run_command(line) for line in block.text.splitlines())
+        elif block.language == "python" and block.text.startswith(">>> "):
+            run_examples(block.text, names)
         elif block.language == "python":
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 exec(compile(block.text, "<page>", "exec"), names)  # noqa: S102
@@ -69,6 +72,15 @@ def run_page(page: str) -> dict[str, Any]:
         elif block.language == "text":
             check_shown_lines(block.text, printed)
     return names
+
+
+def run_examples(text: str, names: dict[str, Any]) -> None:
+    """Run the examples of an interpreter's session, and compare what they print."""
+    report: list[str] = []
+    session = doctest.DocTestParser().get_doctest(text, names, "page", None, 0)
+    failed, tried = doctest.DocTestRunner().run(session, out=report.append, clear_globs=False)
+    assert tried
+    assert not failed, "".join(report)
 
 
 def run_command(line: str) -> str:

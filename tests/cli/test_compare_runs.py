@@ -189,6 +189,9 @@ def test_the_page_shows_what_its_commands_print(root, tmp_path, monkeypatch, cap
     assert shown.split("\n...\n")[0] in printed
     for part in shown.split("\n...\n"):
         assert part.strip("\n") in printed
+    code = page.partition("```python\n")[2].partition("```")[0]
+    exec(code, {})  # noqa: S102
+    assert capsys.readouterr().out.splitlines()[0] in ("True", "False")
 
 
 HOSTILE = "<script>alert(1)</script>=1+1\x1b[31m$\\frac{"

@@ -46,9 +46,13 @@ def read(folder: Path, text: str, **options) -> Mechanism:
     )
 
 
+def read_geometry(data_folder: Path) -> dict:
+    return json.loads((data_folder / "kinematics_oracles" / "genhexkins_geometry.json").read_text())
+
+
 @pytest.fixture
 def geometry(data_folder) -> dict:
-    return json.loads((data_folder / "kinematics_oracles" / "genhexkins_geometry.json").read_text())
+    return read_geometry(data_folder)
 
 
 def test_pins_are_the_parameters_that_the_controller_stores(tmp_path, geometry) -> None:
