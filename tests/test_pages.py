@@ -27,6 +27,7 @@ OWN_TESTS = {
     "docs/cable-robots.md": "tests/cli/test_cable_robot_page.py",
     "docs/comparing-runs.md": "tests/cli/test_compare_runs.py",
     "docs/delta-printers.md": "tests/cli/test_delta_page.py",
+    "docs/hexapod-with-tracker.md": "tests/cli/test_hexapod_page.py",
     "docs/notebooks.md": "tests/report/test_notebooks_page.py",
     "docs/planning.md": "tests/cli/test_planning_page.py",
     "docs/report.md": "tests/documents/test_report_page.py",
@@ -164,7 +165,7 @@ PREPARATIONS: dict[str, Callable[[Path, Path], object]] = {
     "evidence/README.md": lambda root, data: None,
     **{
         f"examples/{name}/README.md": lambda root, data, name=name: copy_example(root, name)
-        for name in ("cable-robot", "delta-printer", "exports", "hexapod-42")
+        for name in ("cable-robot", "delta-printer", "exports", "hexapod-42", "hexapod-tracker")
     },
 }
 """From a page that runs here to the function that puts the files of its reader into the folder."""
