@@ -1,0 +1,73 @@
+// SPDX-License-Identifier: Apache-2.0
+// The C interface. This file is compiled for the baseline of the platform: it asks the processor
+// what it has before any other code runs.
+#include "interface.h"
+
+namespace baseline {
+extern const loopcal::Kernels kernels;
+}
+#if defined(WITH_V3)
+namespace v3 {
+extern const loopcal::Kernels kernels;
+}
+#endif
+#if defined(WITH_V4)
+namespace v4 {
+extern const loopcal::Kernels kernels;
+}
+#endif
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+namespace {
+
+constexpr int ABI = 1;  // changes with every change of the C interface; library.py states it, too
+
+struct Set {
+    const char *name;
+    const loopcal::Kernels *kernels;
+};
+
+// All sets of this library, the fastest first; kernels is null where the processor lacks one.
+const Set *list_sets() {
+    static const Set sets[] = {
+#if defined(WITH_V4)
+        {"v4", __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                       __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+                       __builtin_cpu_supports("avx512vl")
+                   ? &v4::kernels
+                   : nullptr},
+#endif
+#if defined(WITH_V3)
+        {"v3", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                       __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2")
+                   ? &v3::kernels
+                   : nullptr},
+#endif
+        {"baseline", &baseline::kernels},
+        {nullptr, nullptr},
+    };
+    return sets;
+}
+
+}  // namespace
+
+EXPORT int loopcal_abi() { return ABI; }
+
+// Name of instruction set i, null beyond the last one; *works tells whether this processor has it.
+EXPORT const char *loopcal_instruction_set(int i, int *works) {
+    const Set *sets = list_sets();
+    for (int k = 0; k <= i; k++)
+        if (!sets[k].name) return nullptr;
+    *works = sets[i].kernels != nullptr;
+    return sets[i].name;
+}
+
+EXPORT int loopcal_fold(int set, const double *factor, const double *rows, double *out, int64_t t,
+                        int64_t m, int64_t p, int64_t stride) {
+    return list_sets()[set].kernels->fold(factor, rows, out, t, m, p, stride);
+}

@@ -1,0 +1,197 @@
+// SPDX-License-Identifier: Apache-2.0
+// Rows are folded into a triangular factor by Householder reflections, ROWS rows at a time.
+//
+// Reflection k takes row k of the factor and column k of a block of rows, [r; x], to [alpha; 0]:
+// v = [r - alpha; x], and with beta = 1 / (v'v / 2) every later column loses v beta (v' column).
+// Two layouts compute the same operations in the same order, so that they give the same bits:
+//   by trials  : a lane for each trial; the entries of a block are columns of ROWS vectors,
+//   by columns : one trial, a lane for each column.
+#pragma once
+
+#include "lanes.h"
+
+namespace INSTRUCTION_SET {
+
+constexpr int ROWS = 12;  // of a block: their entries of one column fit the registers
+
+// Columns whose squares sum to less are zero: products of still smaller numbers lose all digits.
+constexpr double FLOOR = 1e-200;
+
+// x' column, by three sums that do not wait for each other
+template <class Real> INLINE Real inner(const Real *x, const Real *column) {
+    Real a = x[0] * column[0], b = x[1] * column[1], c = x[2] * column[2];
+    for (int i = 3; i < ROWS; i += 3) {
+        a = a + x[i] * column[i];
+        b = b + x[i + 1] * column[i + 1];
+        c = c + x[i + 2] * column[i + 2];
+    }
+    return (a + b) + c;
+}
+
+template <class Real> struct Reflection {
+    Real alpha, v0, beta;
+};
+
+// Reflect [r; x] where `acts`; elsewhere, and for x near zero, change nothing (x is then zeroed).
+template <class Real, class Truth>
+INLINE Reflection<Real> reflect(Real r, Real *x, Truth acts) {
+    Real square = inner(x, x), zero = constant<Real>(0.0), one = constant<Real>(1.0);
+    // a sum that is NaN acts
+    Truth works = acts & ((square >= FLOOR) | (square != square));
+    for (int i = 0; i < ROWS; i++) x[i] = select(works, x[i], zero);
+    Real alpha = with_sign_of(root(r * r + square), zero - r);
+    Real v0 = r - alpha;
+    Real half = select(works, (zero - alpha) * v0, one);
+    return {select(works, alpha, r), select(works, v0, zero), one / half};
+}
+
+// Row i of the packed upper triangle begins with its diagonal.
+INLINE int64_t packed(int64_t i, int64_t p) { return i * p - i * (i - 1) / 2; }
+
+// --- by trials: factor packed, block [p][ROWS] -----------------------------------------------
+
+INLINE void fold_block(Lanes *factor, Lanes *block, int64_t p, Lanes filled) {
+    for (int64_t k = 0; k < p; k++) {
+        Mask acts = filled > (double)k;
+        if (!any(acts)) break;
+        Lanes *row = factor + packed(k, p), *x = block + k * ROWS;
+        Lanes v[ROWS];
+        for (int i = 0; i < ROWS; i++) v[i] = x[i];
+        Reflection<Lanes> h = reflect(row[0], v, acts);
+        row[0] = h.alpha;
+        for (int64_t j = 1; j < p - k; j++) {
+            Lanes *column = x + j * ROWS;
+            Lanes s = h.beta * (h.v0 * row[j] + inner(v, column));
+            row[j] = row[j] - h.v0 * s;
+            for (int i = 0; i < ROWS; i++) column[i] = column[i] - v[i] * s;
+        }
+    }
+}
+
+inline size_t need_by_trials(int64_t p) {
+    return Arena::need<Lanes>(packed(p, p)) + Arena::need<Lanes>(p * ROWS);
+}
+
+// Fold `count` <= W trials. rows : m x p of each trial, `stride` apart.
+inline void fold_trials(const double *factor, const double *rows, double *out, int64_t count,
+                        int64_t m, int64_t p, int64_t stride, Arena &arena) {
+    Lanes *R = arena.take<Lanes>(packed(p, p)), *block = arena.take<Lanes>(p * ROWS);
+    const double *factors[W], *rows_of[W];
+    Lanes filled{};
+    for (int lane = 0; lane < W; lane++) {  // lanes without a trial repeat the last one
+        int64_t trial = lane < count ? lane : count - 1;
+        factors[lane] = factor + trial * p * p;
+        rows_of[lane] = rows + trial * stride;
+    }
+    for (int64_t i = 0; i < p; i++) {
+        Lanes *row = R + packed(i, p) - i;
+        Mask used{};
+        for (int64_t j = i; j < p; j++) {
+            Lanes value;
+            for (int lane = 0; lane < W; lane++) value[lane] = factors[lane][i * p + j];
+            row[j] = value;
+            used |= value != 0.0;
+        }
+        filled = select(used, splat((double)(i + 1)), filled);
+    }
+    for (int64_t first = 0; first < m; first += ROWS) {
+        int64_t height = m - first < ROWS ? m - first : ROWS;
+        for (int64_t j = 0; j < p; j++)
+            for (int64_t i = height; i < ROWS; i++) block[j * ROWS + i] = Lanes{};
+        for (int64_t i = 0; i < height; i++) {
+            int64_t offset = (first + i) * p;
+            for (int64_t j = 0; j < p; j++) {
+                Lanes value;
+                for (int lane = 0; lane < W; lane++) value[lane] = rows_of[lane][offset + j];
+                block[j * ROWS + i] = value;
+            }
+        }
+        // a factor of few rows has no more rows than were folded
+        filled = smaller(filled + (double)height, splat((double)p));
+        fold_block(R, block, p, filled);
+    }
+    for (int64_t i = 0; i < p; i++) {
+        const Lanes *row = R + packed(i, p) - i;
+        for (int64_t lane = 0; lane < count; lane++) {
+            double *to = out + lane * p * p + i * p;
+            for (int64_t j = 0; j < i; j++) to[j] = 0.0;
+            for (int64_t j = i; j < p; j++) to[j] = row[j][lane];
+        }
+    }
+}
+
+// --- by columns: factor [p][width], block [ROWS][width], width a multiple of W ----------------
+
+inline int64_t padded(int64_t p) { return (p + W - 1) / W * W; }
+
+inline size_t need_by_columns(int64_t p) {
+    return Arena::need<double>(p * padded(p)) + Arena::need<double>(ROWS * padded(p));
+}
+
+INLINE void fold_block_by_columns(double *factor, double *block, int64_t p, int64_t filled) {
+    int64_t width = padded(p);
+    for (int64_t k = 0; k < filled; k++) {
+        double *row = factor + k * width, v[ROWS];
+        for (int i = 0; i < ROWS; i++) v[i] = block[i * width + k];
+        Reflection<double> h = reflect(row[k], v, true);
+        // columns before k are zero in all these rows
+        Lanes wide[ROWS];
+        for (int i = 0; i < ROWS; i++) wide[i] = splat(v[i]);
+        for (int64_t j = k / W * W; j < width; j += W) {
+            Lanes column[ROWS], old = load(row + j);
+            for (int i = 0; i < ROWS; i++) column[i] = load(block + i * width + j);
+            Lanes s = h.beta * (h.v0 * old + inner(wide, column));
+            store(row + j, old - h.v0 * s);
+            for (int i = 0; i < ROWS; i++) store(block + i * width + j, column[i] - wide[i] * s);
+        }
+        row[k] = h.alpha;
+        for (int i = 0; i < ROWS; i++) block[i * width + k] = 0.0;
+    }
+}
+
+inline void fold_trial(const double *factor, const double *rows, double *out, int64_t m, int64_t p,
+                       Arena &arena) {
+    int64_t width = padded(p), filled = 0;
+    double *R = arena.take<double>(p * width), *block = arena.take<double>(ROWS * width);
+    for (int64_t i = 0; i < p; i++)
+        for (int64_t j = 0; j < width; j++) {
+            R[i * width + j] = j >= i && j < p ? factor[i * p + j] : 0.0;
+            if (R[i * width + j] != 0.0) filled = i + 1;
+        }
+    for (int64_t first = 0; first < m; first += ROWS) {
+        int64_t height = m - first < ROWS ? m - first : ROWS;
+        std::memset(block, 0, sizeof(double) * (size_t)(ROWS * width));
+        for (int64_t i = 0; i < height; i++)
+            std::memcpy(block + i * width, rows + (first + i) * p, sizeof(double) * (size_t)p);
+        filled = filled + height < p ? filled + height : p;
+        fold_block_by_columns(R, block, p, filled);
+    }
+    for (int64_t i = 0; i < p; i++)
+        for (int64_t j = 0; j < p; j++) out[i * p + j] = j < i ? 0.0 : R[i * width + j];
+}
+
+// --- the call ---------------------------------------------------------------------------------
+
+inline int fold(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
+                int64_t p, int64_t stride) {
+    size_t trials = need_by_trials(p), columns = need_by_columns(p);
+    for (int64_t first = 0; first < t; first += W) {
+        int64_t count = t - first < W ? t - first : W;
+        const double *from = factor + first * p * p, *given = rows + first * stride;
+        double *to = out + first * p * p;
+        if (count * 2 > W) {
+            Arena arena(trials);
+            if (!arena.ok()) return 1;
+            fold_trials(from, given, to, count, m, p, stride, arena);
+            continue;
+        }
+        for (int64_t i = 0; i < count; i++) {
+            Arena arena(columns);
+            if (!arena.ok()) return 1;
+            fold_trial(from + i * p * p, given + i * stride, to + i * p * p, m, p, arena);
+        }
+    }
+    return 0;
+}
+
+}  // namespace INSTRUCTION_SET
