@@ -71,3 +71,19 @@ EXPORT int loopcal_fold(int set, const double *factor, const double *rows, doubl
                         int64_t m, int64_t p, int64_t stride) {
     return list_sets()[set].kernels->fold(factor, rows, out, t, m, p, stride);
 }
+
+EXPORT int loopcal_linearize(int set, const int64_t *structure, const double *numbers,
+                             const loopcal::Strided *arrays, const loopcal::Strided *joints,
+                             double *const *out, int64_t t, int64_t n) {
+    return list_sets()[set].kernels->linearize(structure, numbers, arrays, joints, out, t, n);
+}
+
+EXPORT int loopcal_solve(int set, const int64_t *structure, const double *numbers,
+                         const loopcal::Strided *arrays, const loopcal::Strided *joints, int64_t t,
+                         int64_t n, int64_t max_iterations, loopcal::Task task, void *context,
+                         double *T, double *const *joints_out, double *residual,
+                         int64_t *iterations, int8_t *status, int8_t *sign) {
+    return list_sets()[set].kernels->solve(structure, numbers, arrays, joints, t, n, max_iterations,
+                                           task, context, T, joints_out, residual, iterations,
+                                           status, sign);
+}

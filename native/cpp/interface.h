@@ -9,9 +9,33 @@ namespace loopcal {
 // Return values of the functions.
 enum Outcome { DONE = 0, NO_MEMORY = 1, TASK_FAILED = 2 };
 
+constexpr int MOST_CONDITIONS = 64;  // of a task, for each row; library.py refuses more
+
+struct TaskAnswer {
+    const double *residual, *slopes;  // (count, conditions), (count, conditions, 6)
+    int64_t conditions;
+};
+
+// Conditions on `count` poses (count, 3, 4) of these rows; a value other than 0 ends the call.
+typedef int (*Task)(void *context, int64_t count, const double *poses, const int64_t *rows,
+                    TaskAnswer *answer);
+
+// An array (t | 1, n | 1, ..): strides of its first axes in doubles, 0 for an axis of length 1.
+struct Strided {
+    const double *data;
+    int64_t trial, pose;
+};
+
 struct Kernels {
     int (*fold)(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
                 int64_t p, int64_t stride);
+    // structure, numbers : see library.py. joints, out : one for each group.
+    int (*linearize)(const int64_t *structure, const double *numbers, const Strided *arrays,
+                     const Strided *joints, double *const *out, int64_t t, int64_t n);
+    int (*solve)(const int64_t *structure, const double *numbers, const Strided *arrays,
+                 const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, Task task,
+                 void *context, double *T, double *const *joints_out, double *residual,
+                 int64_t *iterations, int8_t *status, int8_t *sign);
 };
 
 }  // namespace loopcal

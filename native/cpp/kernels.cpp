@@ -3,10 +3,31 @@
 // INSTRUCTION_SET (a namespace) and LANES (doubles of a vector).
 #include "fold.h"
 #include "interface.h"
+#include "linearize.h"
+#include "solve.h"
 
 namespace INSTRUCTION_SET {
 
+// arrays : e, q, T
+static int call_linearize(const int64_t *structure, const double *numbers,
+                          const loopcal::Strided *arrays, const loopcal::Strided *joints,
+                          double *const *out, int64_t t, int64_t n) {
+    return linearize(structure, numbers, arrays[0], arrays[1], arrays[2], joints, out, t, n);
+}
+
+// arrays : e, q, T, goal
+static int call_solve(const int64_t *structure, const double *numbers,
+                      const loopcal::Strided *arrays, const loopcal::Strided *joints, int64_t t,
+                      int64_t n, int64_t max_iterations, loopcal::Task task, void *context,
+                      double *T, double *const *joints_out, double *residual, int64_t *iterations,
+                      int8_t *status, int8_t *sign) {
+    SolveInput input{arrays[0], arrays[1], arrays[2], arrays[3], joints, t, n, max_iterations,
+                     task,      context};
+    SolveOutput output{T, joints_out, residual, iterations, status, sign};
+    return solve(structure, numbers, input, output);
+}
+
 extern const loopcal::Kernels kernels;
-const loopcal::Kernels kernels = {fold};
+const loopcal::Kernels kernels = {fold, call_linearize, call_solve};
 
 }  // namespace INSTRUCTION_SET

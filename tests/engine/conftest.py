@@ -10,7 +10,7 @@ from tests import zoo
 from tests.engine.cases import Case, make_case
 
 
-@pytest.fixture(scope="session", params=["numpy"])
+@pytest.fixture(scope="session", params=["numpy","native:baseline","native:v3","native:v4"])
 def engine(request) -> Engine:
     return select_engine(request.param)
 

@@ -3,14 +3,26 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
 
-from loopcal.engine import Engine, numpy_engine
+from loopcal.engine import Block, ClosureBlocks, Engine, Program, State, Task
 from loopcal.typing import FloatArray
-from loopcal_native.library import as_reals, list_instruction_sets, load_library, require_done
+from loopcal_native.library import (
+    TASK_FAILED,
+    Strided,
+    as_reals,
+    describe,
+    list_instruction_sets,
+    load_library,
+    require_done,
+)
+from loopcal_native.programs import flatten_program, require
+from loopcal_native.tasks import NO_TASK, TaskCalls
 
 
 def make_engine(variant: str = "") -> Engine:
@@ -24,14 +36,9 @@ def make_engine(variant: str = "") -> Engine:
     name = variant or next(iter(sets))
     if name not in sets:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
-    functions = NativeFunctions(sets[name])
-    return Engine(
-        f"native:{name}",
-        version("loopcal-native"),
-        numpy_engine.solve,
-        numpy_engine.linearize,
-        functions.fold,
-    )
+    own = NativeFunctions(sets[name])
+    number = version("loopcal-native")
+    return Engine(f"native:{name}", number, own.solve, own.linearize, own.fold)
 
 
 @dataclass(frozen=True)
@@ -40,10 +47,91 @@ class NativeFunctions:
 
     instruction_set: int
 
+    def solve(
+        self,
+        program: Program,
+        e: FloatArray,
+        q: FloatArray,
+        start: State,
+        task: Task | None = None,
+        free: bool = False,
+        max_iterations: int = 60,
+        goal: State | None = None,
+    ) -> State:
+        """Find the pose and the joints that close every loop."""
+        t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
+        flat, shape = flatten_program(program, free), (t, n)
+        arrays = [as_reals(e), as_reals(q), as_reals(start.T)]
+        joints = [as_reals(a) for a in start.joints]
+        _require_arrays(program, arrays, joints, shape)
+        if goal is not None:
+            arrays.append(as_reals(goal.T))
+            require(arrays[-1].shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
+        T, residual = np.empty((t, n, 4, 4)), np.empty(shape)
+        out = [np.empty((t, n, *a.shape[2:])) for a in joints]
+        iterations = np.empty(shape, np.int64)
+        status, sign = np.empty(shape, np.int8), np.empty(shape, np.int8)
+        if t * n:
+            calls = TaskCalls(task) if task is not None else None
+            outcome = load_library().loopcal_solve(
+                self.instruction_set,
+                flat.structure.ctypes.data,
+                flat.numbers.ctypes.data,
+                _describe_all([*arrays, *[None] * (4 - len(arrays))]),
+                _describe_all(joints),
+                t,
+                n,
+                max(max_iterations, 0),
+                calls.function if calls else NO_TASK,
+                None,
+                T.ctypes.data,
+                _list_addresses(out),
+                *(a.ctypes.data for a in (residual, iterations, status, sign)),
+            )
+            if calls is not None and outcome == TASK_FAILED:
+                raise calls.error
+            require_done(outcome)
+        return State(T, tuple(out), status, residual, iterations, sign)
+
+    def linearize(
+        self, program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
+    ) -> ClosureBlocks:
+        """Linearize closure at a state (t, n) and eliminate the passive joints."""
+        t, n = shape = state.T.shape[:2]
+        flat = flatten_program(program, free)
+        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
+        joints = [as_reals(a) for a in joints]
+        _require_arrays(program, arrays, joints, shape)
+        m, out = len(program.freedoms), []
+        for group, unknown in zip(program.groups, flat.unknown, strict=True):
+            width = len(unknown) + m + len(group.slots) + len(group.joints) + 1
+            out.append(np.empty((t, n, len(group.limbs), len(group.rows), width)))
+        if t * n:
+            call = load_library().loopcal_linearize
+            require_done(
+                call(
+                    self.instruction_set,
+                    flat.structure.ctypes.data,
+                    flat.numbers.ctypes.data,
+                    _describe_all([arrays[0], None if free else arrays[1], arrays[2]]),
+                    _describe_all(joints),
+                    _list_addresses(out),
+                    t,
+                    n,
+                )
+            )
+        closure, passive = [], []
+        for group, unknown, rows in zip(program.groups, flat.unknown, out, strict=True):
+            u = len(unknown)
+            cuts = [0, u, u + m, u + m + len(group.slots), rows.shape[-1]]
+            for blocks, part in ((passive, rows[..., :u, :]), (closure, rows[..., u:, :])):
+                blocks.append(Block(*(part[..., cuts[i] : cuts[i + 1]] for i in range(4))))
+        return ClosureBlocks(tuple(closure), tuple(passive), flat.unknown)
+
     def fold(self, factor: FloatArray, rows: FloatArray) -> FloatArray:
         """Return the triangular factor R with R'R = factor'factor + rows'rows."""
         factor, rows = as_reals(factor), as_reals(rows)
-        require_shapes(
+        require(
             factor.ndim == 3
             and rows.ndim == 3
             and factor.shape[1] == factor.shape[2] == rows.shape[2]
@@ -58,7 +146,34 @@ class NativeFunctions:
         return out
 
 
-def require_shapes(is_right: bool, expected: str) -> None:
-    """Raise ValueError where arrays do not have the shapes of the interface."""
-    if not is_right:
-        raise ValueError(f"expected {expected}")
+def _require_arrays(
+    program: Program,
+    arrays: Sequence[FloatArray],
+    joints: Sequence[FloatArray],
+    shape: tuple[int, int],
+) -> None:
+    """Raise ValueError unless e, q, T and joints are arrays of t trials and n poses."""
+    t, n = shape
+    e, q, T = arrays
+    expected = f"e ({t} | 1, {program.n_displacements}), not {e.shape}"
+    require(e.ndim == 2 and e.shape[1] == program.n_displacements, expected)
+    require(len(e) in (1, t), expected)
+    named = [("q", q, (program.n_joints,)), ("T", T, (4, 4))]
+    require(len(joints) == len(program.groups), f"joints of {len(program.groups)} groups")
+    for group, values in zip(program.groups, joints, strict=True):
+        named.append(("joints", values, (len(group.limbs), len(group.joints) + 1)))
+    for name, array, end in named:
+        is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
+        is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
+        require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
+
+
+def _describe_all(arrays: Sequence[FloatArray | None]) -> ctypes.Array[Strided]:
+    """Return the addresses and strides of arrays; null for None."""
+    described = (Strided(None, 0, 0) if a is None else describe(a) for a in arrays)
+    return (Strided * len(arrays))(*described)
+
+
+def _list_addresses(arrays: Sequence[FloatArray]) -> ctypes.Array[ctypes.c_void_p]:
+    """Return the addresses of arrays."""
+    return (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))

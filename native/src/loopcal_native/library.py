@@ -13,9 +13,25 @@ ABI = 1
 """The C interface that this package calls; dispatch.cpp states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""
+MOST_CONDITIONS = 64
+"""Conditions of a task for each row; interface.h states it, too."""
 
-REAL = ctypes.c_void_p
-COUNT = ctypes.c_int64
+ADDRESS, COUNT, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int
+
+
+class Strided(ctypes.Structure):
+    """An array (t | 1, n | 1, ..): strides of its first axes in doubles, 0 for one of length 1."""
+
+    _fields_ = (("data", ADDRESS), ("trial", COUNT), ("pose", COUNT))
+
+
+class TaskAnswer(ctypes.Structure):
+    """Residuals (count, conditions) and slopes (count, conditions, 6) of a task."""
+
+    _fields_ = (("residual", ADDRESS), ("slopes", ADDRESS), ("conditions", COUNT))
+
+
+TASK = ctypes.CFUNCTYPE(INT, ADDRESS, COUNT, ADDRESS, ADDRESS, ctypes.POINTER(TaskAnswer))
 
 
 @cache
@@ -30,19 +46,21 @@ def load_library() -> ctypes.CDLL:
     if file is None:
         raise OSError("its library was not built; install loopcal-native with a C++ compiler")
     library = ctypes.CDLL(str(file))
-    library.loopcal_abi.restype = ctypes.c_int
+    library.loopcal_abi.restype = INT
     if library.loopcal_abi() != ABI:
         raise OSError("its library belongs to another version of loopcal-native")
-    library.loopcal_instruction_set.argtypes = (ctypes.c_int, ctypes.POINTER(ctypes.c_int))
+    library.loopcal_instruction_set.argtypes = (INT, ctypes.POINTER(INT))
     library.loopcal_instruction_set.restype = ctypes.c_char_p
-    library.loopcal_fold.argtypes = (ctypes.c_int, REAL, REAL, REAL, *(COUNT,) * 4)
+    library.loopcal_fold.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 4)
+    library.loopcal_linearize.argtypes = (INT, *(ADDRESS,) * 5, *(COUNT,) * 2)
+    library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3, TASK, *(ADDRESS,) * 7)
     return library
 
 
 @cache
 def list_instruction_sets() -> dict[str, int]:
     """Return the instruction sets that this processor has, the fastest first, by name."""
-    library, sets, works = load_library(), {}, ctypes.c_int(0)
+    library, sets, works = load_library(), {}, INT(0)
     number = 0
     while (name := library.loopcal_instruction_set(number, ctypes.byref(works))) is not None:
         if works.value:
@@ -62,3 +80,13 @@ def require_done(outcome: int) -> None:
 def as_reals(array: np.ndarray) -> np.ndarray:
     """Return an array of doubles in one piece of memory; most arrays stay as they are."""
     return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def describe(array: np.ndarray) -> Strided:
+    """Return the address and the strides of an array of `as_reals`, which must be kept."""
+    size = array[0, 0].size if array.ndim > 2 else array.shape[-1]
+    if array.ndim == 2:  # (t | 1, numbers)
+        return Strided(array.ctypes.data, size if len(array) > 1 else 0, 0)
+    poses = array.shape[1]
+    trial = size * poses if len(array) > 1 else 0
+    return Strided(array.ctypes.data, trial, size if poses > 1 else 0)

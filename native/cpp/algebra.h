@@ -1,0 +1,136 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sines, vectors and rotations in lanes. Vectors have 3 entries, matrices 9, row by row; an
+// argument of type Number is Lanes or double (the same for all lanes).
+#pragma once
+
+#include "lanes.h"
+
+namespace INSTRUCTION_SET {
+
+// Sine and cosine to 1.2 units in the last place for |x| < 1e6, and to 1.2 units in the last place
+// of x beyond; NaN beyond 1e15. Coefficients: fdlibm (Sun Microsystems, 1993), k_sin.c and k_cos.c.
+INLINE void sine_and_cosine(Lanes x, Lanes &sine, Lanes &cosine) {
+    constexpr double WHOLE = 6755399441055744.0;  // 1.5 * 2^52: its sum has no fraction left
+    Lanes shifted = x * 0x1.45f306dc9c883p-1 + WHOLE;  // 2 / pi
+    Mask quadrant = (Mask)shifted;
+    Lanes turns = shifted - WHOLE;
+    // pi / 2 in two parts, the first of 33 bits, so that its product is exact
+    Lanes r = (x - turns * 1.57079632673412561417e+00) - turns * 6.07710050650619224932e-11;
+    r = select(magnitude(x) <= 1e15, r, splat(__builtin_nan("")));
+    Lanes z = r * r;
+    Lanes s = 8.33333333332248946124e-03 +
+              z * (-1.98412698298579493134e-04 +
+                   z * (2.75573137070700676789e-06 +
+                        z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)));
+    s = r + (z * r) * (-1.66666666666666324348e-01 + z * s);
+    Lanes c = z * (4.16666666666666019037e-02 +
+                   z * (-1.38888888888741095749e-03 +
+                        z * (2.48015872894767294178e-05 +
+                             z * (-2.75573143513906633035e-07 +
+                                  z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)))));
+    Lanes half = 0.5 * z, w = 1.0 - half;
+    c = w + (((1.0 - w) - half) + z * c);
+    Mask odd = (quadrant & 1) != 0;
+    Lanes first = select(odd, c, s), second = select(odd, s, c);
+    sine = select((quadrant & 2) != 0, -first, first);
+    cosine = select(((quadrant + 1) & 2) != 0, -second, second);
+}
+
+template <class Number>
+INLINE void multiply_vector(const Lanes *a, const Number *v, Lanes *out) {
+    for (int i = 0; i < 3; i++) out[i] = a[3 * i] * v[0] + a[3 * i + 1] * v[1] + a[3 * i + 2] * v[2];
+}
+
+template <class Number>
+INLINE void multiply_matrix(const Lanes *a, const Number *b, Lanes *out) {
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            out[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+}
+
+INLINE Lanes dot(const Lanes *a, const Lanes *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+INLINE void cross(const Lanes *a, const Lanes *b, Lanes *out) {
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+// I + a hat(w) + b hat(w)^2
+INLINE void rotation_polynomial(const Lanes *w, Lanes a, Lanes b, Lanes *out) {
+    Lanes bx = b * w[0], by = b * w[1], bz = b * w[2], rest = 1.0 - b * dot(w, w);
+    Lanes ax = a * w[0], ay = a * w[1], az = a * w[2];
+    Lanes bxy = bx * w[1], bxz = bx * w[2], byz = by * w[2];
+    out[0] = rest + bx * w[0];
+    out[1] = bxy - az;
+    out[2] = bxz + ay;
+    out[3] = bxy + az;
+    out[4] = rest + by * w[1];
+    out[5] = byz - ax;
+    out[6] = bxz - ay;
+    out[7] = byz + ax;
+    out[8] = rest + bz * w[2];
+}
+
+constexpr double SMALLEST = 1e-300;  // least divisor, see householder.py
+
+// exp(hat(w)) by Rodrigues' formula
+INLINE void exponential(const Lanes *w, Lanes *out) {
+    Lanes t = root(dot(w, w) + SMALLEST), sine, half, unused;
+    sine_and_cosine(t, sine, unused);
+    sine_and_cosine(0.5 * t, half, unused);
+    half = half / (0.5 * t);
+    rotation_polynomial(w, sine / t, 0.5 * half * half, out);
+}
+
+// J with exp(hat(w + d)) = exp(hat(J d)) exp(hat(w)) to first order in d
+INLINE void left_jacobian(const Lanes *w, Lanes *out) {
+    Lanes t2 = dot(w, w), t = root(t2), sine, half, unused, one = splat(1.0);
+    sine_and_cosine(t, sine, unused);
+    Mask none = t == 0.0, small = t < 0.02;
+    Lanes divisor = select(none, one, 0.5 * t);
+    sine_and_cosine(divisor, half, unused);
+    half = select(none, one, half / divisor);
+    Lanes tail = select(small, 1.0 / 6.0 - t2 / 120.0, (t - sine) / select(small, one, t2 * t));
+    rotation_polynomial(w, 0.5 * half * half, tail, out);
+}
+
+// --- Householder, see householder.py: columns of `rows` entries, one after the other --------------
+
+struct Reflector {
+    Lanes alpha, beta;
+};
+
+// The reflection that takes column[0..count) to [alpha, 0, ..]; its vector replaces the column.
+INLINE Reflector make_reflector(Lanes *column, int count) {
+    Lanes square = column[0] * column[0];
+    for (int i = 1; i < count; i++) square = square + column[i] * column[i];
+    Lanes alpha = with_sign_of(root(square), -column[0]);
+    column[0] = column[0] - alpha;
+    return {alpha, 1.0 / larger(-(alpha * column[0]), splat(SMALLEST))};
+}
+
+INLINE void reflect_column(const Lanes *v, Lanes beta, Lanes *column, int count) {
+    Lanes s = v[0] * column[0];
+    for (int i = 1; i < count; i++) s = s + v[i] * column[i];
+    s = beta * s;
+    for (int i = 0; i < count; i++) column[i] = column[i] - v[i] * s;
+}
+
+// Triangularize the first `columns` of `total` columns; below their diagonals remain the vectors.
+// Returns the determinant of the reflections and their betas; the diagonal is that of the factor.
+INLINE Lanes triangularize(Lanes *matrix, int rows, int total, int columns) {
+    int count = columns < rows - 1 ? columns : rows - 1;
+    Lanes sign = splat(1.0);
+    for (int j = 0; j < count; j++) {
+        Lanes *v = matrix + j * rows + j;
+        Reflector h = make_reflector(v, rows - j);
+        for (int c = j + 1; c < total; c++)
+            reflect_column(v, h.beta, matrix + c * rows + j, rows - j);
+        v[0] = h.alpha;
+        sign = select(h.alpha != 0.0, -sign, sign);
+    }
+    return sign;
+}
+
+}  // namespace INSTRUCTION_SET

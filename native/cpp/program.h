@@ -1,0 +1,133 @@
+// SPDX-License-Identifier: Apache-2.0
+// A mechanism as flat arrays, as library.py writes it (see `flatten_program` there), and its links
+// displaced by the parameters of a trial.
+#pragma once
+
+#include "algebra.h"
+
+namespace INSTRUCTION_SET {
+
+enum Ending { RIGID = 0, BALL = 1, DISTANCE = 2 };
+constexpr int PITCH = 6, LENGTH = 7;  // values of Slot.axis beside those of a twist
+constexpr int LINK = 21;              // numbers of a placed link: rotation, slope, origin
+
+// Limbs of one structure; see loopcal.engine.Group. Arrays belong to the caller.
+struct Group {
+    int limbs, joints, ending, rows, slots, unknown;
+    int64_t first_column;      // of e
+    const int64_t *row;        // rows of the ending that count
+    const int64_t *turns;      // joints: 1 for R, 0 for P
+    const int64_t *solved;     // `unknown` joints that closure determines
+    const int64_t *actuator;   // (joints + 1, limbs): column of q or -1
+    const int64_t *slot;       // (slots, 2): element and axis
+    const int64_t *rotates;    // links: whether their rotation can differ from the identity
+    const int64_t *displaced;  // links: whether a slot rotates them
+    const int64_t *advances;   // joints: whether their pitch can differ from zero
+    const double *links;       // (limbs, joints + 2, 12): rotation, origin
+    const double *pitch;       // (limbs, joints)
+    const double *length;      // (limbs,)
+
+    int placed() const { return LINK * (joints + 2) + joints + 1; }  // numbers of a placed limb
+};
+
+struct Program {
+    int groups, freedoms, displacements, drives, free;
+    int freedom[6];
+    const double *sigma;  // (drives,), null without redundancy
+    double size;
+    Group *group;
+
+    // `memory` for as many groups as whole[0] states
+    Program(const int64_t *whole, const double *real, Group *memory) : group(memory) {
+        const int64_t *i = whole;
+        groups = (int)*i++, freedoms = (int)*i++, displacements = (int)*i++, drives = (int)*i++;
+        bool has_sigma = *i++ != 0;
+        free = (int)*i++;
+        for (int f = 0; f < 6; f++) freedom[f] = (int)*i++;
+        size = *real++;
+        sigma = has_sigma ? real : nullptr;
+        if (has_sigma) real += drives;
+        for (int g = 0; g < groups; g++) {
+            Group &o = group[g];
+            o.limbs = (int)*i++, o.joints = (int)*i++, o.ending = (int)*i++, o.rows = (int)*i++;
+            o.slots = (int)*i++, o.unknown = (int)*i++, o.first_column = *i++;
+            o.row = i, i += o.rows;
+            o.turns = i, i += o.joints;
+            o.solved = i, i += o.unknown;
+            o.actuator = i, i += (o.joints + 1) * o.limbs;
+            o.slot = i, i += 2 * o.slots;
+            o.rotates = i, i += o.joints + 2;
+            o.displaced = i, i += o.joints + 2;
+            o.advances = i, i += o.joints;
+            o.links = real, real += o.limbs * (o.joints + 2) * 12;
+            o.pitch = real, real += o.limbs * o.joints;
+            o.length = real, real += o.limbs;
+        }
+    }
+
+    int placed() const {
+        int count = 0;
+        for (int g = 0; g < groups; g++) count += group[g].limbs * group[g].placed();
+        return count;
+    }
+
+    int joint_values() const {
+        int count = 0;
+        for (int g = 0; g < groups; g++) count += group[g].limbs * (group[g].joints + 1);
+        return count;
+    }
+
+    int unknown_joints() const {
+        int count = 0;
+        for (int g = 0; g < groups; g++) count += group[g].limbs * group[g].unknown;
+        return count;
+    }
+};
+
+// placed = nominal . translation(d) . rotation(exp(w)) for every link of every limb, with lanes for
+// trials. e : the displacements of each lane.
+inline void place_links(const Program &program, const double *const *e, Lanes *placed) {
+    for (int g = 0; g < program.groups; g++) {
+        const Group &group = program.group[g];
+        int links = group.joints + 2;
+        for (int k = 0; k < group.limbs; k++, placed += group.placed()) {
+            Lanes *pitch = placed + LINK * links, *length = pitch + group.joints;
+            const double *nominal = group.links + k * links * 12;
+            for (int j = 0; j < group.joints; j++) pitch[j] = splat(group.pitch[k * group.joints + j]);
+            *length = splat(group.length[k]);
+            // moves are gathered in the place of rotation (turns) and slope (shifts)
+            for (int i = 0; i < LINK * links; i++) placed[i] = Lanes{};
+            for (int s = 0; s < group.slots; s++) {
+                int64_t element = group.slot[2 * s], axis = group.slot[2 * s + 1];
+                Lanes value;
+                int64_t column = group.first_column + (int64_t)k * group.slots + s;
+                for (int lane = 0; lane < W; lane++) value[lane] = e[lane][column];
+                if (axis == PITCH)
+                    pitch[element] = pitch[element] + value;
+                else if (axis == LENGTH)
+                    *length = *length + value;
+                else
+                    placed[LINK * element + axis] = placed[LINK * element + axis] + value;
+            }
+            for (int j = 0; j < links; j++) {
+                Lanes *link = placed + LINK * j, *slope = link + 9, *origin = link + 18;
+                const double *n = nominal + 12 * j;
+                Lanes w[3] = {link[0], link[1], link[2]}, d[3] = {link[3], link[4], link[5]};
+                Lanes base[9], turn[9];
+                for (int i = 0; i < 9; i++) base[i] = splat(n[i]);
+                for (int i = 0; i < 3; i++)
+                    origin[i] = n[9 + i] + (n[3 * i] * d[0] + n[3 * i + 1] * d[1] + n[3 * i + 2] * d[2]);
+                if (group.displaced[j]) {
+                    exponential(w, turn);
+                    multiply_matrix(base, turn, link);
+                    left_jacobian(w, turn);
+                    multiply_matrix(base, turn, slope);
+                } else {
+                    for (int i = 0; i < 9; i++) link[i] = base[i], slope[i] = Lanes{};
+                }
+            }
+        }
+    }
+}
+
+}  // namespace INSTRUCTION_SET
