@@ -32,12 +32,11 @@ template <class Real> struct Reflection {
     Real alpha, v0, beta;
 };
 
-// Reflect [r; x] where `acts`; elsewhere, and for x near zero, change nothing (x is then zeroed).
-template <class Real, class Truth>
-INLINE Reflection<Real> reflect(Real r, Real *x, Truth acts) {
+// Reflect [r; x]; where x is near zero, change nothing (x is then zeroed).
+template <class Real> INLINE Reflection<Real> reflect(Real r, Real *x) {
     Real square = inner(x, x), zero = constant<Real>(0.0), one = constant<Real>(1.0);
     // a sum that is NaN acts
-    Truth works = acts & ((square >= FLOOR) | (square != square));
+    auto works = (square >= FLOOR) | (square != square);
     for (int i = 0; i < ROWS; i++) x[i] = select(works, x[i], zero);
     Real alpha = with_sign_of(root(r * r + square), zero - r);
     Real v0 = r - alpha;
@@ -50,14 +49,12 @@ INLINE int64_t packed(int64_t i, int64_t p) { return i * p - i * (i - 1) / 2; }
 
 // --- by trials: factor packed, block [p][ROWS] -----------------------------------------------
 
-INLINE void fold_block(Lanes *factor, Lanes *block, int64_t p, Lanes filled) {
+INLINE void fold_block(Lanes *factor, Lanes *block, int64_t p) {
     for (int64_t k = 0; k < p; k++) {
-        Mask acts = filled > (double)k;
-        if (!any(acts)) break;
         Lanes *row = factor + packed(k, p), *x = block + k * ROWS;
         Lanes v[ROWS];
         for (int i = 0; i < ROWS; i++) v[i] = x[i];
-        Reflection<Lanes> h = reflect(row[0], v, acts);
+        Reflection<Lanes> h = reflect(row[0], v);
         row[0] = h.alpha;
         for (int64_t j = 1; j < p - k; j++) {
             Lanes *column = x + j * ROWS;
@@ -77,7 +74,6 @@ inline void fold_trials(const double *factor, const double *rows, double *out, i
                         int64_t m, int64_t p, int64_t stride, Arena &arena) {
     Lanes *R = arena.take<Lanes>(packed(p, p)), *block = arena.take<Lanes>(p * ROWS);
     const double *factors[W], *rows_of[W];
-    Lanes filled{};
     for (int lane = 0; lane < W; lane++) {  // lanes without a trial repeat the last one
         int64_t trial = lane < count ? lane : count - 1;
         factors[lane] = factor + trial * p * p;
@@ -85,14 +81,11 @@ inline void fold_trials(const double *factor, const double *rows, double *out, i
     }
     for (int64_t i = 0; i < p; i++) {
         Lanes *row = R + packed(i, p) - i;
-        Mask used{};
         for (int64_t j = i; j < p; j++) {
             Lanes value;
             for (int lane = 0; lane < W; lane++) value[lane] = factors[lane][i * p + j];
             row[j] = value;
-            used |= value != 0.0;
         }
-        filled = select(used, splat((double)(i + 1)), filled);
     }
     for (int64_t first = 0; first < m; first += ROWS) {
         int64_t height = m - first < ROWS ? m - first : ROWS;
@@ -106,9 +99,7 @@ inline void fold_trials(const double *factor, const double *rows, double *out, i
                 block[j * ROWS + i] = value;
             }
         }
-        // a factor of few rows has no more rows than were folded
-        filled = smaller(filled + (double)height, splat((double)p));
-        fold_block(R, block, p, filled);
+        fold_block(R, block, p);
     }
     for (int64_t i = 0; i < p; i++) {
         const Lanes *row = R + packed(i, p) - i;
@@ -128,12 +119,12 @@ inline size_t need_by_columns(int64_t p) {
     return Arena::need<double>(p * padded(p)) + Arena::need<double>(ROWS * padded(p));
 }
 
-INLINE void fold_block_by_columns(double *factor, double *block, int64_t p, int64_t filled) {
+INLINE void fold_block_by_columns(double *factor, double *block, int64_t p) {
     int64_t width = padded(p);
-    for (int64_t k = 0; k < filled; k++) {
+    for (int64_t k = 0; k < p; k++) {
         double *row = factor + k * width, v[ROWS];
         for (int i = 0; i < ROWS; i++) v[i] = block[i * width + k];
-        Reflection<double> h = reflect(row[k], v, true);
+        Reflection<double> h = reflect(row[k], v);
         // columns before k are zero in all these rows
         Lanes wide[ROWS];
         for (int i = 0; i < ROWS; i++) wide[i] = splat(v[i]);
@@ -151,20 +142,17 @@ INLINE void fold_block_by_columns(double *factor, double *block, int64_t p, int6
 
 inline void fold_trial(const double *factor, const double *rows, double *out, int64_t m, int64_t p,
                        Arena &arena) {
-    int64_t width = padded(p), filled = 0;
+    int64_t width = padded(p);
     double *R = arena.take<double>(p * width), *block = arena.take<double>(ROWS * width);
     for (int64_t i = 0; i < p; i++)
-        for (int64_t j = 0; j < width; j++) {
+        for (int64_t j = 0; j < width; j++)
             R[i * width + j] = j >= i && j < p ? factor[i * p + j] : 0.0;
-            if (R[i * width + j] != 0.0) filled = i + 1;
-        }
     for (int64_t first = 0; first < m; first += ROWS) {
         int64_t height = m - first < ROWS ? m - first : ROWS;
         std::memset(block, 0, sizeof(double) * (size_t)(ROWS * width));
         for (int64_t i = 0; i < height; i++)
             std::memcpy(block + i * width, rows + (first + i) * p, sizeof(double) * (size_t)p);
-        filled = filled + height < p ? filled + height : p;
-        fold_block_by_columns(R, block, p, filled);
+        fold_block_by_columns(R, block, p);
     }
     for (int64_t i = 0; i < p; i++)
         for (int64_t j = 0; j < p; j++) out[i * p + j] = j < i ? 0.0 : R[i * width + j];

@@ -40,7 +40,7 @@ INLINE Lanes splat(double value) { return value - Lanes{}; }
 
 INLINE Lanes root(Lanes a) {
 #if defined(__AVX512F__) && LANES == 8
-    return (Lanes)_mm512_sqrt_pd((__m512d)a);
+    return (Lanes)_mm512_maskz_sqrt_pd(255, (__m512d)a);
 #elif defined(__AVX__) && LANES == 4
     return (Lanes)_mm256_sqrt_pd((__m256d)a);
 #elif defined(__SSE2__) && LANES == 2

@@ -3,14 +3,18 @@
 mechanisms.
 """
 
+from importlib.util import find_spec
+
 import pytest
 
 from loopcal.engine import Engine, select_engine
 from tests import zoo
 from tests.engine.cases import Case, make_case
 
+ENGINES = ["numpy", "native"] if find_spec("loopcal_native") else ["numpy"]
 
-@pytest.fixture(scope="session", params=["numpy","native:baseline","native:v3","native:v4"])
+
+@pytest.fixture(scope="session", params=ENGINES)
 def engine(request) -> Engine:
     return select_engine(request.param)
 

@@ -58,3 +58,9 @@ def test_trials_can_share_rows(engine, rows):
     shared = engine.fold(np.zeros((2, 7, 7)), rows[:1])
     assert_array_equal(shared[0], shared[1])
     assert_allclose(gram(shared[0]), gram(rows[0]), rtol=1e-12)
+
+
+def test_columns_of_zeros_in_the_first_rows_are_folded(engine, rows):
+    rows[:, :30, :3] = 0.0  # as rows of other parameters
+    factor = engine.fold(np.zeros((3, 7, 7)), rows)
+    assert_allclose(gram(factor), gram(rows), rtol=1e-12, atol=1e-12)

@@ -7,3 +7,4 @@ an instruction set of this one (`native:v3`).
 """
 
 from loopcal_native.engine import make_engine as make_engine
+from loopcal_native.library import list_instruction_sets as list_instruction_sets

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The native engine with each instruction set of this processor; tests are skipped without it."""
+
+import numpy as np
+import pytest
+
+from loopcal.engine import ClosureBlocks, Engine, State, select_engine
+from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
+from tests.engine.cases import Case, make_case
+
+native = pytest.importorskip("loopcal_native", reason="loopcal-native is not installed")
+
+ROBOTS = tuple(list_shipped_robots())
+
+
+def make_engines() -> dict[str, Engine]:
+    """Return the native engine by instruction set, the fastest first."""
+    return {name: select_engine(f"native:{name}") for name in native.list_instruction_sets()}
+
+
+def make_robot_case(name: str, t: int, n: int) -> Case:
+    """Return a shipped robot with displacements of t trials and n poses near home."""
+    return make_case(load_robot(name), t=t, n=n)
+
+
+def list_arrays(result: State | ClosureBlocks | np.ndarray) -> dict[str, np.ndarray]:
+    """Return the arrays of a result by name."""
+    if isinstance(result, np.ndarray):
+        return {"R": result}
+    if isinstance(result, State):
+        named = {"joints": np.concatenate([a.ravel() for a in result.joints])}
+        fields = ("T", "status", "residual", "iterations", "closure_sign")
+        return named | {field: getattr(result, field) for field in fields}
+    blocks = {"closure": result.closure, "passive": result.passive}
+    return {
+        f"{kind}.{field}": np.concatenate([getattr(block, field).ravel() for block in of_kind])
+        for kind, of_kind in blocks.items()
+        for field in ("U", "A", "E", "Q")
+    }

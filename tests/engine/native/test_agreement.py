@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The native engine agrees with the engine in NumPy on every shipped robot, and has the same bits
+for every instruction set.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from loopcal.engine import select_engine
+from tests.engine.cases import displacement_units, pose_demand
+from tests.engine.native.instruction_sets import ROBOTS, list_arrays, make_engines, make_robot_case
+
+ENGINES = make_engines()
+NATIVE, NUMPY = next(iter(ENGINES.values())), select_engine("numpy")
+
+ROUNDING = 2e-14  # of a coordinate in sizes: rounding times the condition of these robots
+
+
+def assert_same_bits(results):
+    """Assert that results of several instruction sets are equal bit for bit."""
+    first, *others = (list_arrays(result) for result in results)
+    for other in others:
+        for name, array in first.items():
+            assert_array_equal(other[name], array, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(("t", "n"), [(1, 21), (5, 17), (9, 3)])
+def test_states_agree_with_numpy_and_between_instruction_sets(name, t, n):
+    case = make_robot_case(name, t, n)
+    solved = [e.solve(case.program, case.e, case.q, case.home) for e in ENGINES.values()]
+    expected, actual = NUMPY.solve(case.program, case.e, case.q, case.home), solved[0]
+    for field in ("status", "iterations", "closure_sign"):
+        assert_array_equal(getattr(actual, field), getattr(expected, field))
+    scale = np.ones((4, 4))
+    scale[:3, 3] = case.program.size
+    assert_allclose(actual.T / scale, expected.T / scale, atol=ROUNDING)
+    for mine, theirs in zip(actual.joints, expected.joints, strict=True):
+        assert_allclose(mine, theirs, atol=ROUNDING * max(case.program.size, 1.0))
+    assert_same_bits(solved)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("free", [False, True])
+def test_blocks_agree_with_numpy_and_between_instruction_sets(name, free):
+    case = make_robot_case(name, 3, 5)
+    state = NUMPY.solve(case.program, case.e, case.q, case.home)
+    calls = [e.linearize(case.program, case.e, case.q, state, free) for e in ENGINES.values()]
+    expected = list_arrays(NUMPY.linearize(case.program, case.e, case.q, state, free))
+    largest = max(np.abs(array).max() for array in expected.values() if array.size)
+    for name, array in list_arrays(calls[0]).items():
+        assert_allclose(array, expected[name], atol=1e-14 * largest, err_msg=name)
+    assert calls[0].joints == tuple(tuple(g.unknown_joints(free)) for g in case.program.groups)
+    assert_same_bits(calls)
+
+
+@pytest.mark.parametrize("name", ["hexapod-42", "6-pus", "3-rrr"])
+def test_inverse_solutions_agree_with_numpy_and_between_instruction_sets(name):
+    case = make_robot_case(name, 1, 2100)  # two chunks of rows that share a call of the task
+    q = case.home_q + 0.1 * (case.q - case.home_q)
+    reached = NUMPY.solve(case.program, case.e, q, case.home)
+    whole = pose_demand(reached.T.reshape(-1, 4, 4), case.program.size)
+    freedoms = list(case.program.freedoms)
+
+    def task(T, rows):
+        square = np.zeros((len(T), 4, 4))
+        square[:, :3], square[:, 3, 3] = T, 1.0
+        residual, slopes = whole(square, rows)
+        return residual[:, freedoms], slopes[:, freedoms]
+
+    guess = np.broadcast_to(case.home_q, q.shape)
+    arguments = case.program, case.e, guess, case.home, task, True
+    solved = [e.solve(*arguments) for e in ENGINES.values()]
+    expected = NUMPY.solve(*arguments)
+    assert_array_equal(solved[0].status, expected.status)
+    for mine, theirs in zip(solved[0].joints, expected.joints, strict=True):
+        assert_allclose(mine, theirs, atol=ROUNDING * max(case.program.size, 1.0))
+    assert_same_bits(solved)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 7, 43])
+@pytest.mark.parametrize("trials", [1, 3, 8, 13])
+def test_factors_agree_with_numpy_and_between_instruction_sets(columns, trials):
+    rng = np.random.default_rng(columns * trials)
+    rows = rng.normal(size=(trials, 5 * columns + 3, columns))
+    rows[:, : len(rows[0]) // 2, : columns // 2] = 0.0  # as rows of other parameters
+    start = np.triu(rng.normal(size=(trials, columns, columns)))
+    for factor in (np.zeros_like(start), start):
+        folded = [e.fold(factor, rows) for e in ENGINES.values()]
+        expected = NUMPY.fold(factor, rows)
+        gram, known = (R.swapaxes(1, 2) @ R for R in (folded[0], expected))
+        assert_allclose(gram, known, atol=1e-13 * np.abs(known).max())
+        assert_array_equal(folded[0], np.triu(folded[0]))
+        assert_same_bits(folded)
+        alone = [ENGINES["baseline"].fold(factor[[i]], rows[[i]])[0] for i in range(trials)]
+        assert_array_equal(folded[0], np.array(alone))
+
+
+def test_bits_do_not_depend_on_which_rows_share_lanes():
+    case = make_robot_case("ru-pus-prs", 11, 9)
+    together = NATIVE.solve(case.program, case.e, case.q, case.home)
+    for trial, pose in ((0, 0), (7, 8), (10, 3)):
+        row = slice(trial, trial + 1), slice(pose, pose + 1)
+        alone = NATIVE.solve(case.program, case.e[row[0]], case.q[row], case.home)
+        assert_array_equal(alone.T[0, 0], together.T[trial, pose])
+        own = replace(case.home, T=alone.T, joints=alone.joints)
+        whole = NATIVE.linearize(case.program, case.e, case.q, together)
+        part = NATIVE.linearize(case.program, case.e[row[0]], case.q[row], own)
+        for mine, other in zip(part.closure, whole.closure, strict=True):
+            assert_array_equal(mine.E[0, 0], other.E[trial, pose])
+    for pose in range(2):  # lanes for trials in place of poses
+        few = NATIVE.solve(case.program, case.e, case.q[:, pose : pose + 1], case.home)
+        assert_array_equal(few.T[:, 0], together.T[:, pose])
+
+
+def test_angles_of_many_turns_are_those_of_few():
+    case = make_robot_case("3-rrr", 1, 6)
+    turned = case.q + 2 * np.pi * np.array([0.0, 1.0, -7.0, 1e3, -1e4, 1e5])[:, None]
+    few = NATIVE.solve(case.program, case.e, case.q, case.home)
+    many = NATIVE.solve(case.program, case.e, turned, case.home)
+    allowed = 1e-15 * np.abs(turned).max(axis=2)[0] + 1e-14  # rounding of the angles
+    assert (np.abs(many.T - few.T).max(axis=(0, 2, 3)) <= 10 * allowed).all()
+
+
+def test_displacements_are_as_large_as_in_numpy():
+    case = make_robot_case("ru-pus-prs", 40, 1)
+    rng = np.random.default_rng(3)
+    size = 10.0 ** rng.uniform(-12, -1, (40, 1))
+    e = size * rng.normal(size=case.e.shape) * displacement_units(case.program)
+    mine = NATIVE.linearize(
+        case.program,
+        e,
+        case.q[:1],
+        NATIVE.solve(case.program, e, case.q[:1], case.home, max_iterations=0),
+    )
+    state = NUMPY.solve(case.program, e, case.q[:1], case.home, max_iterations=0)
+    theirs = list_arrays(NUMPY.linearize(case.program, e, case.q[:1], state))
+    for name, array in list_arrays(mine).items():
+        assert_allclose(array, theirs[name], atol=1e-13, err_msg=name)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays of wrong shape are refused before the library reads them; any numbers are answered."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal.engine import CONVERGED, Engine, Program, Slot, State
+from loopcal.errors import MissingPackageError
+from tests.engine.native.instruction_sets import ROBOTS, make_engines, make_robot_case
+
+NATIVE = next(iter(make_engines().values()))
+
+
+def change_group(program: Program, **values) -> Program:
+    """Return a program whose first group is changed."""
+    return replace(program, groups=(replace(program.groups[0], **values), *program.groups[1:]))
+
+
+CASE = make_robot_case("five-bar", 2, 3)
+PROGRAM, E, Q, HOME = CASE.program, CASE.e, CASE.q, CASE.home
+GROUP = PROGRAM.groups[0]
+WRONG_CALLS = {
+    "columns of e": (PROGRAM, E[:, 1:], Q, HOME),
+    "trials of e": (PROGRAM, np.repeat(E, 2, axis=0), Q, HOME),
+    "axes of e": (PROGRAM, E[0], Q, HOME),
+    "columns of q": (PROGRAM, E, Q[..., :1], HOME),
+    "trials of q": (PROGRAM, np.repeat(E[:1], 3, axis=0), Q, HOME),
+    "axes of q": (PROGRAM, E, Q[0], HOME),
+    "poses of the start": (PROGRAM, E, Q, replace(HOME, T=np.repeat(HOME.T, 2, axis=1))),
+    "matrices of the start": (PROGRAM, E, Q, replace(HOME, T=HOME.T[..., :3, :])),
+    "joints of the start": (PROGRAM, E, Q, replace(HOME, joints=(HOME.joints[0][..., :1],))),
+    "groups of the start": (PROGRAM, E, Q, replace(HOME, joints=())),
+    "ending": (change_group(PROGRAM, ending="magnet"), E, Q, HOME),
+    "rows": (change_group(PROGRAM, rows=(0, 3)), E, Q, HOME),
+    "joints": (change_group(PROGRAM, joints="X"), E, Q, HOME),
+    "links": (change_group(PROGRAM, links=GROUP.links[:, 1:]), E, Q, HOME),
+    "actuator": (change_group(PROGRAM, actuator=GROUP.actuator + 9), E, Q, HOME),
+    "slots": (change_group(PROGRAM, slots=(Slot(99, 0),) * len(GROUP.slots)), E, Q, HOME),
+    "columns": (change_group(PROGRAM, columns=slice(0, 1)), E, Q, HOME),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_CALLS)
+def test_arrays_of_wrong_shape_are_refused(what):
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.solve(*WRONG_CALLS[what])
+    program, e, q, start = WRONG_CALLS[what]
+    state = NATIVE.solve(PROGRAM, E, Q, HOME)
+    if start is not HOME:
+        state = start
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.linearize(program, e, q, state)
+
+
+@pytest.mark.parametrize(
+    ("factor", "rows"),
+    [
+        ((2, 3, 4), (2, 5, 4)),
+        ((2, 3, 3), (2, 5, 4)),
+        ((2, 3, 3), (3, 5, 3)),
+        ((3, 3), (5, 3)),
+        ((2, 3, 3), (5, 3)),
+    ],
+)
+def test_factors_of_wrong_shape_are_refused(factor, rows):
+    with pytest.raises(ValueError, match="the native engine expects"):
+        NATIVE.fold(np.zeros(factor), np.zeros(rows))
+
+
+def test_nothing_is_solved_for_no_trials_no_poses_and_no_rows():
+    assert NATIVE.solve(
+        PROGRAM, E, Q[:, :0], replace(HOME, T=HOME.T[:, :0], joints=(HOME.joints[0][:, :0],))
+    ).T.shape == (2, 0, 4, 4)
+    assert NATIVE.fold(np.zeros((0, 3, 3)), np.zeros((0, 5, 3))).shape == (0, 3, 3)
+    R = np.triu(np.random.default_rng(1).normal(size=(2, 3, 3)))
+    np.testing.assert_array_equal(NATIVE.fold(R, np.zeros((2, 0, 3))), R)
+    assert NATIVE.fold(np.zeros((2, 0, 0)), np.zeros((2, 4, 0))).shape == (2, 0, 0)
+
+
+def test_errors_of_a_task_reach_the_caller():
+    def task(_T, _rows):
+        raise KeyError("pose")
+
+    for wrong in (task, lambda T, rows: (np.zeros((1, 2)), np.zeros((1, 2, 6))), lambda T, rows: 3):
+        with pytest.raises((KeyError, ValueError, TypeError)):
+            NATIVE.solve(PROGRAM, E, Q, HOME, wrong, free=True)
+
+
+def test_an_instruction_set_that_the_processor_lacks_is_refused():
+    from loopcal.engine import select_engine
+
+    with pytest.raises(MissingPackageError, match="this processor has the instruction sets"):
+        select_engine("native:v99")
+
+
+def draw_any(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Draw numbers of every magnitude, infinities and NaN."""
+    value = rng.normal(size=shape) * 10.0 ** rng.uniform(-320, 308, shape)
+    special = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 1e-308, 1.7e308, 1.0, np.pi])
+    return np.where(rng.uniform(size=shape) < 0.3, rng.choice(special, shape), value)
+
+
+def disturb(rng: np.random.Generator, array: np.ndarray, share: float) -> np.ndarray:
+    """Replace a share of the entries by any numbers."""
+    return np.where(rng.uniform(size=array.shape) < share, draw_any(rng, array.shape), array)
+
+
+def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
+    """Solve, linearize and fold rows with wrong numbers; return how many were solved."""
+    rng = np.random.default_rng(seed)
+    case = make_robot_case(name, rows, 1)
+    share = rng.choice([0.001, 0.02, 0.3, 1.0])
+    start = State(
+        disturb(rng, np.repeat(case.home.T, rows, axis=0), share / 10),
+        tuple(disturb(rng, np.repeat(a, rows, axis=0), share / 10) for a in case.home.joints),
+        *(
+            np.repeat(a, rows, axis=0)
+            for a in (
+                case.home.status,
+                case.home.residual,
+                case.home.iterations,
+                case.home.closure_sign,
+            )
+        ),
+    )
+    e, q = disturb(rng, case.e, share), disturb(rng, case.q, share)
+    state = native.solve(case.program, e, q, start)
+    closed = state.status == CONVERGED
+    assert np.isfinite(state.T[closed]).all()
+    assert set(np.unique(state.status)) <= {0, 1, 2, 3}
+    blocks = native.linearize(case.program, e, q, state)
+    native.linearize(case.program, e, q, state, free=True)
+    matrix = blocks.closure[0].E.reshape(rows, -1, blocks.closure[0].E.shape[-1])
+    factor = native.fold(np.zeros((rows, *matrix.shape[2:] * 2)), matrix)
+    assert np.isfinite(
+        factor[
+            np.isfinite(matrix).all(axis=(1, 2))
+            & (np.abs(matrix).max(axis=(1, 2), initial=0.0) < 1e100)
+        ]
+    ).all()
+    return int(closed.sum())
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_any_numbers_are_answered(name):
+    with np.errstate(all="ignore"):
+        check_any_numbers(NATIVE, name, 300, 1)
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_million_wrong_inputs_are_answered(name):
+    rows = 1000
+    with np.errstate(all="ignore"):
+        for seed in range(-(-1_000_000 // rows // len(ROBOTS))):
+            check_any_numbers(NATIVE, name, rows, seed)
