@@ -25,7 +25,8 @@ ENDING = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 LIBRARY = f"libloopcal{ENDING}"
 OPTIONS = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-exceptions")
 OPTIONS += ("-fno-rtti", "-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-psabi")
-OPTIONS += ("-Wno-maybe-uninitialized",)  # GCC warns of its own header of AVX-512
+# GCC copies vectors in pieces that stall the loads of whole ones, unless loops stay loops
+OPTIONS += ("-fno-tree-loop-distribute-patterns", "-Wno-ignored-optimization-argument")
 AVX512 = "f bw cd dq vl"
 SETS = {
     "x86": {

@@ -15,7 +15,7 @@ FILE_LIMIT, TEST_FILE_LIMIT = 400, 550
 FUNCTION_LIMIT = 75
 """Lines of a function with its docstring, at 100 columns."""
 
-FOLDERS = ("src", "tests", "tools", "benchmarks", "evidence")
+FOLDERS = ("src", "tests", "tools", "benchmarks", "evidence", "native")
 REASON = re.compile(r"#\s*size:\s*\S")
 
 

@@ -92,7 +92,8 @@ template <class Number, int ENDING> struct Limb {
             for (int i = 0; i < 9; i++) turned[i] = rotation[i];
         if (ENDING == DISTANCE) {
             distance = root(dot(gap, gap));
-            for (int i = 0; i < 3; i++) direction[i] = gap[i] / distance;
+            Lanes inverse = 1.0 / distance;
+            for (int i = 0; i < 3; i++) direction[i] = gap[i] * inverse;
             cross(arm, direction, moment);
         }
     }

@@ -106,11 +106,12 @@ class Equations {
         }
         sign = sign * triangularize(low, rows, m + 1, m);
         for (int f = 0; f < m; f++) sign = sign * signum(low[f * rows + f]);
-        Lanes y[6], left{};
+        Lanes y[6], inverse[6], left{};
+        for (int f = 0; f < m; f++) inverse[f] = 1.0 / low[f * rows + f];
         for (int f = m - 1; f >= 0; f--) {
             Lanes known{};
             for (int c = f + 1; c < m; c++) known = known + low[c * rows + f] * y[c];
-            y[f] = (-low[m * rows + f] - known) / low[f * rows + f];
+            y[f] = (-low[m * rows + f] - known) * inverse[f];
         }
         for (int i = 0; i < m; i++) left = left + low[m * rows + i] * low[m * rows + i];
         for (int f = 0; f < 6; f++) step[f] = Lanes{};

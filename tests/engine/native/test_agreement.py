@@ -51,8 +51,8 @@ def test_blocks_agree_with_numpy_and_between_instruction_sets(name, free):
     calls = [e.linearize(case.program, case.e, case.q, state, free) for e in ENGINES.values()]
     expected = list_arrays(NUMPY.linearize(case.program, case.e, case.q, state, free))
     largest = max(np.abs(array).max() for array in expected.values() if array.size)
-    for name, array in list_arrays(calls[0]).items():
-        assert_allclose(array, expected[name], atol=1e-14 * largest, err_msg=name)
+    for block, array in list_arrays(calls[0]).items():
+        assert_allclose(array, expected[block], atol=1e-14 * largest, err_msg=block)
     assert calls[0].joints == tuple(tuple(g.unknown_joints(free)) for g in case.program.groups)
     assert_same_bits(calls)
 

@@ -115,15 +115,10 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     start = State(
         disturb(rng, np.repeat(case.home.T, rows, axis=0), share / 10),
         tuple(disturb(rng, np.repeat(a, rows, axis=0), share / 10) for a in case.home.joints),
-        *(
-            np.repeat(a, rows, axis=0)
-            for a in (
-                case.home.status,
-                case.home.residual,
-                case.home.iterations,
-                case.home.closure_sign,
-            )
-        ),
+        case.home.status,
+        case.home.residual,
+        case.home.iterations,
+        case.home.closure_sign,
     )
     e, q = disturb(rng, case.e, share), disturb(rng, case.q, share)
     state = native.solve(case.program, e, q, start)
