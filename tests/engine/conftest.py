@@ -11,7 +11,9 @@ from loopcal.engine import Engine, select_engine
 from tests import zoo
 from tests.engine.cases import Case, make_case
 
-ENGINES = ["numpy", "native"] if find_spec("loopcal_native") else ["numpy"]
+HAS_NATIVE = find_spec("loopcal_native") is not None
+ENGINES = ["numpy", "native"] if HAS_NATIVE else ["numpy"]
+collect_ignore = [] if HAS_NATIVE else ["native"]
 
 
 @pytest.fixture(scope="session", params=ENGINES)

@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The native engine with each instruction set of this processor; tests are skipped without it."""
+"""The native engine with each instruction set of this processor."""
 
 import numpy as np
-import pytest
+from loopcal_native import list_instruction_sets
 
 from loopcal.engine import ClosureBlocks, Engine, State, select_engine
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from tests.engine.cases import Case, make_case
 
-native = pytest.importorskip("loopcal_native", reason="loopcal-native is not installed")
-
 ROBOTS = tuple(list_shipped_robots())
 
 
 def make_engines() -> dict[str, Engine]:
     """Return the native engine by instruction set, the fastest first."""
-    return {name: select_engine(f"native:{name}") for name in native.list_instruction_sets()}
+    return {name: select_engine(f"native:{name}") for name in list_instruction_sets()}
 
 
 def make_robot_case(name: str, t: int, n: int) -> Case:

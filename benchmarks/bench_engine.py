@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What kinematics and fits cost with each installed engine, in processor time of one thread,
+against numpy on the same amount of work and against a fit that a user writes by hand.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from importlib.util import find_spec
+
+import numpy as np
+
+from benchmarks.bench_identify import _measured, _poses, _tracker
+from benchmarks.bench_kinematics import _problem
+from benchmarks.bench_sensitivity import _first_answer, _record
+from benchmarks.harness import Metric, measure_ratio
+from loopcal.engine import current_engine
+from loopcal.engine.selection import VARIABLE
+from loopcal.estimate import LeastSquares, identify, identify_trials
+from loopcal.io import load_robot
+from loopcal.measure import sample_truth, simulate_trials
+from loopcal.mechanism import differentiate_pose, forward, forward_trials, inverse
+
+ENGINES = ("numpy", "native") if find_spec("loopcal_native") else ("numpy",)
+POSES, TRIALS = 10_000, 200
+
+measure = partial(measure_ratio, clock=time.process_time, tolerance=0.3)
+
+
+@contextmanager
+def use_engine(name: str) -> Iterator[None]:
+    """Compute the body with an engine."""
+    before = os.environ.get(VARIABLE, "")
+    os.environ[VARIABLE] = name
+    current_engine.cache_clear()
+    try:
+        yield
+    finally:
+        os.environ[VARIABLE] = before
+        current_engine.cache_clear()
+
+
+def _of_each(
+    name: str, make: Callable[[], tuple[Callable[[], object], Callable[[], object]]], repeats: int
+) -> list[Metric]:
+    """Measure work and reference that `make` returns, for each engine."""
+    metrics = []
+    for engine in ENGINES:
+        with use_engine(engine):
+            subject, reference = make()
+            metrics.append(measure(f"engine.{engine}.{name}", subject, reference, repeats=repeats))
+    return metrics
+
+
+def _systems() -> Callable[[], object]:
+    """Return numpy's solution of as many 6 x 6 systems as there are poses."""
+    rng = np.random.default_rng(0)
+    A, b = rng.normal(size=(POSES, 6, 6)), rng.normal(size=(POSES, 6, 1))
+    return lambda: np.linalg.solve(A, b)
+
+
+def bench_kinematics() -> list[Metric]:
+    """Forward and inverse kinematics of 10 000 hexapod poses, and all sensitivities of a hexapod
+    of chains (102 parameters), against np.linalg.solve of as many 6 x 6 systems.
+    """
+    robot, target, readings, _, _ = _problem()
+    chains, rng = _first_answer(_record().expand()), np.random.default_rng(0)
+    values, q = chains.values[None], rng.uniform(-0.02, 0.02, (1, POSES, 6))
+    state = forward_trials(chains, values, q)
+    return [
+        *_of_each("forward", lambda: (lambda: forward(robot, readings), _systems()), 7),
+        *_of_each("inverse", lambda: (lambda: inverse(robot, target), _systems()), 7),
+        *_of_each(
+            "sensitivity",
+            lambda: (lambda: differentiate_pose(chains, values, q, state), _systems()),
+            5,
+        ),
+    ]
+
+
+def bench_stacked_fits() -> list[Metric]:
+    """Fits of 42 parameters to 50 poses of many machines at once, against np.linalg.qr of their
+    300 x 43 rows.
+    """
+    robot = load_robot("hexapod-42")
+    truth = sample_truth(robot, TRIALS, 0)
+    trials = simulate_trials(robot, truth, _poses(robot, 50), _tracker(), 0)
+    rows = np.random.default_rng(0).normal(size=(TRIALS, 300, 43))
+    return _of_each(
+        "stacked_fits",
+        lambda: (
+            lambda: identify_trials(robot, trials, LeastSquares()),
+            lambda: np.linalg.qr(rows, mode="r"),
+        ),
+        3,
+    )
+
+
+def bench_single_fit() -> list[Metric]:
+    """One fit of 42 parameters to 50 poses with all that `identify` returns, against scipy's
+    Levenberg-Marquardt on leg lengths with a Jacobian written by hand.
+    """
+    robot = load_robot("hexapod-42")
+    return _of_each(
+        "one_fit",
+        lambda: (
+            partial(identify, robot, _measured(robot, 50), LeastSquares()),
+            _fit_by_hand(robot.values.reshape(6, 7)),
+        ),
+        15,
+    )
+
+
+def _fit_by_hand(nominal: np.ndarray) -> Callable[[], object]:
+    """Return the fit of base points, platform points and lengths (6, 7) to 50 measured poses as a
+    user writes it for a hexapod.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(0)
+    truth = nominal + rng.normal(size=(6, 7)) * 1e-3
+    R = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, (50, 3))).as_matrix()
+    t = np.mean([nominal[:, 2].min(), 0.5]) + rng.uniform(-0.05, 0.05, (50, 3))
+
+    def legs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        legs = t[:, None] + np.einsum("nij,kj->nki", R, x[:, 3:6]) - x[:, :3]
+        return legs, np.linalg.norm(legs, axis=2)
+
+    readings = legs(truth)[1] - truth[:, 6] + rng.normal(size=(50, 6)) * 1e-6
+
+    def residual(flat: np.ndarray) -> np.ndarray:
+        x = flat.reshape(6, 7)
+        return (legs(x)[1] - x[:, 6] - readings).ravel()
+
+    def jacobian(flat: np.ndarray) -> np.ndarray:
+        vectors, length = legs(flat.reshape(6, 7))
+        unit = vectors / length[..., None]
+        J = np.zeros((50, 6, 6, 7))
+        k = np.arange(6)
+        J[:, k, k, :3] = -unit
+        J[:, k, k, 3:6] = np.einsum("nji,nkj->nki", R, unit)
+        J[:, k, k, 6] = -1.0
+        return J.reshape(300, 42)
+
+    return lambda: least_squares(residual, nominal.ravel(), jacobian, method="lm")
