@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
@@ -145,4 +146,5 @@ def _fit_by_hand(nominal: np.ndarray) -> Callable[[], object]:
         J[:, k, k, 6] = -1.0
         return J.reshape(300, 42)
 
-    return lambda: least_squares(residual, nominal.ravel(), jacobian, method="lm")
+    fit: Any = least_squares  # the stubs know no function as a Jacobian
+    return lambda: fit(residual, nominal.ravel(), jacobian, method="lm")
