@@ -25,8 +25,8 @@ ENDING = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 LIBRARY = f"libloopcal{ENDING}"
 OPTIONS = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-exceptions")
 OPTIONS += ("-fno-rtti", "-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-psabi")
-# GCC copies vectors in pieces that stall the loads of whole ones, unless loops stay loops
-OPTIONS += ("-fno-tree-loop-distribute-patterns", "-Wno-ignored-optimization-argument")
+GCC_OPTIONS = ("-fno-tree-loop-distribute-patterns",)
+"""GCC would copy vectors in pieces, which stall the loads of whole ones."""
 AVX512 = "f bw cd dq vl"
 SETS = {
     "x86": {
@@ -54,7 +54,10 @@ def compile_library(target: Path, work: Path) -> None:
     """Compile the library; every instruction set by a call of its own."""
     is_x86 = platform.machine().lower() in ("x86_64", "amd64")
     sets = SETS["x86" if is_x86 else "other"]
-    compiler = [*find_compiler(), *OPTIONS, *shlex.split(os.environ.get("CXXFLAGS", ""))]
+    compiler = find_compiler()
+    about = subprocess.run([*compiler, "--version"], check=True, capture_output=True, text=True)
+    compiler += OPTIONS if "clang" in about.stdout else (*OPTIONS, *GCC_OPTIONS)
+    compiler += shlex.split(os.environ.get("CXXFLAGS", ""))
     if sys.platform != "win32":
         compiler.append("-fPIC")
     work.mkdir(parents=True, exist_ok=True)

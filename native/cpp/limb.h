@@ -170,7 +170,7 @@ template <class Number, int ENDING> struct Limb {
             shift(axis, out);
             return negate(out);
         }
-        Lanes at[3], along[3], more[6];
+        Lanes at[3], along[3], more[6] = {};
         for (int i = 0; i < 3; i++) at[i] = tip[i] - frames.origins[3 * j + i];
         turn(axis, at, out);
         negate(out);

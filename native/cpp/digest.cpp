@@ -1,0 +1,180 @@
+// SPDX-License-Identifier: Apache-2.0
+// Prints a digest of what every function of the engine computes by each instruction set of this
+// machine: equal lines mean equal bits. `.ci/native` compares compilers and processors with it.
+//
+// The inputs are drawn by integer arithmetic, so that they are the same everywhere: a platform with
+// limbs of every ending, displaced in every slot. Most rows do not close, so that thirty steps
+// amplify any difference; some are not finite.
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <vector>
+
+#include "interface.h"
+
+extern "C" {
+const char *loopcal_instruction_set(int i, int *works);
+int loopcal_fold(int, const double *, const double *, double *, int64_t, int64_t, int64_t, int64_t);
+int loopcal_linearize(int, const int64_t *, const double *, const loopcal::Strided *,
+                      const loopcal::Strided *, double *const *, int64_t, int64_t);
+int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
+                  const loopcal::Strided *, int64_t, int64_t, int64_t, loopcal::Task, void *,
+                  double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
+}
+
+namespace {
+
+typedef std::vector<double> Reals;
+
+struct Random {
+    uint64_t state = 88172645463325252ull;
+    double operator()() {  // in (-1, 1)
+        state ^= state << 13, state ^= state >> 7, state ^= state << 17;
+        return (double)(int64_t)(state >> 11) / (double)(1ll << 52) - 1.0;
+    }
+    Reals reals(size_t count, double size) {
+        Reals out(count);
+        for (double &value : out) value = size * (*this)();
+        return out;
+    }
+};
+
+struct Digest {  // FNV-1a
+    uint64_t value = 14695981039346656037ull;
+    template <class Number> void add(const std::vector<Number> &numbers) {
+        for (Number number : numbers) {
+            if (number != number) number = 0;  // the bits of NaN are not defined
+            const unsigned char *bytes = reinterpret_cast<const unsigned char *>(&number);
+            for (size_t i = 0; i < sizeof number; i++) value = (value ^ bytes[i]) * 1099511628211ull;
+        }
+    }
+};
+
+struct GroupShape {
+    const char *joints;
+    int ending, rows, driven;  // place of the driven joint; the rod is the one behind the last
+};
+
+const GroupShape SHAPES[] = {{"RRPRRR", 0, 6, 2}, {"RRP", 1, 3, 2}, {"", 2, 1, 0}};
+constexpr int GROUPS = 3, LIMBS = 2, DRIVES = GROUPS * LIMBS;
+
+void add_rotation(Random &random, Reals &to) {  // of a quaternion, by operations of IEEE 754 alone
+    double a = 1.0, b = 0.5 * random(), c = 0.5 * random(), d = 0.5 * random();
+    double s = 1.0 / std::sqrt(a * a + b * b + c * c + d * d);
+    a *= s, b *= s, c *= s, d *= s;
+    const double R[] = {1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c),
+                        2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b),
+                        2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)};
+    to.insert(to.end(), R, R + 9);
+}
+
+struct Machine {
+    std::vector<int64_t> structure;
+    Reals numbers;
+    int64_t displacements = 0;
+    std::vector<size_t> values, rows;  // of each group: joint values, numbers of its rows
+
+    explicit Machine(Random &random, bool free) {
+        structure = {GROUPS, 6, 0, DRIVES, 0, free, 0, 1, 2, 3, 4, 5};
+        numbers = {0.4};
+        int drive = 0;
+        for (const GroupShape &shape : SHAPES) {
+            int64_t joints = 0;
+            while (shape.joints[joints]) joints++;
+            std::vector<int64_t> solved, slots, body;
+            for (int64_t j = 0; j <= joints; j++)
+                if (free ? j < joints || shape.driven == joints : j < joints && j != shape.driven)
+                    solved.push_back(j);
+            for (int64_t j = 0; j < joints + 2; j++)
+                for (int64_t axis = 0; axis < 6; axis++) slots.insert(slots.end(), {j, axis});
+            if (joints) slots.insert(slots.end(), {0, 6});
+            if (shape.ending == 2) slots.insert(slots.end(), {joints, 7});
+            int64_t count = (int64_t)slots.size() / 2;
+            structure.insert(structure.end(), {LIMBS, joints, shape.ending, shape.rows, count,
+                                               (int64_t)solved.size(), displacements});
+            displacements += LIMBS * count;
+            for (int i = 0; i < shape.rows; i++) structure.push_back(i);
+            for (int64_t j = 0; j < joints; j++) structure.push_back(shape.joints[j] == 'R');
+            structure.insert(structure.end(), solved.begin(), solved.end());
+            for (int64_t j = 0; j <= joints; j++)
+                for (int k = 0; k < LIMBS; k++)
+                    structure.push_back(j == shape.driven ? drive + k : -1);
+            drive += LIMBS;
+            structure.insert(structure.end(), slots.begin(), slots.end());
+            structure.insert(structure.end(), 2 * (joints + 2), 1);
+            for (int64_t j = 0; j < joints; j++) structure.push_back(j == 0);
+            for (int i = 0; i < LIMBS * (joints + 2); i++) {
+                add_rotation(random, numbers);
+                for (int axis = 0; axis < 3; axis++) numbers.push_back(0.3 * random());
+            }
+            for (int i = 0; i < LIMBS * joints; i++) numbers.push_back(i % joints ? 0.0 : 0.01);
+            for (int i = 0; i < LIMBS; i++) numbers.push_back(0.5 + 0.1 * random());
+            values.push_back((size_t)(LIMBS * (joints + 1)));
+            rows.push_back((size_t)(LIMBS * shape.rows * ((int64_t)solved.size() + 6 + count + joints + 1)));
+        }
+        structure[2] = displacements;
+    }
+};
+
+void add_kinematics(int set, bool free, int64_t t, int64_t n, Digest &digest) {
+    Random random;
+    Machine machine(random, free);
+    Reals e = random.reals((size_t)(t * machine.displacements), 1e-3);
+    Reals q = random.reals((size_t)(t * n * DRIVES), 0.1), T;
+    q[1] = INFINITY, q[q.size() - 1] = 1e4;
+    add_rotation(random, T);
+    T = {T[0], T[1], T[2], 0.1, T[3], T[4], T[5], 0.2, T[6], T[7], T[8], 0.4, 0, 0, 0, 1};
+    std::vector<Reals> start, joints, rows;
+    std::vector<loopcal::Strided> given, solved;
+    std::vector<double *> joints_out, rows_out;
+    for (int g = 0; g < GROUPS; g++) {
+        start.push_back(random.reals(machine.values[(size_t)g], 0.5));
+        joints.emplace_back((size_t)(t * n) * machine.values[(size_t)g]);
+        rows.emplace_back((size_t)(t * n) * machine.rows[(size_t)g]);
+    }
+    for (size_t g = 0; g < GROUPS; g++) {
+        int64_t values = (int64_t)machine.values[g];
+        given.push_back({start[g].data(), 0, 0});
+        solved.push_back({joints[g].data(), n * values, values});
+        joints_out.push_back(joints[g].data());
+        rows_out.push_back(rows[g].data());
+    }
+    Reals poses((size_t)(16 * t * n)), residual((size_t)(t * n));
+    std::vector<int64_t> iterations((size_t)(t * n));
+    std::vector<int8_t> status((size_t)(t * n)), sign((size_t)(t * n));
+    loopcal::Strided arrays[] = {{e.data(), machine.displacements, 0},
+                                 {q.data(), n * DRIVES, DRIVES}, {T.data(), 0, 0}, {nullptr, 0, 0}};
+    loopcal_solve(set, machine.structure.data(), machine.numbers.data(), arrays, given.data(), t, n,
+                  30, nullptr, nullptr, poses.data(), joints_out.data(), residual.data(),
+                  iterations.data(), status.data(), sign.data());
+    arrays[2] = {poses.data(), 16 * n, 16};
+    loopcal_linearize(set, machine.structure.data(), machine.numbers.data(), arrays, solved.data(),
+                      rows_out.data(), t, n);
+    digest.add(poses), digest.add(residual), digest.add(iterations);
+    digest.add(status), digest.add(sign);
+    for (size_t g = 0; g < GROUPS; g++) digest.add(joints[g]), digest.add(rows[g]);
+}
+
+void add_factors(int set, int64_t t, int64_t m, int64_t p, Digest &digest) {
+    Random random;
+    Reals factor((size_t)(t * p * p)), rows = random.reals((size_t)(t * m * p), 10.0);
+    for (size_t i = 0; i < rows.size() / 3; i++) rows[i] *= i % 3 ? 1.0 : 0.0;
+    loopcal_fold(set, factor.data(), rows.data(), factor.data(), t, m, p, m * p);
+    loopcal_fold(set, factor.data(), rows.data(), factor.data(), t, m / 2, p, m * p);
+    digest.add(factor);
+}
+
+}  // namespace
+
+int main() {
+    int works = 0;
+    for (int set = 0; const char *name = loopcal_instruction_set(set, &works); set++) {
+        if (!works) continue;
+        Digest digest;
+        for (bool free : {false, true})
+            for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 13, n, digest);
+        add_kinematics(set, false, 1, 50, digest);
+        for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
+        std::printf("%016llx %s\n", (unsigned long long)digest.value, name);
+    }
+}
