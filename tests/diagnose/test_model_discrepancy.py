@@ -37,7 +37,7 @@ from loopcal.measure import (
     sample_truth,
     simulate,
 )
-from loopcal.mechanism import Mechanism, differentiate_pose, forward, sample_workspace
+from loopcal.mechanism import Mechanism, differentiate_pose, forward, inverse, sample_workspace
 from loopcal.numerics.variance_component import compute_component_tail
 from tests.estimate.problems import UM, URAD
 
@@ -139,11 +139,35 @@ def test_a_wrong_sigma_is_no_discrepancy():
     assert np.mean(found) <= LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 16)
 
 
+def touch_bed(seed: int, points: int = 13, sigma: float = 20 * UM) -> Measurements:
+    """Return probed heights: readings where the nozzle touches the bed, up to the noise, at z = 0."""
+    rng = np.random.default_rng(seed)
+    machine = delta().with_values(sample_truth(delta(), 1, seed)[0])
+    turn = 2.4 * np.arange(points)  # golden angle
+    radius = 0.07 * np.sqrt(np.arange(points) / points)
+    z = sigma * rng.standard_normal(points)
+    q = inverse(machine, np.c_[radius * np.cos(turn), radius * np.sin(turn), z]).q
+    instrument = Instrument((Sensor(Component(("z",)), Gaussian(np.array([sigma]))),))
+    data = simulate(machine, np.zeros((points, 3)), instrument, seed)
+    (rows,) = data.observations
+    touched = replace(rows, measured=np.zeros_like(rows.measured))
+    return replace(data, readings=q, observations=(touched,))
+
+
+def test_heights_of_a_bed_are_no_coordinate_that_explains_their_noise():
+    """The z of the fitted poses is their residual; a function of it would explain all of them."""
+    found = [
+        bool(find(adjust_uncertainty(identify(delta(), data), data)))
+        for data in (touch_bed(seed) for seed in range(16))
+    ]
+    assert np.mean(found) <= LEVEL + 3.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 16)
+
+
 def test_probabilities_agree_with_all_eigenvectors_of_the_variances():
     rng = np.random.default_rng(3)
     T = np.tile(np.eye(4), (6, 1, 1))
     T[:, :3, 3] = rng.standard_normal((6, 3))
-    errors = describe_smooth_errors(T, np.zeros(3))
+    errors = describe_smooth_errors(T, np.zeros(3), 1.0)
     half = errors.count // 2
     rows = np.triu(rng.standard_normal((2 * half, 2 * half)))
     y = 5.0 * rng.standard_normal(2 * half)

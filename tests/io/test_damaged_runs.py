@@ -204,7 +204,7 @@ def list_wrong_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 def test_every_array_of_a_wrong_form_is_refused_by_name(folder) -> None:
     arrays = read_arrays(folder / "RUN")
-    own = describe_smooth_errors(np.tile(np.eye(4), (3, 1, 1)), np.zeros(3)).arrays()
+    own = describe_smooth_errors(np.tile(np.eye(4), (3, 1, 1)), np.zeros(3), 1.0).arrays()
     m, p = 6 * len(own["discrepancy_centers"]), len(arrays["estimate"])
     own |= {"discrepancy_root": np.zeros((p, m)), "discrepancy_degrees": np.ones(2)}
     own |= {"discrepancy_directions": np.eye(p), "discrepancy_variance": np.ones(p)}

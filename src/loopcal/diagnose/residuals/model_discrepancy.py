@@ -114,7 +114,7 @@ def find_slow_errors(
     if len(T) < FEWEST_POSES:
         return None
     kernels = (
-        describe_smooth_errors(T, tool, length, by_rotation=by_rotation)
+        describe_smooth_errors(T, tool, fit.robot.size, length, by_rotation=by_rotation)
         for length, by_rotation in KERNELS
     )
     every = (project_slow_errors(fit, data, linear, errors) for errors in kernels)
@@ -140,7 +140,7 @@ def find_rough_errors(
     lack = check_lack_of_fit(fit, data)
     if lack.is_explained is not False:
         return None
-    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], ROUGH, MOST_ROUGH)
+    errors = describe_smooth_errors(T, fit.robot.tool[:3, 3], fit.robot.size, ROUGH, MOST_ROUGH)
     rows = project_slow_errors(fit, data, linear, errors)
     if rows is None:
         return None

@@ -31,9 +31,16 @@ PREFIX = "discrepancy_"
 CENTERS = 40
 """Largest number of centers: more of them are closer to each other than the error varies."""
 
-STILL = 1e-6
-"""Half the range of rotations [rad], and of places as a share of the largest coordinate, below
-which poses do not differ."""
+STILL = 0.01
+"""Half the range of a coordinate, as a share of the largest one (rotations times the robot's size),
+below which poses do not differ in it. Small differences, as of heights probed on a bed, are errors
+of the machine and noise: as a coordinate, they would explain the residuals by themselves."""
+
+ROUNDING = 1e-9
+"""Share of the robot's size below which no difference is one."""
+
+SAME = 1e-6
+"""Distance in normalized coordinates below which poses are the same."""
 
 JITTER = 1e-9
 """Added to the correlation of a center with itself, so that its triangle exists."""
@@ -113,6 +120,7 @@ def correlate(x: FloatArray, centers: FloatArray) -> FloatArray:
 def describe_smooth_errors(
     T: FloatArray,
     tool: FloatArray,
+    size: float,
     length: float = 1.0,
     most: int = CENTERS,
     *,
@@ -122,7 +130,7 @@ def describe_smooth_errors(
 
     Parameters
     ----------
-    tool : (3,) [m] tool point in the platform frame.
+    tool : (3,) [m] tool point in the platform frame. size : of the robot [m].
     length : over which errors vary, in halves of the range of each coordinate; a small one leaves
         errors that different poses do not share. most : largest number of centers.
     by_rotation : whether errors vary with the rotation of the platform, too.
@@ -132,8 +140,10 @@ def describe_smooth_errors(
     x = _coordinates(T, tool, rotation)
     low, high = x.min(axis=0), x.max(axis=0)
     origin, half = 0.5 * (low + high), 0.5 * (high - low)
-    least = np.r_[[STILL] * 3, [STILL * float(np.abs(x[:, 3:]).max())] * 3]
-    used = (half > least) & (by_rotation | (np.arange(6) >= 3))
+    lengths = half * np.r_[[size] * 3, [1.0] * 3]
+    used = (lengths > max(STILL * lengths.max(), ROUNDING * size)) & (
+        by_rotation | (np.arange(6) >= 3)
+    )
     scale = np.where(used, length * np.where(used, half, 1.0), np.inf)
     x = (x - origin) / scale
     centers = x[_spread(x, most)]
@@ -148,7 +158,7 @@ def _spread(x: FloatArray, most: int) -> list[int]:
     """
     chosen = [int(np.argmax((x**2).sum(axis=1)))]
     distance = ((x - x[chosen[0]]) ** 2).sum(axis=1)
-    while len(chosen) < most and distance.max() > STILL**2:
+    while len(chosen) < most and distance.max() > SAME**2:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(axis=1))
     return chosen
