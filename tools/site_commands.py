@@ -17,7 +17,7 @@ WIDE = 10_000
 """Columns, so that no text is wrapped."""
 
 
-def write_command_pages() -> Iterator[tuple[str, str]]:
+def format_command_pages() -> Iterator[tuple[str, str]]:
     """Return each command with the text of its page."""
     program = click.Context(
         command_line,
@@ -27,10 +27,10 @@ def write_command_pages() -> Iterator[tuple[str, str]]:
         show_default=True,
     )
     for name in command_line.list_commands(program):
-        yield name, "\n".join([*write_command(name, program, 0), ""])
+        yield name, "\n".join([*format_command(name, program, 0), ""])
 
 
-def write_command(name: str, parent: click.Context, level: int) -> Iterator[str]:
+def format_command(name: str, parent: click.Context, level: int) -> Iterator[str]:
     """Return the lines of one command, and of the commands of a group below it."""
     assert isinstance(parent.command, click.Group)
     command = parent.command.get_command(parent, name)
@@ -38,8 +38,8 @@ def write_command(name: str, parent: click.Context, level: int) -> Iterator[str]
     context = click.Context(command, info_name=name, parent=parent)
     path = context.command_path
     yield from (path, UNDERLINES[level] * len(path), "")
-    yield from write_block("text", [command.get_usage(context).removeprefix("Usage: ")])
-    yield from write_help(command.help or "")
+    yield from format_block("text", [command.get_usage(context).removeprefix("Usage: ")])
+    yield from format_help(command.help or "")
     yield from (f".. program:: {path}", "")
     for parameter in command.get_params(context):
         record = parameter.get_help_record(context)
@@ -48,10 +48,10 @@ def write_command(name: str, parent: click.Context, level: int) -> Iterator[str]
             yield from (f".. option:: {record[0]}", "", f"   {text}", "")
     if isinstance(command, click.Group):
         for member in command.list_commands(context):
-            yield from write_command(member, context, level + 1)
+            yield from format_command(member, context, level + 1)
 
 
-def write_help(text: str) -> Iterator[str]:
+def format_help(text: str) -> Iterator[str]:
     """Return the markup of a help text: paragraphs, and blocks that click does not wrap."""
     for paragraph in inspect.cleandoc(text).split("\n\n"):
         lines = paragraph.strip("\n").split("\n")
@@ -63,10 +63,10 @@ def write_help(text: str) -> Iterator[str]:
             yield from (escape_help(block[0]), "")
             block = inspect.cleandoc("\n".join(block[1:])).split("\n")
         are_commands = all(line.startswith(("loopcal ", "eval ")) for line in block)
-        yield from write_block("sh" if are_commands else "text", block)
+        yield from format_block("sh" if are_commands else "text", block)
 
 
-def write_block(language: str, lines: list[str]) -> Iterator[str]:
+def format_block(language: str, lines: list[str]) -> Iterator[str]:
     """Return the markup of a block of code."""
     yield from (f".. code-block:: {language}", "", *(f"   {line}" for line in lines), "")
 

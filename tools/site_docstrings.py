@@ -6,6 +6,7 @@ Docstrings of loopcal are NumPy style with the description on the line of the na
 """
 
 import re
+from collections.abc import Sequence
 
 TERMS = {"Parameters": "``{}``", "Attributes": "``{}``", "Raises": ":py:exc:`{}`"}
 """From the heading of a section of entries to the markup of the name of an entry."""
@@ -17,7 +18,7 @@ UNDERLINE = re.compile(r"^-{3,}$")
 CODE = re.compile(r"(``.*?``|`[^`]*`|^ *>>> .*$)", re.DOTALL | re.MULTILINE)
 
 
-def convert_docstring(lines: list[str]) -> list[str]:
+def convert_docstring(lines: Sequence[str]) -> list[str]:
     """Return the lines of a docstring in the markup of docutils: a heading, then definitions."""
     result: list[str] = []
     heading = ""

@@ -16,7 +16,7 @@ from typing import Any
 from pygments.lexers.special import TextLexer
 
 from tools.api_reference import SECTIONS, describe_name, list_names
-from tools.site_commands import write_command_pages
+from tools.site_commands import format_command_pages
 from tools.site_docstrings import convert_docstring
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,18 +49,18 @@ def add_contents(app: Any, page: str, source: list[str]) -> None:
     text = source[0]
     if page == "docs/api":
         text = API_ROW.sub(r"| {py:obj}`\1 <loopcal.\1>` |", text)
-        text += write_contents(
+        text += format_contents(
             "", [f"generated/api/{name}.rst" for name in map(name_page, SECTIONS)]
         )
     elif page == "docs/commands":
         names = [match[2] for match in COMMAND_ROW.finditer(text)]
         text = COMMAND_ROW.sub(r"| [\1](generated/commands/\2.rst) |", text)
-        text += write_contents("", [f"generated/commands/{name}.rst" for name in names])
+        text += format_contents("", [f"generated/commands/{name}.rst" for name in names])
     elif page.startswith("docs/") and page.endswith("/README"):
         text = text.replace("gallery/GALLERY_HEADER.rst", "generated/gallery/index.rst")
         parts = re.split(r"^## (.*)\n", text, flags=re.MULTILINE)
         for caption, part in zip(["", *parts[1::2]], parts[::2], strict=True):
-            text += write_contents(caption, list_entries(part))
+            text += format_contents(caption, list_entries(part))
         text = WHOLE_INDEX.sub(lambda link: read_table(link[1]), text)
     source[0] = text
 
@@ -91,7 +91,7 @@ def read_table(folder: str) -> str:
     return "\n".join(["", *rows, ""]).replace("](", f"]({folder}/")
 
 
-def write_contents(caption: str, files: list[str]) -> str:
+def format_contents(caption: str, files: list[str]) -> str:
     """Return a table of contents that only the side bar shows."""
     if not files:
         return ""
@@ -103,12 +103,12 @@ def write_pages_of_the_code(app: Any) -> None:
     """Write docs/generated: a page for each section of the API, and one for each command."""
     del app
     pages = {
-        GENERATED / "api" / f"{name_page(package)}.rst": write_api_page(
+        GENERATED / "api" / f"{name_page(package)}.rst": format_api_page(
             heading, list_names(package)
         )
         for package, heading in SECTIONS.items()
     }
-    for name, text in write_command_pages():
+    for name, text in format_command_pages():
         pages[GENERATED / "commands" / f"{name}.rst"] = text
     for path in GENERATED.rglob("*.rst"):
         example = ROOT / "docs" / "gallery" / f"{path.stem}.py"
@@ -123,13 +123,13 @@ def name_page(package: str) -> str:
     return package.removeprefix("loopcal.")
 
 
-def write_api_page(heading: str, names: list[str]) -> str:
+def format_api_page(heading: str, names: list[str]) -> str:
     """Return the page of some public names with their docstrings."""
     title = [heading, "=" * len(heading), "", ".. currentmodule:: loopcal", ""]
-    return "\n".join([*title, *chain.from_iterable(map(write_directive, names)), ""])
+    return "\n".join([*title, *chain.from_iterable(map(format_directive, names)), ""])
 
 
-def write_directive(name: str) -> list[str]:
+def format_directive(name: str) -> list[str]:
     """Return the lines that document one public name."""
     import loopcal
 

@@ -237,7 +237,7 @@ def test_ending_of_the_file_chooses_its_format(compare) -> None:
     assert Path("both.csv").read_text("utf-8").startswith("run,parameter,")
     code, _, err = compare("may june -o both.xlsx")
     assert code == 1
-    assert "ends in .html, .json or .csv, but this one has '.xlsx'" in err
+    assert "ends in .html or .json or .csv, but this one has '.xlsx'" in err
     assert not Path("both.xlsx").exists()
     code, _, err = compare("may june -o both.csv")
     assert code == 1

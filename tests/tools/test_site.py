@@ -82,7 +82,7 @@ def test_each_public_name_has_a_page_and_a_link_to_it(root) -> None:
 
 
 def test_each_command_has_a_page_with_its_options() -> None:
-    pages = dict(site_commands.write_command_pages())
+    pages = dict(site_commands.format_command_pages())
     assert list(pages) == command_line.list_commands(click.Context(command_line))
     assert ".. option:: --hold-out SHARE" in pages["calibrate"]
     assert "   loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25" in (

@@ -116,7 +116,7 @@ def map_height_errors(
     ----------
     fit : that converged. fitted, held_out : the measurements of the calibration.
     """
-    parts = []
+    listed = []
     for data, is_held_out in ((fitted, False), (held_out, True)):
         if data is None or not any(_measures_height(o) for o in data.observations):
             continue
@@ -126,18 +126,18 @@ def map_height_errors(
             )
         except DataError:  # the validation reports that no pose is reached
             continue
-        parts += [(*part, is_held_out) for part in _list_heights(compared, fit.robot)]
+        listed += [(*heights, is_held_out) for heights in _list_heights(compared, fit.robot)]
     unit = fit.robot.get_unit(Dimension.LENGTH)
-    if sum(len(labels) for labels, *_ in parts) < FEWEST:
+    if sum(len(labels) for labels, *_ in listed) < FEWEST:
         return None
-    labels, points, before, after, is_held_out = zip(*parts, strict=True)
-    count = [len(of_part) for of_part in labels]
+    labels, points, before, after, is_held_out = zip(*listed, strict=True)
+    counts = [len(of_kind) for of_kind in labels]
     return HeightErrors(
-        tuple(label for of_part in labels for label in of_part),
+        tuple(label for of_kind in labels for label in of_kind),
         np.concatenate(points),
         np.concatenate(before),
         np.concatenate(after),
-        np.repeat(np.array(is_held_out, dtype=bool), count),
+        np.repeat(np.array(is_held_out, dtype=bool), counts),
         unit,
     )
 

@@ -14,14 +14,10 @@ from loopcal.diagnose.point_names import PointCheck, check_point_names, find_oth
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Position
+from loopcal.measure.kinds.points.target_kind import name_point
 from loopcal.mechanism import Mechanism, forward
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit, list_symbols
-
-
-def name_point(pose: str, target: str, targets: Sequence[str]) -> str:
-    """Return the name of a point: POSE_TARGET, or POSE where there is one target."""
-    return f"{pose}_{target}" if len(targets) > 1 else pose
 
 
 def examine_points(robot: Mechanism, data: Measurements, unit: str) -> tuple[Finding, ...]:

@@ -118,9 +118,9 @@ def _rename(
 
     is_open = np.isnan(points).any(axis=2)
     candidates = np.concatenate([places, np.argwhere(is_open)])
-    found = points[tuple(places.T)]
+    far_points = points[tuple(places.T)]
     expected = predicted[tuple(candidates.T)]
-    between = np.linalg.norm(found[:, None] - expected[None], axis=2)
+    between = np.linalg.norm(far_points[:, None] - expected[None], axis=2)
     rows, columns = linear_sum_assignment(np.minimum(between, limit))
     renamed, far = [], []
     for row, column in zip(rows.tolist(), columns.tolist(), strict=True):

@@ -9,7 +9,7 @@ import webbrowser
 from pathlib import Path
 
 from loopcal.documents.sources import load_record
-from loopcal.documents.writing import check_ending, write_html
+from loopcal.documents.writing import check_ending, write_document
 from loopcal.errors import ArgumentTypeError
 from loopcal.io import Run
 from loopcal.io.core.outputs import refuse_outputs
@@ -57,7 +57,7 @@ def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) ->
     refuse_outputs((path,), (), force=True)
     is_robot = isinstance(source, Mechanism)
     document = build_robot_view(source) if is_robot else build_calibration_view(load_record(source))
-    write_html(path, render_html(document))
+    write_document(path, render_html(document))
     return path
 
 

@@ -7,18 +7,21 @@ from pathlib import Path
 
 from loopcal.documents.sources import load_record
 from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.findings import report_finding
 from loopcal.io import Run
-from loopcal.io.core.json_text import read_json, to_json
+from loopcal.io.core.json_text import to_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.text_file import as_path, read_text, write_text
+from loopcal.plain_text import quote
 from loopcal.report.document.calibration_document import build_document
 from loopcal.report.document.page import render_html
 from loopcal.workflow import CalibrationReport
 
-HTML = (".html", ".htm")
-"""Endings of a report's name."""
+SHORT_HTML = ".htm"
+HTML = (".html", SHORT_HTML)
+"""Endings of a page's name."""
 
 
 def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
@@ -60,8 +63,8 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     document = build_document(load_record(report))
     html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
     with restore_on_failure((path, data)):
-        write_html(path, html)
-        write_text(data, json_text, lambda file: read_json(file, "report", "", TABLE_SIZE))
+        write_document(path, html)
+        write_document(data, json_text)
     return path
 
 
@@ -76,19 +79,25 @@ def name_files(path: Path) -> tuple[Path, Path]:
     return path, path.with_suffix(".json")
 
 
-def check_ending(path: Path, what: str) -> None:
-    """Raise FileError where the name of an HTML file has another ending; `what` is in the file."""
-    if path.suffix.lower() not in HTML:
-        ending = repr(path.suffix) if path.suffix else "no ending"
-        sentence = f"the name of a {what} ends in .html, but this one has {ending}"
-        raise FileError(f"{sentence}; choose another name, such as {what}.html", path)
+def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:
+    """Return the ending of a file's name; FileError where it is none of `endings`.
+
+    `what` is in the file, such as "report".
+    """
+    ending = path.suffix.lower()
+    if ending not in endings:
+        allowed = tuple(name for name in endings if name != SHORT_HTML)
+        shown = quote(path.suffix) if path.suffix else ""
+        finding = report_finding("files.document-ending", what=what, allowed=allowed, ending=shown)
+        raise FileError(finding, path)
+    return ending
 
 
-def write_html(path: Path, html: str) -> None:
-    """Write a page to a file, and read it back."""
-    write_text(path, html, lambda file: _check_html(file, html))
+def write_document(path: Path, text: str) -> None:
+    """Write a page, or a document as JSON, to a file, and compare what is read from it."""
+    write_text(path, text, lambda file: _check_document(file, text))
 
 
-def _check_html(file: Path, html: str) -> None:
-    """Read a written page; raise LoopcalError where it is not the one that was made."""
-    require_same("page", html, read_text(file, "report", limit=TABLE_SIZE))
+def _check_document(file: Path, text: str) -> None:
+    """Read a written document; raise LoopcalError where it is not the one that was made."""
+    require_same("document", text, read_text(file, "document", limit=TABLE_SIZE))

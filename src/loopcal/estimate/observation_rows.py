@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.measure import Kind, Measurements
-from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BLOCK = 2048
@@ -136,7 +136,7 @@ def linked_blocks(data: Measurements) -> IntArray:
     if not pairs:
         return member
     links = member[np.concatenate([consecutive_pairs(rows) for rows in pairs])]
-    return connected_groups(links, len(numbers))[member]
+    return find_connected_groups(links, len(numbers))[member]
 
 
 def list_block_labels(labels: Sequence[str], member: IntArray) -> tuple[tuple[str, ...], ...]:

@@ -15,7 +15,7 @@ from loopcal.measure.array_checks import check_array, check_number, check_type, 
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
-from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -240,7 +240,7 @@ class Measurements(TableResult):
         order = np.argsort(self.repeats, kind="stable")
         repeated = np.flatnonzero(np.diff(self.repeats[order]) == 0)
         links = np.column_stack([block[order[repeated]], block[order[repeated + 1]]])
-        joined = connected_groups(links, int(block.max()) + 1)[block]
+        joined = find_connected_groups(links, int(block.max()) + 1)[block]
         names, member, sizes = np.unique(joined, return_inverse=True, return_counts=True)
         if len(names) < 2:
             raise DataError(

@@ -117,10 +117,11 @@ def build_tree(is_free: BoolArray, scopes: Sequence[str], sets: IntArray) -> Eli
     return _sort_by_structure(node, parent, _components(is_free, pairs))
 
 
-def connected_groups(links: IntArray, count: int) -> IntArray:
+def find_connected_groups(links: IntArray, count: int) -> IntArray:
     """Return the group (count,) of each item, numbered by first items.
 
-    `links` (k, 2) join items directly; items are in one group where links join them.
+    `links` (k, 2) join items directly; items are in one group where links join them. The tests
+    compare it with scipy.sparse.csgraph, whose import alone would take 0.2 s.
     """
     lowest = np.arange(count)  # of the items that are known to be in a group with this one
     while (apart := lowest[links[:, 0]] != lowest[links[:, 1]]).any():
@@ -136,7 +137,7 @@ def _components(chosen: BoolArray, pairs: IntArray) -> IntArray:
     U, inside = len(chosen), pairs[chosen[pairs[:, 1]]]
     total = U + int(inside[:, 0].max(initial=-1)) + 1
     links = np.column_stack([U + inside[:, 0], inside[:, 1]])
-    group = connected_groups(links, total)[:U][chosen]
+    group = find_connected_groups(links, total)[:U][chosen]
     component = np.full(U, -1)
     component[chosen] = np.unique(group, return_inverse=True)[1]
     return component

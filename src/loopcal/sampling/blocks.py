@@ -14,7 +14,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements
-from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.typing import IntArray
 
 ENOUGH_BLOCKS = 12
@@ -74,7 +74,7 @@ def _consecutive(data: Measurements, length: int) -> Clusters:
     run = np.empty(n, dtype=np.int64)
     run[order] = np.arange(n) // length
     links: IntArray = np.column_stack([run, run.max() + 1 + linked])
-    joined = connected_groups(links, int(links.max()) + 1)[run]
+    joined = find_connected_groups(links, int(links.max()) + 1)[run]
     names, member = np.unique(joined, return_inverse=True)
     name = f"{length}-pose run"
     if len(names) < FEWEST_CLUSTERS:

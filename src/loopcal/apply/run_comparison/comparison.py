@@ -68,7 +68,7 @@ class RunComparison(TableResult):
 
     def plot(self) -> Figure:
         """Draw the estimates of all runs with their 95 % intervals, and the tested shifts."""
-        return draw("draw_runs", self)
+        return draw("draw_run_shifts", self)
 
     def __str__(self) -> str:
         """Return the findings, one on each line."""

@@ -64,13 +64,14 @@ def compare(
       loopcal compare may june july -o sessions.csv
     """  # noqa: D301
     from loopcal.apply import compare_runs
-    from loopcal.documents.comparison import check_ending, write_comparison
+    from loopcal.documents.comparison import ENDINGS, write_comparison
+    from loopcal.documents.writing import check_ending
     from loopcal.io import load_run
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.report.run_comparison_view import find_error_units, view_comparison
 
     if output is not None:
-        check_ending(output)
+        check_ending(output, "comparison", ENDINGS)
         refuse_outputs((output,), (*runs, *data), force)
     loaded = [load_run(run) for run in runs]
     measurements = read_checked_measurements(data, loaded[0].robot, **flags) if data else None

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`loopcal gcode` and `loopcal fill`: from a plan to the machine, and from the export of an
-instrument back to its sheet. Also what `loopcal import` does with an
-instrument's export.
+instrument back to its sheet. Also what `loopcal import` does with an instrument's export.
 """
 
 from __future__ import annotations
@@ -92,19 +91,21 @@ def gcode(
 
     refuse_outputs((output,), (find_robot_file(robot), plan), force)
     machine = load_robot(robot)
-    own = machine.units[Dimension.LENGTH]
-    used: Literal["mm", "in"] = unit or ("in" if own == "in" else "mm")
-    scale = find_unit(used).factor_to_si / 60.0
+    is_in_inches = machine.units[Dimension.LENGTH] == "in"
+    program_unit: Literal["mm", "in"] = unit or ("in" if is_in_inches else "mm")
+    feed_unit = find_unit(program_unit).factor_to_si / 60.0  # [m/s]
     stops = read_stops(plan, machine)
     refuse_coordinates(machine)
     home = check_route(machine, stops.labels, stops.coordinates)
-    text = format_gcode(machine, stops, home, GcodeSettings(feed * scale, pause, used))
-    write_text(output, text, lambda path: check_written_gcode(path, text, machine, stops, used))
-    counts = {"stops": len(stops.labels), "unit": used}
+    text = format_gcode(machine, stops, home, GcodeSettings(feed * feed_unit, pause, program_unit))
+    write_text(
+        output, text, lambda path: check_written_gcode(path, text, machine, stops, program_unit)
+    )
+    counts = {"stops": len(stops.labels), "unit": program_unit}
     if as_json:
         terminal.print_json({"program": output, **counts})
         return
-    terminal.print_page([f"{output}: {counts['stops']} stops, lengths in {used}"])
+    terminal.print_page([f"{output}: {counts['stops']} stops, lengths in {program_unit}"])
 
 
 @click.command()

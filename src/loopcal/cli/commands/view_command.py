@@ -104,17 +104,19 @@ def _show_live(run: Run, port: int | None, no_browser: bool, as_json: bool) -> N
     from loopcal.documents.view_writing import open_page
     from loopcal.report.scene.live_view import PORT, LiveView
 
-    shown = LiveView(run.robot, port or PORT)
+    live_view = LiveView(run.robot, port or PORT)
     try:
         if as_json:
-            terminal.print_json({"address": shown.address})
+            terminal.print_json({"address": live_view.address})
         else:
-            terminal.print_page([f"{run.robot.name} is shown at {shown.address}; Ctrl-C ends this"])
+            terminal.print_page(
+                [f"{run.robot.name} is shown at {live_view.address}; Ctrl-C ends this"]
+            )
         terminal.flush_output()
         if not no_browser:
-            open_page(shown.address)
+            open_page(live_view.address)
         Event().wait()
     except KeyboardInterrupt:
         pass
     finally:
-        shown.stop()
+        live_view.stop()

@@ -9,7 +9,7 @@ import numpy as np
 
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.measure import Measurements
-from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.typing import IntArray
 
 FEWEST_CLUSTERS = 5
@@ -49,7 +49,7 @@ def divide_into_clusters(data: Measurements) -> tuple[Clusters, ...]:
     for name, pairs in (("session", _pose_sessions(data)), ("day", _pose_days(data))):
         if len(pairs):
             links = np.column_stack([blocks[pairs[:, 0]], count + pairs[:, 1]])
-            joined = connected_groups(links, int(links.max()) + 1)[blocks]
+            joined = find_connected_groups(links, int(links.max()) + 1)[blocks]
             names, member = np.unique(joined, return_inverse=True)
             divisions.append(Clusters(name, member, len(names)))
     enough = [clusters for clusters in reversed(divisions) if clusters.count >= FEWEST_CLUSTERS]

@@ -25,7 +25,7 @@ from loopcal.estimate.observation_rows import (
 )
 from loopcal.estimate.poses.linearization import KindRows
 from loopcal.findings import report_finding
-from loopcal.numerics.elimination_tree import EliminationTree, connected_groups
+from loopcal.numerics.elimination_tree import EliminationTree, find_connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 LARGEST = 2000
@@ -64,7 +64,7 @@ def find_components(n: int, rows: Sequence[ObservationRows], freedoms: int) -> I
     """
     pairs = [consecutive_pairs(r.poses) for r in rows if r.poses.ndim > 1]
     links = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
-    member = connected_groups(links, n)
+    member = find_connected_groups(links, n)
     largest = int(np.bincount(member).max())
     if largest * freedoms > LARGEST:
         raise EstimationError(

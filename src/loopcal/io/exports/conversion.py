@@ -26,20 +26,14 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import (
-    NAME_COLUMNS,
-    format_header,
-    format_row,
-    read_table,
-    refuse_settings_beside,
-)
+from loopcal.io.core.csv_table import NAME_COLUMNS, format_header, format_row
 from loopcal.io.core.limits import PATTERN_SECONDS
 from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import as_path, write_text
+from loopcal.io.core.text_file import as_path
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
+from loopcal.io.exports.converted_file import save_table
 from loopcal.io.exports.export_lines import (
     Line,
     Misfit,
@@ -253,17 +247,7 @@ def save_conversion(conversion: Conversion, path: str | Path) -> None:
     ------
     FileError : the file cannot be written.
     """
-
-    def check(written: Path) -> None:
-        table = read_table(written)
-        header, *rows = conversion.table
-        require_same("columns", header, format_header(table.units))
-        for before, after in zip(rows, table.rows, strict=True):
-            require_same("row", before, after)
-        require_same("settings", conversion.settings, table.settings.content)
-
-    refuse_settings_beside(Path(path))
-    write_text(path, conversion.text, check)
+    save_table(path, conversion.text, conversion.table, conversion.settings)
 
 
 def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:

@@ -17,21 +17,16 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import (
-    Table,
-    format_header,
-    format_row,
-    read_table,
-    refuse_settings_beside,
-)
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import read_text, write_text
+from loopcal.io.core.csv_table import Table, format_header, format_row, read_table
+from loopcal.io.core.text_file import read_text
 from loopcal.io.data.kind_rows import KindRows, read_kinds
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export, list_headers
+from loopcal.io.exports.converted_file import save_table
 from loopcal.io.exports.profile import Profile
 from loopcal.io.exports.profile_reader import check_columns
 from loopcal.measure import Measurements, Observations
+from loopcal.measure.kinds.points.target_kind import name_point
 from loopcal.mechanism import Mechanism
 from loopcal.units import Dimension, find_unit
 
@@ -107,13 +102,13 @@ def fill_sheet(
             units.setdefault("session", None)
         for pose, row in read.rows:
             if pose not in table.pose_names():
-                unknown += [_name_point(pose, t, targets) for t in _list_measured(row, targets)]
+                unknown += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
                 continue
             cells = {"session": Path(export).stem, **row} if has_sessions else row
             if _add_row(filled.setdefault(pose, []), cells, columns):
-                identical += [_name_point(pose, t, targets) for t in _list_measured(row, targets)]
+                identical += [name_point(pose, t, targets) for t in _list_measured(row, targets)]
     if not filled:
-        wanted = [_name_point(p, t, targets) for p in table.pose_names() for t in targets]
+        wanted = [name_point(p, t, targets) for p in table.pose_names() for t in targets]
         code = "sheet.no-name-matches"
         raise FileError(
             report_finding(code, exported=_shorten(unknown), wanted=_shorten(wanted)),
@@ -137,17 +132,7 @@ def fill_sheet(
 
 def save_filled_sheet(filled: FilledSheet, path: str | Path) -> None:
     """Write a filled sheet; FileError where it cannot be written."""
-
-    def check(written: Path) -> None:
-        table = read_table(written)
-        header, *rows = filled.table
-        require_same("columns", header, format_header(table.units))
-        for before, after in zip(rows, table.rows, strict=True):
-            require_same("row", before, after)
-        require_same("settings", filled.settings, table.settings.content)
-
-    refuse_settings_beside(Path(path))
-    write_text(path, filled.text, check)
+    save_table(path, filled.text, filled.table, filled.settings)
 
 
 def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:
@@ -239,10 +224,6 @@ def _list_measured(row: Row, targets: Sequence[str]) -> list[str]:
     return [target for target in targets if any(row.get(f"{target}.{n}") for n in "xyz")]
 
 
-def _name_point(pose: str, target: str, targets: Sequence[str]) -> str:
-    return f"{pose}_{target}" if len(targets) > 1 else pose
-
-
 def _shorten(names: Sequence[str]) -> tuple[str, ...]:
     """Return the first names of a list, for a sentence."""
     distinct = list(dict.fromkeys(names))
@@ -259,7 +240,7 @@ def _report_counts(
         for target in targets:
             count = sum(target in _list_measured(row, targets) for row in rows)
             points += count
-            name = _name_point(pose, target, targets)
+            name = name_point(pose, target, targets)
             missing += [name] * (count == 0)
             repeated += [name] * (count > 1)
     poses = len(table.pose_names())

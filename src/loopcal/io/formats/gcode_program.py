@@ -26,6 +26,7 @@ from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.text_file import read_text
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
+from loopcal.io.formats.value_file import format_short
 from loopcal.io.runs.plan_folder import SHEET, VIA
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -38,6 +39,8 @@ DECIMALS = 6
 """Decimals of coordinates: a nanometer, a microdegree."""
 
 ANGLES = "(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"
+"""Comment on the words of angles."""
+
 UNIT_CODES = {"mm": "G21", "in": "G20"}
 ROUNDING = 2e-8
 """Difference of coordinates that were written with these decimals [m, rad]."""
@@ -119,20 +122,16 @@ def format_gcode(
     refuse_coordinates(robot)
     poses = sum(use != VIA for use in stops.uses)
     feed = settings.feed * 60.0 / find_unit(settings.unit).factor_to_si
-    wait = "M0" if settings.pause is None else f"G4 P{_format(settings.pause, 3)}"
+    wait = "M0" if settings.pause is None else f"G4 P{format_short(settings.pause, 3)}"
 
     def move(coordinates: FloatArray) -> str:
-        return f"G53 G1 {_format_words(robot, coordinates, settings.unit)} F{_format(feed, 3)}"
+        return f"G53 G1 {_format_words(robot, coordinates, settings.unit)} F{format_short(feed, 3)}"
 
     lines = [
         f"({_clean(robot.name)}: {poses} poses of a plan, in its order, and back to home)",
         "(X Y Z: origin of the platform frame in the base frame, in machine coordinates, G53.)",
         "(Work offsets and the tool length do not count.)",
-        *(
-            ["(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"]
-            if "roll" in robot.controlled
-            else []
-        ),
+        *([ANGLES] if "roll" in robot.controlled else []),
         f"(Lengths in {settings.unit}. The paths from home are checked; the way to home is not.)",
         f"{UNIT_CODES[settings.unit]} G90 G94 G40 G49 G61",
         "(MSG, the next move goes to home: check that the way is free)",
@@ -151,14 +150,15 @@ def format_gcode(
 def check_written_gcode(
     path: Path, text: str, robot: Mechanism, stops: PlannedStops, unit: str
 ) -> None:
-    """Read a program; raise LoopcalError where it is not this text, or its moves are not home, the
-    stops, and home.
+    """Read a program; raise LoopcalError where it is not this text, or its moves between the first
+    and the last, which are those to home, do not lead to the stops.
     """
-    require_same("text", text, read_text(path, "program"))
+    written = read_text(path, "program")
+    require_same("text", text, written)
     factors = _get_factors(robot, unit)
     letters = [WORDS[name] for name in robot.controlled]
     moves = []
-    for line in read_text(path, "program").splitlines():
+    for line in written.splitlines():
         if match := _MOVE.match(line):
             words = dict(_WORD.findall(match["words"]))
             moves.append([float(words[w]) * f for w, f in zip(letters, factors, strict=True)])
@@ -178,13 +178,9 @@ def _format_words(robot: Mechanism, coordinates: FloatArray, unit: str) -> str:
     """Return the words of a move."""
     numbers: Sequence[float] = coordinates.tolist()
     triples = zip(robot.controlled, numbers, _get_factors(robot, unit), strict=True)
-    return " ".join(f"{WORDS[name]}{_format(value / f, DECIMALS)}" for name, value, f in triples)
-
-
-def _format(value: float, decimals: int) -> str:
-    """Return a number without exponent and without zeros at its end."""
-    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
-    return "0" if text in {"-0", ""} else text
+    return " ".join(
+        f"{WORDS[name]}{format_short(value / f, DECIMALS)}" for name, value, f in triples
+    )
 
 
 def _clean(text: str) -> str:

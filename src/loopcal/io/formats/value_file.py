@@ -195,15 +195,15 @@ def shorten_numbers(wanted: Mapping[Name, float | str], decimals: int) -> dict[N
     """Return numbers as texts for people, without zeros at their ends; lists are `a:b:c`."""
     return {
         name: ":".join(
-            _shorten(float(number), decimals)
+            format_short(float(number), decimals)
             for number in (value.split(":") if isinstance(value, str) else (value,))
         )
         for name, value in wanted.items()
     }
 
 
-def _shorten(number: float, decimals: int) -> str:
-    """Return a number with at most so many decimals."""
+def format_short(number: float, decimals: int) -> str:
+    """Return a number with at most so many decimals, without zeros at its end and without -0."""
     text = f"{number:.{decimals}f}"
     text = text.rstrip("0").rstrip(".") if "." in text else text
     return "0" if text == "-0" else text

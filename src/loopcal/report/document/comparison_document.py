@@ -9,7 +9,7 @@ from loopcal.apply import RunComparison
 from loopcal.findings.importance import sort_by_importance
 from loopcal.report.document.elements import Document, Element, Listing, Section
 from loopcal.report.document.inline_svg import make_picture
-from loopcal.report.figures import draw_run_errors, draw_run_parameters, draw_runs
+from loopcal.report.figures import draw_run_errors, draw_run_parameters, draw_run_shifts
 from loopcal.report.run_comparison_view import (
     build_errors,
     build_estimates,
@@ -87,7 +87,7 @@ def _build_shifts(comparison: RunComparison) -> Section:
     if all(pair.moved is None for pair in comparison.pairs):
         return Section("shifts", title, (NO_SHIFTS,))
     picture = make_picture(
-        draw_runs(comparison),
+        draw_run_shifts(comparison),
         "shift-figure",
         "Shift of each parameter from the first run.",
         "For each parameter the figure shows the shift in standard deviations while all others may "
@@ -102,7 +102,7 @@ def _build_errors(comparison: RunComparison) -> Section:
     units = find_error_units(comparison)
     table = build_errors(comparison, units.__getitem__)
     elements: list[Element] = [table]
-    if any(one.common or one.own for one in comparison.errors):
+    if any(run.common or run.own for run in comparison.errors):
         picture = make_picture(
             draw_run_errors(comparison, units.__getitem__),
             "errors-figure",

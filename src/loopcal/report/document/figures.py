@@ -26,7 +26,7 @@ from loopcal.report.figures import (
     draw_validation,
 )
 from loopcal.report.scene.scene import Scene, compute_pose_errors
-from loopcal.report.scene.scene_data import choose_rows, write_scene
+from loopcal.report.scene.scene_data import choose_rows, format_scene
 from loopcal.typing import FloatArray, IntArray
 
 MAP_SENTENCE = (
@@ -156,7 +156,7 @@ def draw_scene_picture(
         f"geometry before calibration there, {poses.magnification:g} times magnified: its "
         "predicted position minus that of the calibrated geometry at the same readings, in the "
         f"base frame of the robot file.{MAP_SENTENCE if accuracy is not None else ''}",
-        write_scene(scene),
+        format_scene(scene),
     )
 
 

@@ -14,7 +14,7 @@ from loopcal.report.document.inline_svg import make_picture
 from loopcal.report.document.record import CalibrationRecord
 from loopcal.report.figures import draw_scene
 from loopcal.report.scene.scene import Scene
-from loopcal.report.scene.scene_data import write_scene
+from loopcal.report.scene.scene_data import format_scene
 
 
 def build_robot_view(robot: Mechanism) -> Document:
@@ -53,5 +53,5 @@ def _draw_home(robot: Mechanism) -> Iterator[Element]:
         "scene-figure",
         "The robot at home.",
         "The picture shows limbs, joints, rods, platform and tool, in space and from above.",
-        write_scene(scene),
+        format_scene(scene),
     )

@@ -7,6 +7,7 @@
 from loopcal.report.figures.accuracy_figure import draw_accuracy_map as draw_accuracy_map
 from loopcal.report.figures.comparison_figures import draw_run_errors as draw_run_errors
 from loopcal.report.figures.comparison_figures import draw_run_parameters as draw_run_parameters
+from loopcal.report.figures.comparison_figures import draw_run_shifts as draw_run_shifts
 from loopcal.report.figures.convergence_figure import draw_convergence as draw_convergence
 from loopcal.report.figures.height_figure import draw_height_errors as draw_height_errors
 from loopcal.report.figures.identifiability_figure import (
@@ -21,7 +22,6 @@ from loopcal.report.figures.residual_figure import draw_residual_rows as draw_re
 from loopcal.report.figures.residual_figure import draw_residuals as draw_residuals
 from loopcal.report.figures.result_figures import draw_budget as draw_budget
 from loopcal.report.figures.result_figures import draw_repeatability as draw_repeatability
-from loopcal.report.figures.result_figures import draw_runs as draw_runs
 from loopcal.report.figures.robot_figure import draw_robot as draw_robot
 from loopcal.report.figures.scene_figure import draw_scene as draw_scene
 from loopcal.report.figures.surface_plan_figure import draw_surface_plan as draw_surface_plan

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several calibrations side by side: parameters with their intervals, and held-out errors."""
+"""Several calibrations side by side: parameters with their intervals, shifts, held-out errors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import numpy as np
 from loopcal.apply import RunComparison
 from loopcal.report.figures.style import (
     COLORS,
+    DARK,
     DOT,
     LINE,
     MARKERS,
+    PALE,
     REFERENCE,
     SMALL,
     THIN,
@@ -23,6 +25,7 @@ from loopcal.report.figures.style import (
     shorten,
     start_figure,
 )
+from loopcal.report.run_comparison_view import find_shift
 from loopcal.units import Unit
 
 if TYPE_CHECKING:
@@ -87,7 +90,7 @@ def draw_run_errors(comparison: RunComparison, show_unit: Callable[[str], Unit])
     from matplotlib.patches import Patch
 
     has_common = comparison.common_poses > 0
-    errors = [one.common if has_common else one.own for one in comparison.errors]
+    errors = [run.common if has_common else run.own for run in comparison.errors]
     quantities = tuple(dict.fromkeys(name for of_run in errors for name in of_run))
     figure = start_figure(7.2, 1.4 + 2.6 * max(len(quantities), 1))
     panels: Any = figure.subplots(max(len(quantities), 1), 1, squeeze=False)[:, 0]
@@ -99,7 +102,7 @@ def draw_run_errors(comparison: RunComparison, show_unit: Callable[[str], Unit])
             if error is not None:
                 axes.bar(k, error.rms / unit.factor_to_si, 0.5, color=COLORS[k % len(COLORS)])
                 axes.plot(k, error.largest / unit.factor_to_si, "o", color="0.2", ms=DOT + 1.0)
-        labels = [shorten(one.run) for one in comparison.errors]
+        labels = [shorten(run.run) for run in comparison.errors]
         axes.set_xticks(x, labels, fontsize=SMALL)
         axes.set_xlim(-0.6, len(errors) - 0.4)
         axes.set_ylim(bottom=0.0)
@@ -115,3 +118,54 @@ def draw_run_errors(comparison: RunComparison, show_unit: Callable[[str], Unit])
         f"{comparison.common_poses} common poses" if has_common else "held-out poses of each run"
     )
     return finish_figure(figure, f"Errors after calibration at the {poses}")
+
+
+def draw_run_shifts(comparison: RunComparison) -> Figure:
+    """Draw the shift of each parameter from the first run, in standard deviations, while all others
+    may have changed, too; a significant shift is filled. What is not determined or not tested has
+    no marker.
+    """
+    from matplotlib.lines import Line2D
+
+    names = comparison.parameters[:MOST_ROWS]
+    figure = start_figure(7.2, 1.8 + 0.2 * len(names))
+    axes: Any = figure.add_subplot()
+    handles, y = [], np.arange(len(names))
+    for k, pair in enumerate(comparison.pairs, 1):  # the first run has color and marker 0
+        color, marker = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
+        shifts = [find_shift(pair, name) for name in names]
+        size = np.array([shift / sd if sd > 0.0 else np.nan for shift, sd, _ in shifts])
+        significant = np.array([flag for _, _, flag in shifts])
+        offset = 0.5 * k / (len(comparison.pairs) + 1) - 0.25
+        for chosen, face in ((significant, color), (~significant, "white")):
+            axes.plot(size[chosen], (y + offset)[chosen], marker, color=color, mfc=face, ms=DOT + 2)
+        handles.append(
+            Line2D([], [], color=color, marker=marker, ls="none", label=shorten(pair.second))
+        )
+    axes.axvspan(-1.96, 1.96, color=PALE, alpha=0.35, lw=0.0, zorder=0)
+    axes.axvline(0.0, color=REFERENCE, lw=THIN)
+    axes.set_yticks(y, [shorten(name) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    first = comparison.runs[0].name
+    label_axes(axes, f"shift from {shorten(first)} [standard deviations]", "")
+    handles.append(Line2D([], [], color=PALE, lw=6, alpha=0.5, label="95 % of a single shift"))
+    handles.append(
+        Line2D([], [], color=DARK, marker="o", ls="none", label="filled: significant at 5 % of all")
+    )
+    add_legend(figure, handles)
+    return finish_figure(figure, _describe_changes(comparison))
+
+
+def _describe_changes(comparison: RunComparison) -> str:
+    """Return the outcome of each pair in a few words, and what explains a change."""
+    words = {True: "has changed", False: "no change", None: "not tested"}
+    lines = []
+    for pair in comparison.pairs:
+        line = f"{shorten(pair.second)}: {words[pair.moved]}"
+        if pair.moved and pair.cause.names:
+            line += f"; a change of {' and '.join(pair.cause.names)} alone explains it"
+        lines.append(line)
+    more = len(comparison.parameters) - MOST_ROWS
+    if more > 0:
+        lines.append(f"the first {MOST_ROWS} of {len(comparison.parameters)} parameters")
+    return "\n".join(lines)

@@ -36,7 +36,7 @@ def make_layout() -> ConstrainedLayoutEngine:
 
 
 @contextmanager
-def _remembered_margins(every: list[Axes]) -> Iterator[None]:
+def _remembered_margins(all_axes: list[Axes]) -> Iterator[None]:
     """Let axes answer with the margins that were measured, as long as their ticks are the same.
 
     Always measured are color bars, axes in space, and axes with a fixed aspect, whose limits change
@@ -44,7 +44,7 @@ def _remembered_margins(every: list[Axes]) -> Iterator[None]:
     """
     free = [
         axes
-        for axes in every
+        for axes in all_axes
         if axes.name == "rectilinear"
         and axes.get_aspect() == "auto"
         and axes.get_axes_locator() is None

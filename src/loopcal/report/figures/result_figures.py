@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of several numbers with intervals: repeatability, uncertainty budget, compared runs."""
+"""Results of several numbers with intervals: repeatability and the uncertainty budget."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.apply import ErrorBudget, RunComparison
+from loopcal.apply import ErrorBudget
 from loopcal.apply.repeatability_result import DIMENSIONS, Estimate, Repeatability, VisitedPose
 from loopcal.report.budget_view import name_source
 from loopcal.report.figures.style import (
@@ -16,7 +16,6 @@ from loopcal.report.figures.style import (
     DOT,
     LINE,
     MARKERS,
-    PALE,
     REFERENCE,
     THIN,
     add_legend,
@@ -27,15 +26,11 @@ from loopcal.report.figures.style import (
     start_figure,
 )
 from loopcal.report.numbers import format_number
-from loopcal.report.run_comparison_view import find_shift
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-MOST_RUN_ROWS = 60
-"""Parameters that a figure of compared runs names."""
 
 
 def draw_repeatability(result: Repeatability) -> Figure:
@@ -133,54 +128,3 @@ def draw_budget(budget: ErrorBudget) -> Figure:
     add_legend(figure, handles)
     over = "poses of the workspace" if budget.is_workspace else "measured poses"
     return finish_figure(figure, f"Expected error (rms, k = 1) at {budget.poses} {over}")
-
-
-def draw_runs(comparison: RunComparison) -> Figure:
-    """Draw the shift of each parameter from the first run, in standard deviations, while all others
-    may have changed, too; a significant shift is filled. What is not determined or not tested has
-    no marker.
-    """
-    from matplotlib.lines import Line2D
-
-    names = comparison.parameters[:MOST_RUN_ROWS]
-    figure = start_figure(7.2, 1.8 + 0.2 * len(names))
-    axes: Any = figure.add_subplot()
-    handles, y = [], np.arange(len(names))
-    for k, pair in enumerate(comparison.pairs, 1):  # the first run has color and marker 0
-        color, marker = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
-        shifts = [find_shift(pair, name) for name in names]
-        size = np.array([shift / sd if sd > 0.0 else np.nan for shift, sd, _ in shifts])
-        significant = np.array([flag for _, _, flag in shifts])
-        offset = 0.5 * k / (len(comparison.pairs) + 1) - 0.25
-        for chosen, face in ((significant, color), (~significant, "white")):
-            axes.plot(size[chosen], (y + offset)[chosen], marker, color=color, mfc=face, ms=DOT + 2)
-        handles.append(
-            Line2D([], [], color=color, marker=marker, ls="none", label=shorten(pair.second))
-        )
-    axes.axvspan(-1.96, 1.96, color=PALE, alpha=0.35, lw=0.0, zorder=0)
-    axes.axvline(0.0, color=REFERENCE, lw=THIN)
-    axes.set_yticks(y, [shorten(name) for name in names])
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    first = comparison.runs[0].name
-    label_axes(axes, f"shift from {shorten(first)} [standard deviations]", "")
-    handles.append(Line2D([], [], color=PALE, lw=6, alpha=0.5, label="95 % of a single shift"))
-    handles.append(
-        Line2D([], [], color=DARK, marker="o", ls="none", label="filled: significant at 5 % of all")
-    )
-    add_legend(figure, handles)
-    return finish_figure(figure, _describe_runs(comparison))
-
-
-def _describe_runs(comparison: RunComparison) -> str:
-    """Return the outcome of each pair in a few words, and what explains a change."""
-    words = {True: "has changed", False: "no change", None: "not tested"}
-    lines = []
-    for pair in comparison.pairs:
-        line = f"{shorten(pair.second)}: {words[pair.moved]}"
-        if pair.moved and pair.cause.names:
-            line += f"; a change of {' and '.join(pair.cause.names)} alone explains it"
-        lines.append(line)
-    more = len(comparison.parameters) - MOST_RUN_ROWS
-    if more > 0:
-        lines.append(f"the first {MOST_RUN_ROWS} of {len(comparison.parameters)} parameters")
-    return "\n".join(lines)

@@ -57,7 +57,7 @@ def choose_rows(robot: Mechanism, count: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, most).astype(np.intp))
 
 
-def write_scene(scene: Scene) -> str:
+def format_scene(scene: Scene) -> str:
     """Return a scene as JSON in which no text can end a script element."""
     robot = scene.robot
     unit = find_unit(robot.units[Dimension.LENGTH])

@@ -2,7 +2,7 @@
 """Base of the kinds that measure points of the platform from a frame: targets, tips and probes."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -20,6 +20,11 @@ Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
 """The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in
 the frame, and (.., k, g, w) by the setup items that only this kind has.
 """
+
+
+def name_point(pose: str, target: str, targets: Sequence[str]) -> str:
+    """Return the name of a measured point: POSE_TARGET, or POSE where there is one target."""
+    return f"{pose}_{target}" if len(targets) > 1 else pose
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
