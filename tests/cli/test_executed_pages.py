@@ -78,6 +78,7 @@ def test_rods_of_20_mm_stay_flat_and_are_off_center_as_the_page_states(
     largest = re.search(r"^position z +largest +7 +\S+ +(\S+)", printed, re.MULTILINE)
     assert largest
     assert float(largest[1]) < 0.04  # [mm]
+    assert "Recommendation: Keep the current values" in printed
     firmware, machine = lc.load_robot("run/robot.yaml"), lc.load_robot("machine.yaml")
     targets = np.array([[0, 0, 0], [0.06, 0, 0], [0, 0.06, 0], [-0.06, 0, 0], [0, -0.06, 0]])
     nozzle = lc.forward(machine, lc.inverse(firmware, targets).q).T[:, :3, 3]

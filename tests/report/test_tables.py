@@ -4,7 +4,12 @@
 import pytest
 
 from loopcal.report.calibration_view import build_parameter_table
-from loopcal.report.numbers import format_number, format_uncertainty, format_with_uncertainty
+from loopcal.report.numbers import (
+    format_exact_beside,
+    format_number,
+    format_uncertainty,
+    format_with_uncertainty,
+)
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import render_text, wrap_text
 
@@ -121,3 +126,14 @@ def test_complete_table_of_parameters_has_the_terms_of_the_gum():
     unknown = {**rows[0], "sd": float("inf"), "plus_minus": float("inf")}
     (cells,) = build_parameter_table("Parameters", [unknown], is_complete=True).rows
     assert cells[4:8] == ("unknown", "4.57", "-", "unknown")
+
+
+def test_exact_value_is_never_hidden_by_the_uncertainty_beside_it():
+    assert format_exact_beside(105.0, 0.381) == "105.000"
+    assert format_exact_beside(105.0, 1.6e8) == "105"
+    assert format_exact_beside(0.3, 500.0) == "0.3"
+    assert format_exact_beside(0.0, 0.1) == "0.000"
+    assert format_exact_beside(1e-17, 0.1) == "0.000"
+    assert format_exact_beside(105.0, float("inf")) == "105"
+    row = {"name": "radius", "nominal": 105.0, "estimate": 105.8, "plus_minus": 2e4, "unit": "mm"}
+    assert build_parameter_table("Parameters", [row]).rows[0][1:3] == ("105", "0")

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import compute_kind_errors
+from loopcal.diagnose import adjust_uncertainty, compute_kind_errors
+from loopcal.estimate import identify
+from loopcal.findings import Quantity, report_finding
 from loopcal.measure import Measurements, Observations
 from loopcal.measure.kinds import Component
 from loopcal.mechanism import Mechanism, forward, inverse
@@ -22,6 +24,16 @@ RINGS = ((1, 0.0, 0.0), (6, 35e-3, 0.0), (6, 70e-3, 30.0))
 """Number of points, radius [m] and first angle [deg]: the thirteen points of the page on deltas."""
 TIMES = 2
 """Each ring is probed at so many first angles: 25 points leave enough to hold out."""
+FITTED_FRAME = {
+    "frame": "fitted",
+    "fitted": (),
+    "over": "measured",
+    "undetermined": (),
+    "origin": "",
+}
+"""Data of a finding that states expected errors."""
+SEVEN = 1e-3 * np.array([[0, 0], [0, 66], [-55, 32], [-52, -30], [0, -49], [45, -26], [49, 28]])
+"""Seven points [m] at unequal distances from the center."""
 WRONG = {
     "radius by 0.5 mm": {"radius": 0.5e-3},
     "a stop by 0.1 mm": {"tower1.stop": 0.1e-3},
@@ -46,11 +58,15 @@ def list_points() -> np.ndarray:
 
 
 def probe(
-    printer: Mechanism, errors: dict[str, float], seed: int, stated: float = SIGMA
+    printer: Mechanism,
+    errors: dict[str, float],
+    seed: int,
+    stated: float = SIGMA,
+    points: np.ndarray | None = None,
 ) -> Measurements:
     """Return heights of a printer that differs from its stored values by `errors` [SI]."""
     change = np.array([errors.get(name, 0.0) for name in printer.parameters.names])
-    q = inverse(printer, list_points()).q
+    q = inverse(printer, list_points() if points is None else points).q
     heights = forward(printer.with_values(printer.values + change), q).T[:, 2, 3]
     noise = SIGMA * np.random.default_rng(seed).standard_normal(len(heights))
     rows = np.arange(len(heights))
@@ -110,6 +126,67 @@ def test_unknown_noise_without_held_out_points_leaves_the_current_values(printer
     assert report.start.finding.code == "residuals.start-needs-sigma"
     assert "the noise is not known well enough" in str(report)
     assert "Use the calibrated geometry" not in str(report)
+
+
+def probe_seven(printer: Mechanism, rods: float, seed: int) -> Measurements:
+    """Return heights at seven points of a printer whose first rod is longer, and whose second rod
+    is shorter than stated, by `rods` [m].
+    """
+    errors = {"arm1.length": rods, "arm2.length": -rods}
+    return probe(printer, errors, seed, points=np.pad(SEVEN, ((0, 0), (0, 1))))
+
+
+def test_few_doubtful_residuals_leave_the_values(printer) -> None:
+    """Seven heights less six parameters leave one degree of freedom: no size of errors of the model
+    can be estimated from it.
+    """
+    report = lc.calibrate(printer, probe_seven(printer, 15e-3, 2))
+    fit = report.identification
+    assert "noise.doubtful" in {f.code for f in report.findings}
+    assert fit.posterior.discrepancy is None
+    assert (fit.interval() < 5.0 * fit.tolerance).all()
+    assert not report.states_expected_error
+    assert report.recommendation.code == "values.keep-doubtful-residuals"
+    assert report.next_step.code == "workflow.next-measure-more"
+
+
+@pytest.mark.parametrize("rods", [20e-3, 30e-3])
+def test_residuals_beyond_the_noise_leave_the_values_and_finite_intervals(printer, rods) -> None:
+    report = lc.calibrate(printer, probe_seven(printer, rods, 1))
+    assert report.recommendation.code == "values.keep-not-calibrated"
+    assert (report.identification.degrees >= 1.0).all()
+
+
+def test_seven_heights_of_a_right_printer_show_no_errors_of_the_model(printer) -> None:
+    """Deviations from nominal far below the tolerances are no sign of errors of the model."""
+    for seed in range(6):
+        data = probe_seven(printer, 0.0, seed)
+        fit = adjust_uncertainty(identify(printer, data), data)
+        assert fit.posterior.discrepancy is None
+        assert (fit.degrees >= 1.0).all()
+
+
+def test_values_of_doubtful_use_are_kept_until_held_out_poses_decide(printer) -> None:
+    fitted = lc.calibrate(printer, probe(printer, WRONG["radius by 0.5 mm"], 4))
+    test, none = fitted.identification.residual_test, report_finding("model.gain-without-intervals")
+    expected = Quantity(0.4, "mm"), Quantity(0.5, "mm")
+    no_gain = report_finding(
+        "model.no-expected-gain", position=expected, orientation=None, point="tool", axes="",
+        **FITTED_FRAME,
+    )  # fmt: skip
+    for findings, errors, code in (
+        ((none,), None, "values.apply-fitted"),
+        ((none, no_gain), None, "values.keep-no-gain"),
+        ((no_gain,), fitted.validation, "values.keep-no-gain"),
+    ):
+        finding = recommend_values(Verdict.UNDECIDED, fitted.start, test, errors, findings)
+        assert finding.code == code
+    for degrees, code in ((1.0, "values.keep-doubtful-residuals"), (5.0, "values.apply-fitted")):
+        doubtful = replace(test, degrees=degrees, p_value=5e-3)
+        assert recommend_values(Verdict.UNDECIDED, fitted.start, doubtful, None).code == code
+    others = lc.validate(fitted.identification, probe(printer, WRONG["radius by 0.5 mm"], 5))
+    finding = recommend_values(Verdict.CALIBRATED, fitted.start, test, others, (no_gain,))
+    assert finding.code == "values.apply"
 
 
 def test_p_value_of_a_gain_is_uniform_where_the_values_before_are_right(printer) -> None:

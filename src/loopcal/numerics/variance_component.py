@@ -10,7 +10,8 @@ whose tail probability for tau = 0 is that of a quadratic form in normal variabl
 saddlepoint approximation (Kuonen, Biometrika 86(4) 929, 1999, doi 10.1093/biomet/86.4.929). The
 size is the mean of sigma^2 tau^2 over its distribution for these y, with tau uniform above 0 and
 for sigma^2 a scaled inverse chi-square prior of `known` degrees of freedom about 1. Its degrees of
-freedom are those of a scaled chi-square variable of the same mean and variance.
+freedom are those of a scaled chi-square variable of the same mean and variance, at least 1: below,
+a quantile of Student's t grows without limit.
 """
 
 from __future__ import annotations
@@ -79,7 +80,8 @@ def estimate_variance_component(
     # sigma^2 at each tau has a relative variance of its own
     own = 2.0 / max(count - 4.0, 1.0)
     spread = float(share @ ((values - mean) ** 2 + own * values**2))
-    return VarianceComponent(mean, 2.0 * mean**2 / spread, float(ratio[np.argmax(density)]))
+    degrees = max(2.0 * mean**2 / spread, 1.0)
+    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]))
 
 
 def _tail(values: FloatArray) -> float:

@@ -16,6 +16,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.report.budget_view import build_budget_table
 from loopcal.report.height_view import view_heights
 from loopcal.report.numbers import (
+    format_exact_beside,
     format_in,
     format_number,
     format_uncertainty,
@@ -138,9 +139,10 @@ def build_parameter_table(
         caption,
         rows,
         (word_column("name"), lambda row: row["name"]),
-        *(
-            (Column(key), lambda row, key=key: format_with_uncertainty(row[key], row["plus_minus"]))
-            for key in ("nominal", "estimate")
+        (Column("nominal"), lambda row: format_exact_beside(row["nominal"], row["plus_minus"])),
+        (
+            Column("estimate"),
+            lambda row: format_with_uncertainty(row["estimate"], row["plus_minus"]),
         ),
         *details,
         (

@@ -52,6 +52,15 @@ def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -
     return f"{value:.{count_decimals(uncertainty)}f}"
 
 
+def format_exact_beside(value: float, uncertainty: float) -> str:
+    """Return a value that is exact, such as a nominal one, with the decimals of the uncertainty
+    beside it; with its own digits where these would show it as 0.
+    """
+    if ROUNDING <= abs(value) < INSIGNIFICANT * uncertainty < math.inf:
+        return format_number(value)
+    return format_with_uncertainty(value, uncertainty)
+
+
 def format_uncertainty(uncertainty: float) -> str:
     """Return an uncertainty with three significant digits, or a word where it has no number."""
     if math.isnan(uncertainty):

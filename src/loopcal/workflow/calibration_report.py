@@ -175,14 +175,17 @@ class CalibrationReport(TableResult):
     def recommendation(self) -> Finding:
         """Whether to apply the identified values or to keep the current ones."""
         test = self.identification.residual_test
-        return recommend_values(self.verdict, self.start, test, self.validation)
+        return recommend_values(self.verdict, self.start, test, self.validation, self.findings)
 
     @property
     def states_expected_error(self) -> bool:
         """Whether the budget is the expected error of the machine: not where the residuals
-        contradict the noise, and no discrepancy of the model explains that.
+        contradict the noise, and no discrepancy of the model explains that, and not where they
+        are doubtful.
         """
         fit = self.identification
+        if fit.residual_test.is_doubtful:
+            return False
         explained = fit.posterior.discrepancy is not None
         return self.budget is not None and (explained or not fit.residual_test.failed)
 

@@ -115,9 +115,7 @@ def choose_next_step(
             "workflow.next-check-held-out", poses=tuple(f"pose {label}" for label in labels)
         )
     if verdict is Verdict.UNDECIDED:
-        if any(finding.code in TOO_FEW_HELD_OUT for finding in findings):
-            return report_finding("workflow.next-hold-out-more")
-        return report_finding("workflow.next-hold-out")
+        return report_finding(_choose_validation(findings, recommendation))
     if outliers:
         return report_finding(
             "workflow.next-check-outliers", poses=tuple(f"pose {label}" for label in outliers)
@@ -137,3 +135,12 @@ def choose_next_step(
         if failed == {finding.code} == {LIMIT_EXCEEDED} and share > 0.5:
             return report_finding("workflow.next-improve-machine", share=share, quantity=quantity)
     return report_finding("workflow.next-measure-more")
+
+
+def _choose_validation(findings: Sequence[Finding], recommendation: str) -> str:
+    """Return the code of the next step where the verdict is undecided."""
+    if recommendation == "values.keep-doubtful-residuals":  # too few poses to hold any out
+        return "workflow.next-measure-more"
+    if any(finding.code in TOO_FEW_HELD_OUT for finding in findings):
+        return "workflow.next-hold-out-more"
+    return "workflow.next-hold-out"

@@ -111,7 +111,8 @@ def find_slow_errors(
         excluded poses. linear : of both, see `linearize_fit`. T : (n, 4, 4) [m] measured poses.
     """
     tool = fit.robot.tool[:3, 3]
-    if len(T) < FEWEST_POSES:
+    # deviations from nominal show errors, too, but only as far as the tolerances are right
+    if len(T) < FEWEST_POSES or fit.residual_test.degrees < FEWEST_DEGREES:
         return None
     kernels = (
         describe_smooth_errors(T, tool, fit.robot.size, length, by_rotation=by_rotation)

@@ -88,6 +88,13 @@ class ResidualTest:
         return self.noise == "given" and self.p_value < SIGNIFICANCE
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether the residuals exceed the stated noise, and have too few degrees of freedom to
+        find out whether noise or the model is the cause.
+        """
+        return self.degrees < FEWEST_DEGREES and self.p_value < DOUBT
+
+    @property
     def sigma_degrees(self) -> float:
         """Degrees of freedom of s that come from the stated sigmas: nu0, or 0 where the residuals
         contradict them.

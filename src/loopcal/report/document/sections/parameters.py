@@ -59,8 +59,8 @@ def build_budget_section(record: CalibrationRecord) -> Section:
     elements: list[Element] = [BUDGET_TERMS]
     if not record.result.get("states_expected_error"):
         elements.append(
-            "The residuals contradict the stated noise, so these numbers are not the expected "
-            "error of the machine."
+            "The residuals exceed the stated noise, so these numbers are not the expected error of "
+            "the machine."
         )
     elements.append(build_budget_table(budget, record.robot))
     return Section("budget", "Uncertainty budget", (*elements, *instruments))
