@@ -140,7 +140,7 @@ def test_a_wrong_sigma_is_no_discrepancy():
 
 
 def touch_bed(seed: int, points: int = 13, sigma: float = 20 * UM) -> Measurements:
-    """Return probed heights: readings where the nozzle touches the bed, up to the noise, at z = 0."""
+    """Return readings where the nozzle touches the bed at z = 0, up to the noise."""
     rng = np.random.default_rng(seed)
     machine = delta().with_values(sample_truth(delta(), 1, seed)[0])
     turn = 2.4 * np.arange(points)  # golden angle

@@ -60,6 +60,13 @@ def test_program_in_inches_with_dwell(folder) -> None:
     assert "X0.393701 Y-0.807087 Z7.480315 A3 B-4 C5 F20" in text
 
 
+@pytest.mark.parametrize(("unit", "feed"), [("mm", "300"), ("in", "11.811")])
+def test_default_feed_is_the_same_speed_in_each_unit(folder, unit: str, feed: str) -> None:
+    assert main(["gcode", "hexapod-42", ".", "-o", "poses.ngc", "--unit", unit]) == 0
+    moves = list_moves((folder / "poses.ngc").read_text())
+    assert {move.rpartition(" F")[2] for move in moves} == {feed}
+
+
 def test_robot_without_tilt_has_three_words(folder) -> None:
     robot = load_robot("linear-delta")
     (folder / "delta.csv").write_text("step,pose,use,x [mm],y [mm],z [mm]\n1,1,fit,10,5,100\n")

@@ -37,9 +37,8 @@ SHOWN = 20
 @click.option(
     "--feed",
     type=float,
-    default=300.0,
     metavar="NUMBER",
-    help="Feed per minute, in the unit of the program.",
+    help="Feed per minute, in the unit of the program.  [default: 300 mm, in inches as fast]",
 )
 @click.option(
     "--pause",
@@ -58,7 +57,7 @@ SHOWN = 20
 def gcode(
     robot: str,
     plan: Path,
-    feed: float,
+    feed: float | None,
     pause: float | None,
     unit: Literal["mm", "in"] | None,
     output: Path,
@@ -80,6 +79,7 @@ def gcode(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.gcode_program import (
+        DEFAULT_FEED,
         GcodeSettings,
         check_written_gcode,
         format_gcode,
@@ -94,10 +94,11 @@ def gcode(
     is_in_inches = machine.units[Dimension.LENGTH] == "in"
     program_unit: Literal["mm", "in"] = unit or ("in" if is_in_inches else "mm")
     feed_unit = find_unit(program_unit).factor_to_si / 60.0  # [m/s]
+    speed = DEFAULT_FEED if feed is None else feed * feed_unit
     stops = read_stops(plan, machine)
     refuse_coordinates(machine)
     home = check_route(machine, stops.labels, stops.coordinates)
-    text = format_gcode(machine, stops, home, GcodeSettings(feed * feed_unit, pause, program_unit))
+    text = format_gcode(machine, stops, home, GcodeSettings(speed, pause, program_unit))
     write_text(
         output, text, lambda path: check_written_gcode(path, text, machine, stops, program_unit)
     )

@@ -35,6 +35,9 @@ from loopcal.units import Dimension, find_unit
 WORDS = {"x": "X", "y": "Y", "z": "Z", "roll": "A", "pitch": "B", "yaw": "C"}
 """Controlled coordinate -> word of RS-274."""
 
+DEFAULT_FEED = 0.005
+"""Feed of moves [m/s], 300 mm per minute, whatever the unit of the program is."""
+
 DECIMALS = 6
 """Decimals of coordinates: a nanometer, a microdegree."""
 
