@@ -15,7 +15,7 @@ import pytest
 from loopcal import geometry
 from loopcal.cli import main
 from loopcal.cli.options.shared_options import SHIPPED_PROFILES
-from loopcal.diagnose import examine_points
+from loopcal.diagnose import check_conventions, examine_points
 from loopcal.errors import DataError, FileError
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.data.measurement_writer import format_data_sheet
@@ -205,6 +205,14 @@ def test_inches_without_the_unit_are_refused(robot, sheet, points, tmp_path) -> 
         examine(robot, sheet, export)
 
 
+def test_mirrored_axes_are_refused_with_the_export(robot, sheet, points, tmp_path) -> None:
+    mirrored = [(name, xyz * [1.0, -1.0, 1.0]) for name, xyz in points]
+    data = fill(robot, sheet, write_spatial_analyzer(tmp_path / "left.txt", mirrored)).data
+    with pytest.raises(DataError, match=r"left\.txt: .* opposite sign") as refused:
+        check_conventions(robot, data)
+    assert "sheet.csv" not in str(refused.value)
+
+
 def test_swapped_poses_and_targets_are_refused_by_name(robot, sheet, points, tmp_path) -> None:
     names = {f"{a}_{t}": f"{b}_{t}" for a, b in ((4, 9), (9, 4)) for t in TARGETS}
     path = write_spatial_analyzer(tmp_path / "e.txt", rename(points, names))
@@ -224,6 +232,23 @@ def test_shifted_names_are_refused(shift, words, robot, sheet, points, tmp_path)
     late = [(name, xyz) for (name, _), xyz in zip(kept, moved, strict=True)]
     with pytest.raises(DataError, match=words):
         examine(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", late))
+
+
+@pytest.mark.parametrize(("first", "shift", "words"), [(4, -1, "early"), (9, 1, "late")])
+def test_names_shifted_from_a_pose_on_are_refused(
+    first, shift, words, robot, sheet, points, tmp_path
+) -> None:
+    """A pose was left out, or its number was used twice, and the numbers went on."""
+    named = dict(points)
+    labels = list(dict.fromkeys(name.split("_")[0] for name in named))
+    shifted = []
+    for i, label in enumerate(labels):
+        place = i - shift * (i >= first)
+        if place < N:
+            shifted += [(f"{label}_{t}", named[f"{labels[place]}_{t}"]) for t in TARGETS]
+    path = write_spatial_analyzer(tmp_path / "e.txt", shifted)
+    with pytest.raises(DataError, match=f"from pose {labels[first]} on, .* one pose too {words}"):
+        examine(robot, sheet, path)
 
 
 def test_a_point_far_from_its_place_is_reported(robot, sheet, points, tmp_path) -> None:
@@ -251,6 +276,17 @@ def test_moved_tracker_is_refused_and_two_files_are_two_sessions(
     save_filled_sheet(fill(robot, sheet, *days), tmp_path / "measured.csv")
     rows = load_measurements(tmp_path / "measured.csv", robot).observations[0]
     assert rows.session.tolist() == ["monday"] * 7 + ["tuesday"] * 7
+
+
+def test_small_move_of_the_tracker_is_reported(robot, sheet, points, tmp_path) -> None:
+    """It is not far beyond the errors of the robot, but two positions fit much better."""
+    moved = [
+        (name, xyz + np.array([0.2, 0.1, -0.1]) * (i >= 21)) for i, (name, xyz) in enumerate(points)
+    ]
+    (found,) = examine(robot, sheet, write_spatial_analyzer(tmp_path / "e.txt", moved))
+    assert found.code == "sheet.instrument-perhaps-moved"
+    assert "up to pose 7 and those from pose 8" in str(found)
+    assert examine(robot, sheet, write_spatial_analyzer(tmp_path / "f.txt", points)) == ()
 
 
 def test_points_without_matching_names_are_filled_by_order_or_refused(

@@ -11,16 +11,16 @@ import pytest
 
 import loopcal as lc
 from loopcal.estimate import MAP, FitOptions, Huber, Identification, LeastSquares, identify
-from loopcal.measure import Measurements
+from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor
 from loopcal.report.calibration_view import view_calibration, view_fit
 from loopcal.report.text_page import render_text
 from loopcal.workflow import CalibrationOptions, CalibrationReport, Verdict, calibrate
 from tests.estimate.problems import hexapod, hexapod_data
 
 
-def wrong_data() -> Measurements:
+def wrong_data(instrument: Instrument | None = None) -> Measurements:
     """Return measurements whose readings belong to other poses."""
-    data = hexapod_data(20)
+    data = hexapod_data(20, instrument=instrument)
     return replace(data, readings=data.readings[np.random.default_rng(0).permutation(20)])
 
 
@@ -67,6 +67,17 @@ def test_json_has_no_statistics_of_a_failed_fit():
     assert failed().verdict is Verdict.NOT_CALIBRATED
     codes = {finding.code for finding in failed().findings}
     assert not {code for code in codes if code.startswith(("gates.errors", "validation."))}
+
+
+def test_run_of_a_failed_fit_with_an_unknown_frame_is_read_back(tmp_path):
+    """The frame has no bounded uncertainty; its run folder could not be written."""
+    options = CalibrationOptions(hold_out=0.25, check_conventions=False)
+    tracker = Instrument((Sensor(Position(unknown=("frame",)), Gaussian(np.full(3, 5e-6))),))
+    report = calibrate(lc.load_robot("hexapod-42"), wrong_data(tracker), options)
+    assert not report.identification.converged
+    lc.save_run(tmp_path / "run", report)
+    arrays = lc.load_run(tmp_path / "run").arrays
+    assert arrays["frames_T"].shape == (0, 4, 4)
 
 
 def test_sum_of_squares_is_printed_only_where_the_iteration_lowered_it():

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loopcal.diagnose.point_names import PointCheck, check_point_names, find_other_scale
+from loopcal.diagnose.point_names import MOVED, PointCheck, check_point_names, find_other_scale
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Position
@@ -76,18 +76,26 @@ def _report_point_check(
     def name(place: tuple[int, int]) -> str:
         return name_point(labels[place[0]], targets[place[1]], targets)
 
+    findings: list[Finding] = []
     if check.moved_before is not None:
         first, last = labels[check.moved_before], labels[check.moved_before - 1]
-        raise DataError(report_finding("sheet.instrument-moved", first=first, last=last))
+        if check.move_gain > MOVED:
+            raise DataError(report_finding("sheet.instrument-moved", first=first, last=last))
+        findings.append(
+            report_finding(
+                "sheet.instrument-perhaps-moved", first=first, last=last, gain=check.move_gain
+            )
+        )
     if check.shift:
         typical, before = (
             robot.to_quantity(distance, Dimension.LENGTH)
             for distance in (check.distance, check.distance_as_named)
         )
-        finding = report_finding(
-            "sheet.points-shifted", is_late=check.shift > 0, typical=typical, before=before
-        )
-        raise DataError(finding)
+        facts = {"is_late": check.shift > 0, "typical": typical, "before": before}
+        if not check.shifted_from:
+            raise DataError(report_finding("sheet.points-shifted", **facts))
+        first = labels[check.shifted_from]
+        raise DataError(report_finding("sheet.points-shifted-later", first=first, **facts))
     if check.renamed:
         points = tuple({"found": name(a), "place": name(b)} for a, b in check.renamed)
         limit = robot.to_quantity(check.limit, Dimension.LENGTH)
@@ -95,10 +103,10 @@ def _report_point_check(
             report_finding("sheet.points-misnamed", points=points, count=len(points), limit=limit)
         )
     if not check.far:
-        return []
+        return findings
     far = tuple(
         {"item": name(place), "distance": robot.to_quantity(distance, Dimension.LENGTH)}
         for place, distance in check.far
     )
     typical = robot.to_quantity(check.distance, Dimension.LENGTH)
-    return [report_finding("sheet.points-far", points=far, typical=typical)]
+    return [*findings, report_finding("sheet.points-far", points=far, typical=typical)]

@@ -10,8 +10,8 @@ two poses, so the nominal robot suffices.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,8 +30,13 @@ MOVED = 8.0
 Also of those with names as they are to those with shifted names.
 """
 
+DOUBTED = 2.0
+"""Like `MOVED`, per degree of freedom: ratio above which it may have moved. Geometric errors alone
+gave at most 1.2 with 30 poses of a hexapod.
+"""
+
 GRID = 8
-"""Moments between which a move is sought at first."""
+"""Moments between which a move or a shift of names is sought at first."""
 
 SCALE_SHARE = 0.02
 """Share of the extent of the poses by which points are away, above which units are doubted."""
@@ -53,7 +58,10 @@ class PointCheck:
     renamed : (row, target) of points and the (row, target) whose prediction they fit.
     far : (row, target) of points that fit no prediction, and their distance [m].
     moved_before : first row after the instrument has moved; None where it stood still.
+    move_gain : ratio of the distances with one instrument frame to those with two. Between `DOUBTED`
+        and `MOVED` the move is likely, but geometric errors of the robot hide it; 0 without a move.
     shift : 1 where the points of each row fit the row before, -1 where they fit the next one.
+    shifted_from : first row whose name is shifted.
     distance_as_named : median distance with the names as they are [m], where they are shifted.
     """
 
@@ -62,7 +70,9 @@ class PointCheck:
     renamed: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = ()
     far: tuple[tuple[tuple[int, int], float], ...] = ()
     moved_before: int | None = None
+    move_gain: float = 0.0
     shift: int = 0
+    shifted_from: int = 0
     distance_as_named: float = float("nan")
 
 
@@ -91,15 +101,26 @@ def check_point_names(kind: Position, T: FloatArray, measured: FloatArray) -> Po
     is_far = is_present & ~(distance <= limit)
     typical = float(np.median(distance[is_present & ~is_far]))
     shift = _find_shift(kind, T, points, is_present, typical)
+    if shift is None and typical > SCALE_SHARE * _measure_extent(T):
+        shift = _find_late_shift(kind, T, points, is_present, typical)
     if shift is not None:
-        return PointCheck(shift[1], limit, shift=shift[0], distance_as_named=typical)
-    split = _find_move(kind, T, points, is_present)
-    if split is not None:
-        return PointCheck(typical, limit, moved_before=split)
+        by, first, then = shift
+        return PointCheck(then, limit, shift=by, shifted_from=first, distance_as_named=typical)
+    split, gain = _find_move(kind, T, points, is_present)
+    if gain > MOVED:
+        return PointCheck(typical, limit, moved_before=split, move_gain=gain)
     places = np.argwhere(is_far)
-    if not len(places):
-        return PointCheck(typical, limit)
-    return _rename(points, predicted, places, distance, typical, limit)
+    check = PointCheck(typical, limit)
+    if len(places):
+        check = _rename(points, predicted, places, distance, typical, limit)
+    if check.renamed or split is None:
+        return check
+    return replace(check, moved_before=split, move_gain=gain)
+
+
+def _measure_extent(T: FloatArray) -> float:
+    """Return the largest extent of poses (r, 4, 4) along an axis [m]."""
+    return float(np.ptp(T[:, :3, 3], axis=0).max(initial=0.0))
 
 
 def _rename(
@@ -175,9 +196,9 @@ def _fit(
 
 def _find_shift(
     kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, typical: float
-) -> tuple[int, float] | None:
-    """Return by how many rows names are shifted, and the median distance then; None where the names
-    as they are fit nearly as well.
+) -> tuple[int, int, float] | None:
+    """Return by how many rows names are shifted, 0 for the first row, and the median distance then;
+    None where the names as they are fit nearly as well.
     """
     best = None
     for shift in (1, -1):
@@ -187,21 +208,62 @@ def _find_shift(
         if fitted is None or not is_present[of_rows].any():
             continue
         distance = float(np.median(fitted[1][is_present[of_rows]]))
-        if distance * MOVED < typical and (best is None or distance < best[1]):
-            best = (shift, distance)
+        if distance * MOVED < typical and (best is None or distance < best[2]):
+            best = (shift, 0, distance)
     return best
+
+
+def _find_late_shift(
+    kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray, typical: float
+) -> tuple[int, int, float] | None:
+    """Return like `_find_shift` a shift that begins at a later row, and this row.
+
+    A pose was left out, or counted twice, and the numbers went on.
+    """
+    n, best = len(T), None
+    for shift in (1, -1):
+        rows = n if shift > 0 else n - 1
+
+        def measure(first: int, shift: int = shift, rows: int = rows) -> float:
+            poses = T[np.arange(rows) - shift * (np.arange(rows) >= first)]
+            fitted = _fit(kind, poses, points[:rows], is_present[:rows])
+            if fitted is None or not is_present[:rows].any():
+                return np.inf
+            return float(np.mean(fitted[1][is_present[:rows]]))
+
+        first = _find_smallest(measure, 1, rows - 1)
+        if first is not None:
+            distance = measure(first)
+            if distance * MOVED < typical and (best is None or distance < best[2]):
+                best = (shift, first, distance)
+    return best
+
+
+def _find_smallest(measure: Callable[[int], float], low: int, high: int) -> int | None:
+    """Return the place of the smallest value in low..high, towards which the values fall."""
+    values: dict[int, float] = {}
+    while low <= high:  # a grid, then a finer one around the best
+        step = max(1, -(-(high - low) // GRID))
+        for place in range(low, high + 1, step):
+            if place not in values:
+                values[place] = measure(place)
+        best = min(values, key=values.__getitem__)
+        if step == 1:
+            break
+        low, high = max(low, best - step + 1), min(high, best + step - 1)
+    return min(values, key=values.__getitem__) if values else None
 
 
 def _find_move(
     kind: Position, T: FloatArray, points: FloatArray, is_present: BoolArray
-) -> int | None:
-    """Return the row before which the instrument has moved; None where it has not.
+) -> tuple[int | None, float]:
+    """Return the row before which the instrument may have moved, and by which ratio the root mean
+    square of distances per degree of freedom falls; (None, 0) up to the ratio `DOUBTED`.
 
-    Both sides are fitted with frames and targets of their own. The best moment must reduce the root
-    mean square by `MOVED`.
+    Both sides are fitted with frames and targets of their own.
     """
     if "frame" not in kind.unknown:
-        return None
+        return None, 0.0
 
     def measure(start: int, end: int) -> float:
         fitted = _fit(kind, T[start:end], points[start:end], is_present[start:end])
@@ -209,23 +271,20 @@ def _find_move(
             return np.inf
         return float((fitted[1][is_present[start:end]] ** 2).sum())
 
-    whole = measure(0, len(T))
     per_pose = max(1, 3 * len(kind.targets))
-    fewest = max(FEWEST_POSES, -(-3 * (6 + 3 * len(kind.targets)) // per_pose))
-    low, high = fewest, len(T) - fewest
-    sums: dict[int, float] = {}
-    while low <= high:  # the sum falls towards the true moment: a grid, then a finer one around
-        step = max(1, -(-(high - low) // GRID))
-        for split in range(low, high + 1, step):
-            if split not in sums:
-                sums[split] = measure(0, split) + measure(split, len(T))
-        best = min(sums, key=sums.__getitem__)
-        if step == 1:
-            break
-        low, high = max(low, best - step + 1), min(high, best + step - 1)
-    if not sums or not min(sums.values()) * MOVED**2 < whole:
-        return None
-    return min(sums, key=sums.__getitem__)
+    unknowns = 6 + 3 * len(kind.targets)
+    fewest = max(FEWEST_POSES, -(-3 * unknowns // per_pose))
+    split = _find_smallest(
+        lambda place: measure(0, place) + measure(place, len(T)), fewest, len(T) - fewest
+    )
+    if split is None:
+        return None, 0.0
+    whole, parts = measure(0, len(T)), measure(0, split) + measure(split, len(T))
+    numbers = 3 * int(is_present.sum())
+    share = (numbers - 2 * unknowns) / (numbers - unknowns)
+    if not (share > 0.0 and np.isfinite(whole) and parts * DOUBTED**2 < whole * share):
+        return None, 0.0
+    return split, float(np.sqrt(whole * share / parts)) if parts > 0.0 else np.inf
 
 
 def find_other_scale(
@@ -249,8 +308,7 @@ def find_other_scale(
         return np.inf if fitted is None else float(np.median(fitted[1][used]))
 
     as_written = measure(1.0)
-    extent = float(np.ptp(T[:, :3, 3], axis=0).max(initial=0.0))
-    if not as_written > SCALE_SHARE * extent:
+    if not as_written > SCALE_SHARE * _measure_extent(T):
         return None
     distances = {name: measure(scale) for name, scale in scales.items()}
     if not distances:

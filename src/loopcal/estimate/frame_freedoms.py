@@ -143,7 +143,10 @@ def _describe_instruments(
     eliminated: EliminatedNuisance | None,
     noise: float,
 ) -> dict[str, InstrumentFrame]:
-    """Return the frames in which the kinds of measurements measure."""
+    """Return the frames in which the kinds of measurements measure.
+
+    A frame of unbounded uncertainty, as after a fit that did not converge, is left out.
+    """
     frames: dict[str, InstrumentFrame] = {}
     for name, stated, is_unknown in list_instrument_frames(data):
         if not is_unknown:
@@ -152,7 +155,9 @@ def _describe_instruments(
         elif local is not None and eliminated is not None:
             axes = (*setup.ROTATION_AXES, *setup.POSITION_AXES)
             places = np.array([local.table.index(f"{name}.{axis}") for axis in axes])
-            frames[name] = _describe_unknown(stated, places, eliminated, free, noise)
+            frame = _describe_unknown(stated, places, eliminated, free, noise)
+            if np.isfinite(frame.own).all() and np.isfinite(frame.by_parameters).all():
+                frames[name] = frame
     return frames
 
 

@@ -120,6 +120,8 @@ def fill_sheet(
             findings.append(report_finding(f"sheet.{code}", names=tuple(dict.fromkeys(names))))
     body = list(_merge(table, filled, units, columns))
     data = _build_measurements(robot, table, entry, body, units)
+    source = " and ".join(map(str, exports))  # the file whose values a check doubts
+    data = replace(data, observations=tuple(replace(o, source=source) for o in data.observations))
     header = _list_header(table, units, columns)
     lines = _list_settings(table)
     cells = tuple(tuple(row.get(name, "") for name in header) for row in body)
@@ -314,7 +316,7 @@ def _build_measurements(
         sigma,
         np.array([row.get("session", "") for row in body])[present],
     )
-    return replace(planned, observations=(replace(observations, source=str(table.path)),))
+    return replace(planned, observations=(observations,))
 
 
 def _get_factor(symbol: str | None, dimension: Dimension) -> float:
