@@ -3,6 +3,8 @@
 allow, and the remaining errors.
 """
 
+import csv
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from loopcal import geometry, load_robot
 from loopcal.apply.compensation import Reach, compensate
 from loopcal.errors import DataError
 from loopcal.estimate import LeastSquares, identify
+from loopcal.io.runs.compensation_file import format_compensation
 from loopcal.mechanism import compare_coordinates, forward, inverse, sample_workspace
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses
 
@@ -161,3 +164,15 @@ def test_no_error_is_stated_where_the_machine_does_not_get_to_a_pose():
         assert np.isfinite(result.before[0]).all()
         assert np.isnan(result.before[1]).all()
         assert np.isnan(result.remaining[1]).all() or mode == "commands"
+
+
+@pytest.mark.parametrize("name", ["3-prs", "linear-delta"])
+def test_file_states_errors_that_are_rounding_as_0(name) -> None:
+    robot = make_identified_robot(name)
+    result = compensate(robot, sample_workspace(robot, 8, 2).coordinates)
+    header, *rows = csv.reader(format_compensation(result).splitlines())
+    is_note = [title.startswith("note ") and title != "note status" for title in header]
+    stated = np.array(rows)[:, is_note].astype(float)
+    assert not ((stated != 0.0) & (np.abs(stated) < 1e-9)).any()  # [mm, deg]
+    assert (stated == 0.0).any()
+    assert (np.abs(stated) > 1e-3).any()

@@ -12,9 +12,10 @@ from numpy.testing import assert_allclose
 import loopcal as lc
 from loopcal.apply import HeightErrors, map_height_errors
 from loopcal.apply.height_errors import restore_heights, store_heights
-from loopcal.measure import Measurements, Observations
+from loopcal.estimate import identify
+from loopcal.measure import Gaussian, Instrument, Measurements, Observations, Sensor, simulate
 from loopcal.measure.kinds import Component, Plane, Position
-from loopcal.mechanism import Mechanism, forward
+from loopcal.mechanism import Mechanism, forward, sample_workspace
 from loopcal.report.figures import draw_height_errors
 from loopcal.report.height_view import build_height_map, build_height_summary, view_heights
 from loopcal.report.tables import Table
@@ -133,3 +134,16 @@ def test_gaps_to_a_level_plane_are_heights_and_those_to_a_wall_are_not(
     assert map_height_errors(fit, measure(printer, report, sideways, 1), None) is None
     position = Position(places=place)
     assert map_height_errors(fit, measure(printer, report, position, 3), None) is None
+
+
+def test_heights_of_a_platform_that_rotates_are_no_map(heights) -> None:
+    """Their errors depend on the orientation, too, and nothing that was measured is a bed."""
+    robot = lc.load_robot("3-prs")
+    poses = sample_workspace(robot, 12, 1).coordinates
+    for kind in (Component(("z",)), Plane(places=np.zeros((1, 3)), surface="table")):
+        sensor = Sensor(kind, Gaussian(np.full(len(kind.columns), 2e-5)))
+        data = simulate(robot, poses, Instrument((sensor,)), 1)
+        fit = identify(robot, data)
+        assert map_height_errors(fit, data, None) is None
+    assert restore_heights(store_heights(heights), robot) is None
+    assert "bed" not in str(heights)

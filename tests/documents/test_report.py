@@ -266,7 +266,7 @@ def test_report_of_a_printer_shows_the_heights_over_the_bed(root, tmp_path) -> N
     lc.save_run(tmp_path / "run", report)
     for source in (report, lc.load_run(tmp_path / "run")):
         section = build(load_record(source), "height").sections[0]
-        assert section.title == "Height errors over the bed"
+        assert section.title == "Height errors"
         sentence, summary, picture, by_point = section.elements
         assert isinstance(sentence, str)
         assert isinstance(summary, Table)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of measured heights over a bed, before and after calibration.
+"""Errors of measured heights over x and y, before and after calibration.
 
-A printer owner sees a wrong geometry as a bowl or a tilted plane on the bed. Rows that measure one
-height (the component z of the tool, or the gap to a level plane) have an error, prediction minus
-measurement, and a place x, y: where the calibrated geometry has the touching point at the recorded
-readings. Of a height that a firmware reported, the error before calibration is that height itself:
-positive where the bed seems too high.
+A printer owner sees a wrong geometry as a bowl or a tilted plane on the bed. Such a map is made of
+a platform that translates in x, y and z and does not rotate: elsewhere the errors of a height
+depend on more than its place. Rows that measure one height (the component z of the tool, or the gap
+to a level plane) have an error, prediction minus measurement, and a place x, y: where the
+calibrated geometry has the touching point at the recorded readings. Of a height that a firmware
+reported, the error before calibration is that height itself: positive where the bed seems too high.
 
 "Before" is the baseline of `loopcal.apply.validation`: the geometry before calibration with the
 setup parameters that fit it best at the fitted rows.
@@ -26,6 +27,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, Observations
 from loopcal.measure.kinds import Component, Plane
+from loopcal.mechanism.assembly import AXES
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit
@@ -42,7 +44,10 @@ FEWEST = 3
 """Heights that show a plane; with fewer there is no map."""
 
 LEVEL = 0.2
-"""Largest ratio of the points' range in z to that in x, y of a surface that is called a bed."""
+"""Largest ratio of the points' range in z to that in x, y of a level surface."""
+
+TRANSLATIONS = tuple(AXES.index(axis) for axis in "xyz")
+"""Freedoms of a platform over whose x and y heights are mapped."""
 
 UPRIGHT = 0.95
 """Least cosine of the angle between the z axes of the measured frame and of the base."""
@@ -50,7 +55,7 @@ UPRIGHT = 0.95
 
 @dataclass(frozen=True, eq=False)
 class HeightErrors(TableResult):
-    """Errors of n measured heights, prediction minus measurement, at their places over the bed.
+    """Errors of n measured heights, prediction minus measurement, at their places x, y.
 
     Attributes
     ----------
@@ -79,13 +84,13 @@ class HeightErrors(TableResult):
                 yield name, is_held_out
 
     def plot(self) -> Figure:
-        """Draw the errors over the bed before and after calibration, with one scale of colors."""
+        """Draw the errors over x and y before and after calibration, with one scale of colors."""
         return draw("draw_height_errors", self)
 
     def __str__(self) -> str:
         """Return one line for the fitted and one for the held-out heights."""
         factor, symbol = self.unit.factor_to_si, self.unit.symbol
-        lines = [f"Height errors at {len(self.poses)} points of the bed:"]
+        lines = [f"Height errors at {len(self.poses)} points:"]
         for name, is_held_out in self.list_sets():
             before, after = (self.statistics(e, is_held_out) for e in ("before", "after"))
             rms = [f"{round_to_digits(s.rms / factor)} {symbol}" for s in (before, after)]
@@ -109,13 +114,15 @@ class HeightErrors(TableResult):
 def map_height_errors(
     fit: Identification, fitted: Measurements, held_out: Measurements | None
 ) -> HeightErrors | None:
-    """Return the errors of all heights over the bed; None where the data measure no heights, or a
-    geometry does not reach their poses.
+    """Return the errors of all heights; None where the data measure no heights, the platform
+    rotates or does not move in x, y and z, or a geometry does not reach the poses.
 
     Parameters
     ----------
     fit : that converged. fitted, held_out : the measurements of the calibration.
     """
+    if not has_height_map(fit.robot):
+        return None
     listed = []
     for data, is_held_out in ((fitted, False), (held_out, True)):
         if data is None or not any(_measures_height(o) for o in data.observations):
@@ -142,6 +149,11 @@ def map_height_errors(
     )
 
 
+def has_height_map(robot: Mechanism) -> bool:
+    """Return whether the platform translates in x, y and z and does not rotate."""
+    return robot.program.freedoms == TRANSLATIONS
+
+
 def store_heights(heights: HeightErrors) -> dict[str, np.ndarray]:
     """Return the errors as arrays by name [SI]."""
     arrays = {name: getattr(heights, name) for name in ("points", "before", "after")}
@@ -150,13 +162,13 @@ def store_heights(heights: HeightErrors) -> dict[str, np.ndarray]:
 
 
 def restore_heights(arrays: Mapping[str, np.ndarray], robot: Mechanism) -> HeightErrors | None:
-    """Return stored errors; None where a run has none.
+    """Return stored errors; None where a run has none, or its robot has no map of heights.
 
     Parameters
     ----------
     arrays : of the run. robot : for the unit.
     """
-    if f"{PREFIX}poses" not in arrays:
+    if f"{PREFIX}poses" not in arrays or not has_height_map(robot):
         return None
     points, before, after, held_out = (
         arrays[f"{PREFIX}{name}"] for name in ("points", "before", "after", "held_out")

@@ -6,13 +6,11 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.apply import Compensation
+from loopcal.apply.compensation import ROUNDING
 from loopcal.report.numbers import format_number, units_of
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block
 from loopcal.units import Dimension
-
-ROUNDING = 1e-9
-"""Errors below this share of the robot's size (or this many radians) are rounding."""
 
 
 def view_compensation(result: Compensation) -> list[Block]:

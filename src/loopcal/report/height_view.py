@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of measured heights over the bed, as tables."""
+"""Errors of measured heights, as tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def build_height_summary(heights: HeightErrors) -> Table:
             rows.append((name, metric, str(after.count), *shown, unit.symbol))
     columns = (word_column("points"), word_column("metric"))
     numbers = (Column("count"), Column("before"), Column("after"))
-    caption = "Height errors over the bed (predicted - measured)"
+    caption = "Height errors (predicted - measured)"
     return Table(caption, (*columns, *numbers, word_column("unit")), tuple(rows))
 
 

@@ -91,8 +91,8 @@ class CalibrationReport(TableResult):
         predicted or the fit did not converge.
     fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic. None
         where the fit did not converge.
-    height_errors : errors of measured heights over the bed, fitted and held-out; None where the
-        data measure no heights, or the fit did not converge.
+    height_errors : errors of measured heights, fitted and held-out; None where the data measure
+        none, the platform does more than translate, or the fit did not converge.
     findings : everything noticed, the most important first.
     budget : uncertainty of parameters and of poses over the workspace by source; None where there
         are no intervals.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from loopcal.apply.compensation import ROUNDING
 from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import format_header, format_row, read_table, require_columns
 from loopcal.io.core.numbers import format_exact
@@ -96,11 +97,15 @@ def _list_columns(result: Compensation) -> tuple[list[tuple[str, Unit]], FloatAr
 
 
 def _list_errors(result: Compensation) -> list[tuple[str, Unit, FloatArray]]:
-    """Return column, unit and values (n,) [SI] of the expected errors."""
+    """Return column, unit and values (n,) [SI] of the expected errors; those that are rounding are
+    0.
+    """
     errors = {"before": result.before, "remaining": result.remaining}
     if result.uncertainty is not None:
         errors["U"] = result.uncertainty.expanded
     dimensions = [Dimension.LENGTH if name in "xyz" else Dimension.ANGLE for name in NAMES]
+    rounding = np.where(np.isin(NAMES, list("xyz")), ROUNDING * result.robot.size, ROUNDING)
+    errors = {title: np.where(abs(v) < rounding, 0.0, v) for title, v in errors.items()}
     return [
         (f"{NOTE} {title} {name}", result.robot.get_unit(dimension), values[:, k])
         for title, values in errors.items()

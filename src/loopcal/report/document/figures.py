@@ -111,7 +111,7 @@ def draw_validation_picture(record: CalibrationRecord) -> Iterator[Element]:
 
 
 def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
-    """Yield the errors of heights over the bed before and after; of many heights none."""
+    """Yield the errors of heights over x and y before and after; of many heights none."""
     heights = record.heights
     if heights is None:
         return
@@ -121,8 +121,8 @@ def draw_height_picture(record: CalibrationRecord) -> Iterator[Element]:
     yield make_picture(
         draw_height_errors(heights),
         "height-figure",
-        "Height errors over the bed before and after calibration.",
-        "Each point is a measured height at its place over the bed; its color is the error, "
+        "Height errors over x and y before and after calibration.",
+        "Each point is a measured height at its place x, y; its color is the error, "
         "predicted minus measured, with the same scale before and after calibration. Circles were "
         "used in the fit, squares were held out.",
     )

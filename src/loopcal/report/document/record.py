@@ -53,7 +53,7 @@ class CalibrationRecord:
     posterior : of a fit that converged; None where the run has none.
     validation : errors at held-out poses; None without any, or where an older version wrote the
         run.
-    heights : errors of measured heights over the bed; None without any.
+    heights : errors of measured heights; None without any.
     residuals : of every kind; none where an older version wrote the run.
     controllers : the values for controllers that can store them.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of measured heights over the bed, before and after calibration."""
+"""Errors of measured heights over x and y, before and after calibration."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ AREA, MARGIN = 110.0, 0.16
 
 
 def draw_height_errors(heights: HeightErrors) -> Figure:
-    """Draw the errors of heights as points of the bed, before and after, with one scale of colors.
+    """Draw the errors of heights over x and y, before and after, with one scale of colors.
 
     Circles are points of the fit, squares are held out.
     """
@@ -53,7 +53,7 @@ def draw_height_errors(heights: HeightErrors) -> Figure:
     bar.ax.set_ylabel(f"height error, predicted - measured [{symbol}]", fontsize=LABEL)
     add_legend(figure, _list_handles(heights))
     count = len(heights.poses)
-    return finish_figure(figure, f"Height errors at {count} points of the bed")
+    return finish_figure(figure, f"Height errors at {count} points")
 
 
 def _draw_panel(axes: Axes, heights: HeightErrors, name: str, limit: float) -> Any:

@@ -62,8 +62,8 @@ def build_error_section(record: CalibrationRecord) -> Section:
 
 
 def build_height_section(record: CalibrationRecord) -> Section:
-    """Return the errors of heights over the bed, where heights were measured."""
-    heights, title = record.heights, "Height errors over the bed"
+    """Return the errors of heights over x and y, where heights were measured."""
+    heights, title = record.heights, "Height errors"
     if heights is None:
         return Section("heights", title, ())
     tables = (build_height_summary(heights), build_height_map(heights))
