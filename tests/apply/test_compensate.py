@@ -166,10 +166,10 @@ def test_no_error_is_stated_where_the_machine_does_not_get_to_a_pose():
         assert np.isnan(result.remaining[1]).all() or mode == "commands"
 
 
-@pytest.mark.parametrize("name", ["3-prs", "linear-delta"])
+@pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
 def test_file_states_errors_that_are_rounding_as_0(name) -> None:
     robot = make_identified_robot(name)
-    result = compensate(robot, sample_workspace(robot, 8, 2).coordinates)
+    result = compensate(robot, sample_workspace(robot, 8, 2).coordinates, "commands")
     header, *rows = csv.reader(format_compensation(result).splitlines())
     is_note = [title.startswith("note ") and title != "note status" for title in header]
     stated = np.array(rows)[:, is_note].astype(float)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal import load_robot
 from loopcal.errors import MechanismError
 from loopcal.mechanism import Actuator, Address, Joint, Limb, LinearMap, Link, build
 from loopcal.parameters import Parameter
@@ -127,6 +128,20 @@ INVALID_ASSEMBLIES = {
         r"the loops of hexapod cannot be closed at its home pose: .* mm stay open",
     ),
 }
+
+
+def test_singular_home_is_called_singular_and_its_actuators_are_named(root, tmp_path) -> None:
+    """Arm and rod of every limb are in one line: 300 mm - 75 mm = 112.5 mm + 112.5 mm."""
+    text = (root / "src" / "loopcal" / "robots" / "3-rrr.yaml").read_text("utf-8")
+    stretched = text.replace("tip: [180, 0, 0]", "tip: [112.5, 0, 0]")
+    stretched = stretched.replace("length: 180", "length: 112.5").replace(
+        "start: 129", "start: 180"
+    )
+    (tmp_path / "robot.yaml").write_text(stretched, "utf-8")
+    sentence = "home pose is singular: there, q1, q2 and q3 do not move the platform"
+    with pytest.raises(MechanismError, match=sentence) as error:
+        load_robot(tmp_path / "robot.yaml")
+    assert "stay open" not in str(error.value)
 
 
 @pytest.mark.parametrize("case", INVALID_ASSEMBLIES)

@@ -20,7 +20,12 @@ from loopcal.mechanism.batch_kinematics import (
     count_shared_drives,
     inverse_trials,
 )
-from loopcal.mechanism.mobility import check_mobility, find_idle_joints, refuse_uncontrolled
+from loopcal.mechanism.mobility import (
+    check_mobility,
+    find_idle_joints,
+    refuse_singular_home,
+    refuse_uncontrolled,
+)
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.possible_values import check_nominal_values
@@ -321,6 +326,7 @@ def _find_home(robot: Mechanism) -> State:
     if state.status[0, 0] != engine.CONVERGED:
         if not shared:
             refuse_uncontrolled(robot, robot.home_state)
+        refuse_singular_home(robot, state)
         raise MechanismError(
             f"the loops of {robot.name} cannot be closed at its home pose: "
             f"{state.residual[0, 0] * 1e3:.3g} mm stay open; check the joint centers, the lengths "

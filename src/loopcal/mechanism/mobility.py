@@ -23,11 +23,18 @@ from loopcal.mechanism.platform_coordinates import (
 from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.states import driven_values
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 RANK = 1e-9
 """Relative size below which a singular value at home counts as zero.
 
 Real margins are above 1e-4, rounding is below 1e-13.
+"""
+CLOSED = 1e-9
+"""Gap of the loops, as a share of the robot's size, below which they are closed."""
+STRETCHED = 1e-5
+"""Motion of a loop's closure by an actuator, as a share of the robot's size or per unit of stroke,
+below which the actuator does not move it. An iteration ends this far from a singular position.
 """
 MAIN_SHARE = 0.3
 """Components below this share of the largest one are left out of the description of a motion."""
@@ -126,6 +133,26 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
     if _count_rank(s) < len(scale):
         raise MechanismError(_word_dependent(robot, len(robot.controlled)))
+
+
+def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
+    """Refuse a home pose at which the loops are closed, but the iteration does not converge.
+
+    state : (1, 1). Raises MechanismError, which names the actuators that move nothing there.
+    """
+    if not state.residual[0, 0] < CLOSED * robot.size:
+        return
+    program, e = robot.program, robot.slots(robot.values[None])[0]
+    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    motion = np.linalg.norm(stack_driven_columns(program, blocks)[0, 0], axis=0)
+    turns = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    is_idle = motion < STRETCHED * np.where(turns, robot.size, 1.0)
+    finding = report_finding(
+        "mechanism.singular-home",
+        name=robot.name,
+        actuators=tuple(a.name for a, idle in zip(robot.actuators, is_idle, strict=True) if idle),
+    )
+    raise MechanismError(finding)
 
 
 def _differentiate_controlled(robot: Mechanism, T: FloatArray) -> FloatArray:
