@@ -132,6 +132,11 @@ class Compensation(TableResult):
         """(n,) targets to which the machine can be sent."""
         return np.array([r in (Reach.REACHED, Reach.IN_PART) for r in self.reach])
 
+    def drop_rounding(self, errors: FloatArray) -> FloatArray:
+        """Return errors (n, 6) [rad, m] with 0 for those that are rounding."""
+        rounding = ROUNDING * np.repeat([1.0, self.robot.size], 3)
+        return np.where(np.abs(errors) < rounding, 0.0, errors)
+
     def __str__(self) -> str:
         """Return how many targets are reached, and the findings of those that are not."""
         usable = self.usable

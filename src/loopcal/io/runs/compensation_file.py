@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from loopcal.apply.compensation import ROUNDING
 from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import format_header, format_row, read_table, require_columns
 from loopcal.io.core.numbers import format_exact
@@ -104,8 +103,7 @@ def _list_errors(result: Compensation) -> list[tuple[str, Unit, FloatArray]]:
     if result.uncertainty is not None:
         errors["U"] = result.uncertainty.expanded
     dimensions = [Dimension.LENGTH if name in "xyz" else Dimension.ANGLE for name in NAMES]
-    rounding = np.where(np.isin(NAMES, list("xyz")), ROUNDING * result.robot.size, ROUNDING)
-    errors = {title: np.where(abs(v) < rounding, 0.0, v) for title, v in errors.items()}
+    errors = {title: result.drop_rounding(values) for title, values in errors.items()}
     return [
         (f"{NOTE} {title} {name}", result.robot.get_unit(dimension), values[:, k])
         for title, values in errors.items()
