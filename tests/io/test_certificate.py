@@ -175,6 +175,15 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
         unit = r"\metre" if row["unit"] == "mm" else r"\radian"
         assert read_text(quantity, "si:real/si:unit") == unit
     assert read_text(root, ".//dcc:metaData/dcc:conformity") == "pass"
+    verdict, limit = (e.text for e in root.findall(".//dcc:declaration/dcc:content", NAMES))
+    content = json.loads((run / "result.json").read_text("utf-8"))
+    assert verdict.startswith(content["headline"])
+    assert content["expected_error"]["finding"]["text"] in verdict
+    assert "do not cover errors that did not act" in verdict
+    warnings = [f["text"] for f in content["findings"] if f["severity"] == "warning"]
+    assert all(text in verdict for text in warnings)
+    judged = content["validation"]["conformity"]["position"]
+    assert f"guard band {judged['guard_band']!r} m" in limit
 
 
 @pytest.mark.parametrize(

@@ -359,6 +359,32 @@ def test_unknown_frame_of_errors_is_refused_before_the_fit(robot, data):
         calibrate(robot, data, CalibrationOptions(frame="laser"))
 
 
+def test_next_step_after_a_limit_is_what_would_help():
+    missing = report_finding("gates.limit-not-measured", quantity="orientation")
+    step = choose_next_step(Verdict.NOT_CALIBRATED, (missing,), (), APPLY)
+    assert str(step) == "Measure orientation as well, or omit its limit."
+    sizes = {"error": Quantity(0.024, "mm"), "limit": Quantity(0.02, "mm")}
+    exceeded = report_finding(
+        "gates.limit-exceeded", quantity="position", pose="32", target="", **sizes
+    )
+    sizes = dict.fromkeys(
+        ("estimate", "expanded", "low", "high", "limit", "guard_band", "acceptance_limit"),
+        Quantity(0.003, "mm"),
+    )
+    conforms = report_finding(
+        "conformity.conforms", quantity="position", count=12, probability=0.98, level=0.95, **sizes
+    )
+    step = choose_next_step(Verdict.NOT_CALIBRATED, (exceeded, conforms), (), APPLY)
+    assert step.code == "workflow.next-less-noise"
+    both = (exceeded, missing, conforms)
+    assert (
+        choose_next_step(Verdict.NOT_CALIBRATED, both, (), APPLY).code
+        == "workflow.next-measure-more"
+    )
+    step = choose_next_step(Verdict.NOT_CALIBRATED, (exceeded,), (), APPLY)
+    assert step.code == "workflow.next-measure-more"
+
+
 def test_next_step_after_an_exceeded_limit_names_repeatability_that_no_calibration_reduces():
     sizes = {"error": Quantity(0.24, "mm"), "limit": Quantity(0.05, "mm")}
     failure = report_finding(

@@ -316,7 +316,8 @@ def _find_distribution(errors: FloatArray, noise: FloatArray) -> Callable[[float
         tail = compute_chi_square_tail(degrees, np.maximum((limit**2 - mean) / unit + degrees, 0.0))
         tail = np.where(is_exact, mean > limit**2, tail)
         with np.errstate(divide="ignore"):
-            return float(np.exp((count * np.log1p(-tail)).sum(axis=1)) @ weight)
+            total = float(np.exp((count * np.log1p(-tail)).sum(axis=1)) @ weight)
+        return min(total, 1.0)  # the weights add up to one but for rounding
 
     return probability
 

@@ -113,8 +113,9 @@ def find_measured_frames(
     ----------
     problem, data : measurements. start : near the poses and setup parameters.
     prior : an earlier calibration, which may determine frames that these measurements do not.
-    linearization : there; without it the frames of the instruments are not described.
-    noise : variance of the whitened rows. solution : poses there, where they are solved already.
+    linearization : there; without it the unknown frames of instruments are not described.
+    noise : variance of the whitened rows; where it is not finite, they are not described either.
+    solution : poses there, where they are solved already.
     """
     readings = data.readings
     if len(readings) > MOST_READINGS:
@@ -127,7 +128,8 @@ def find_measured_frames(
     unfixed = find_unfixed_motions(problem, *located, nuisance)
     if prior is not None and prior.unfixed is not None:
         unfixed = intersect_motions(unfixed, prior.unfixed)
-    eliminated = None if linearization is None else linearization.nuisance
+    is_known = np.isfinite(noise)  # not that of a fit that did not converge
+    eliminated = None if linearization is None or not is_known else linearization.nuisance
     local = None if problem.nuisance is None else problem.nuisance.local
     frames = _describe_instruments(problem.free, data, local, eliminated, noise)
     if np.linalg.norm(unfixed[:6]) > UNFIXED:

@@ -22,6 +22,13 @@ READING_NOISE = (
 )
 """Sentence for robots whose readings are uncertain."""
 
+COMMANDED = (
+    "These errors and the statements on limits compare predicted with measured poses at the same "
+    "readings. The actuators cannot correct all of the measured error: with the calibrated values "
+    "a controller still misses commanded poses by {errors} (rms)."
+)
+"""Sentence for robots whose geometric errors also move what they cannot command."""
+
 SIMILAR = 5e-3
 """Relative difference up to which two errors are called equal."""
 
@@ -126,6 +133,21 @@ def is_fully_compensable(validation: Validation) -> bool:
     )
 
 
+def describe_commanded(validation: Validation) -> str:
+    """Return by how much commanded poses are missed after calibration, as a sentence; empty where
+    the actuators can correct all of the measured error.
+    """
+    if not validation.quantities or is_fully_compensable(validation):
+        return ""
+    shown = []
+    for quantity in validation.quantities:
+        statistics = validation.commanded_after.statistics(quantity)
+        unit = validation.units[quantity]
+        if statistics.count and math.isfinite(statistics.rms):
+            shown.append(f"{format_number(statistics.rms / unit.factor_to_si, 3)} {unit.symbol}")
+    return COMMANDED.format(errors=" and ".join(shown)) if shown else ""
+
+
 def describe_improvements(validation: Validation) -> list[str]:
     """Return how much each error changed by calibration, as lines."""
     if validation.judged < FEW_ROWS:
@@ -162,7 +184,9 @@ def view_errors(validation: Validation, what: str, with_before: bool = True) -> 
             blocks.append(build_error_summary(rest, caption, with_before))
         else:
             blocks += build_kind_summary(rest, caption, with_before)
-    return [*blocks, *(str(f) for f in validation.findings if f.code.startswith(CONFORMITY))]
+    judged = [str(f) for f in validation.findings if f.code.startswith(CONFORMITY)]
+    commanded = describe_commanded(validation) if with_before else ""
+    return [*blocks, *judged, *([commanded] if commanded else [])]
 
 
 def view_validation(validation: Validation, with_before: bool, verbose: bool) -> list[Block]:

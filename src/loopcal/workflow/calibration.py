@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
@@ -51,6 +52,12 @@ NOTHING_TO_COMPARE = (
 )
 """Codes of data that leave nothing to compare: all values locate the poses, or the initial geometry
 reaches none of these."""
+
+NO_GAIN = "model.no-expected-gain"
+"""Finding that a calibration is not expected to improve on the tolerances."""
+
+UNUSUAL_NOISE = 10.0
+"""Factor on sigma from which an estimated noise is no property of an instrument."""
 
 STEPS = 8
 """Steps that the progress callback counts: conventions, model, fit, what the residuals add to the
@@ -208,16 +215,18 @@ def _report(
     start = check_start_values(fit)
     stored = options.compare_with
     comparison = None if stored is None else compare_with_values(fit, stored)
+    examined = () if examination is None else examination.findings
     findings = [
         *_report_conventions(conventions),
         *_report_fit(fit),
+        *_report_unexplained(fit, examined),
         *impossible,
         *(_report_validation(errors, held_out is not None) if fit.converged else ()),
         *_report_repeats(split),
         *_check_instruments(split),
         *_report_freedoms(fit),
         start.finding,
-        *(() if examination is None else examination.findings),
+        *examined,
         *(() if result.choice is None else (result.choice.finding,)),
         *(() if comparison is None else (comparison.outcome,)),
     ]
@@ -286,6 +295,18 @@ def _report_fit(fit: Identification) -> list[Finding]:
         "fit.unidentifiable": Severity.INFO,
     }
     return [replace(f, severity=severities.get(f.code, f.severity)) for f in fit.findings]
+
+
+def _report_unexplained(fit: Identification, examined: Iterable[Finding]) -> list[Finding]:
+    """Return whether an estimated noise takes in the whole of measurements that do not fit.
+
+    Residuals contradict no noise that they determine themselves.
+    """
+    test = fit.residual_test
+    is_unusual = test.noise != "given" and test.sigma_scale >= UNUSUAL_NOISE
+    if not is_unusual or all(finding.code != NO_GAIN for finding in examined):
+        return []
+    return [report_finding("fit.explains-nothing", scale=test.sigma_scale)]
 
 
 def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Finding]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from enum import Enum
 
 from loopcal.findings import Finding, Severity, report_finding
@@ -24,6 +25,12 @@ TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", *TOO_FEW_HELD_OUT, BLUNDE
 
 LIMIT_EXCEEDED = "gates.limit-exceeded"
 """Finding that an error is above a stated limit."""
+
+LIMIT_NOT_MEASURED = "gates.limit-not-measured"
+"""Finding that a limit was stated for something that no row measures."""
+
+CONFORMS = "conformity.conforms"
+"""Finding that an error without the noise of its measurement keeps a limit."""
 
 SIGN_UNDECIDED = "conventions.height-sign-undecided"
 """Finding that heights fit with either sign: the wrong one leads to the wrong geometry."""
@@ -66,9 +73,9 @@ def decide_verdict(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict that findings lead to.
 
     1. Not calibrated: any failure. Failures are a fit that did not converge, a geometry that
-       reaches no held-out pose, residuals that contradict the stated noise, errors on held-out
-       poses that grew by more than 10 % and beyond noise (without poses that do not fit), and a
-       limit that is exceeded at any held-out pose.
+       reaches no held-out pose, residuals that contradict the stated noise, an estimated noise
+       that explains everything, errors on held-out poses that grew by more than 10 % and beyond
+       noise (without poses that do not fit), and a limit that is exceeded at any held-out pose.
     2. Undecided: no pose was held out, or too few to judge an error, or the setup parameters that
        were fitted to them leave no measured value to check, or poses that do not fit dominate the
        errors.
@@ -129,12 +136,33 @@ def choose_next_step(
         if any(finding.code in DEPENDENT for finding in findings):
             return report_finding("workflow.next-check-residuals")
         return report_finding("workflow.next-check-noise")
-    for finding in findings:
-        quantity = str(finding.data.get("quantity", ""))
-        share = (repeatability or {}).get(quantity, 0.0)
-        if failed == {finding.code} == {LIMIT_EXCEEDED} and share > 0.5:
+    limits = _choose_limit_step(failed, findings, repeatability or {})
+    return limits or report_finding("workflow.next-measure-more")
+
+
+def _choose_limit_step(
+    failed: AbstractSet[str], findings: Sequence[Finding], repeatability: Mapping[str, float]
+) -> Finding | None:
+    """Return the next step where only limits fail; None without a better one than to measure more.
+
+    Parameters
+    ----------
+    failed : codes of the failures. repeatability : see `choose_next_step`.
+    """
+    of_limits = [f for f in findings if f.code in (LIMIT_NOT_MEASURED, LIMIT_EXCEEDED)]
+    quantities = [str(f.data["quantity"]) for f in of_limits]
+    listed = " and ".join(quantities)
+    if failed == {LIMIT_NOT_MEASURED}:
+        return report_finding("workflow.next-measure-quantity", quantity=listed)
+    if failed != {LIMIT_EXCEEDED}:
+        return None
+    if set(quantities) <= {f.data["quantity"] for f in findings if f.code == CONFORMS}:
+        return report_finding("workflow.next-less-noise", quantity=listed)
+    for quantity in quantities:
+        share = repeatability.get(quantity, 0.0)
+        if share > 0.5:
             return report_finding("workflow.next-improve-machine", share=share, quantity=quantity)
-    return report_finding("workflow.next-measure-more")
+    return None
 
 
 def _choose_validation(findings: Sequence[Finding], recommendation: str) -> str:

@@ -29,6 +29,17 @@ VERSION = "3.3.0"
 PROBABILITY = 0.95
 """Coverage probability of the stated intervals."""
 
+SCOPE = (
+    "The results concern the geometry in the region and under the conditions of the measured "
+    "poses. They do not cover errors that did not act during the measurement, such as those of "
+    "other loads, temperatures or speeds."
+)
+PREDICTED = (
+    "The error is that of predicted poses at the recorded readings, without the noise of the "
+    "measurement."
+)
+"""What the results and the statements on limits are about."""
+
 UNITS = {Dimension.LENGTH: r"\metre", Dimension.ANGLE: r"\radian"}
 """Dimension -> unit in the D-SI; ratios have the unit one."""
 
@@ -71,7 +82,7 @@ def format_certificate(run: Run, administration: Administration) -> str:
     _add_software(_add(result, "usedSoftware"), run)
     _add_instruments(result, run.result.get("instruments") or [])
     _add_results(_add(result, "results"), run.result)
-    _add_conformity(result, run.result)
+    _add_statements(_add(result, "measurementMetaData"), run.result)
     indent(root)
     return tostring(root, "unicode", xml_declaration=False).join(
         ['<?xml version="1.0" encoding="UTF-8"?>\n', "\n"]
@@ -243,21 +254,29 @@ def _add_quantity(
         SubElement(uncertainty, f"{{{SI}}}{key}").text = repr(float(number))
 
 
-def _add_conformity(parent: Element, content: Mapping[str, Any]) -> None:
-    """Add the statement on each limit."""
+def _add_statements(parent: Element, content: Mapping[str, Any]) -> None:
+    """Add the verdict with what it is subject to, and the statement on each limit."""
+    stated = [f for f in content.get("findings") or () if f["severity"] == "warning"]
+    expected = (content.get("expected_error") or {}).get("finding")
+    if expected and content.get("states_expected_error"):
+        stated.append(expected)
+    headline = content.get("headline")  # absent in runs of earlier versions
+    sentences = [*([headline] if headline else []), *(f["text"] for f in stated)]
+    verdict = _add(parent, "metaData")
+    _add_text(verdict, "name", "Verdict, warnings and expected error")
+    _add_text(verdict, "declaration", " ".join((*sentences, SCOPE)))
     judged = ((content.get("validation") or {}).get("conformity")) or {}
-    if not judged:
-        return
-    listed = _add(parent, "measurementMetaData")
     for quantity, stated in judged.items():
-        meta = _add(listed, "metaData")
+        meta = _add(parent, "metaData")
         unit = "m" if quantity == "position" else "rad"
         _add_text(meta, "name", f"Conformity of the largest {quantity} error at held-out poses")
         _add(meta, "norm", "ISO 14253-1:2017")
         declaration = (
             f"Estimate {stated['estimate']!r} {unit}, expanded uncertainty {stated['expanded']!r} "
-            f"{unit}, limit {stated['limit']!r} {unit}, probability of conformity "
-            f"{stated['probability']!r}; conformity is accepted from {stated['level']!r}"
+            f"{unit}, limit {stated['limit']!r} {unit}, guard band {stated['guard_band']!r} "
+            f"{unit}, acceptance limit {stated['acceptance_limit']!r} {unit}, probability of "
+            f"conformity {stated['probability']!r}; conformity is accepted from "
+            f"{stated['level']!r}. {PREDICTED}"
         )
         _add_text(meta, "declaration", declaration)
         _add(meta, "conformity", CONFORMITY[stated["decision"]])

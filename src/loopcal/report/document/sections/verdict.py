@@ -9,6 +9,7 @@ from typing import Any
 from loopcal.report.budget_view import build_share_table
 from loopcal.report.document.elements import Element, Listing, Section
 from loopcal.report.document.record import CalibrationRecord
+from loopcal.report.validation_view import describe_commanded
 from loopcal.workflow import Verdict
 
 MEANING = {
@@ -57,6 +58,8 @@ def build_verdict_section(record: CalibrationRecord) -> Section:
     judged = [f for f in record.findings if f["code"].startswith(CONFORMITY)]
     if judged:
         elements.append(list_findings(judged))
+        commanded = "" if record.validation is None else describe_commanded(record.validation)
+        elements += [commanded] if commanded else []
     important = [f for f in select_important(record.findings) if f not in judged]
     if important:
         elements.append(list_findings(important))

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine with fewer actuators than coordinates: its limits are no limits on commanded poses."""
+
+import re
+
+import numpy as np
+
+import loopcal as lc
+from loopcal.measure import Instrument, Pose, Sensor, sample_truth, simulate
+from loopcal.mechanism import sample_workspace
+from loopcal.report.calibration_view import view_calibration
+from loopcal.report.text_page import render_text
+from loopcal.report.validation_view import describe_commanded
+from tests.estimate.problems import UM, URAD, noise
+
+
+def calibrate_drawn(name: str) -> lc.CalibrationReport:
+    """Return the calibration of a machine drawn from its tolerances, against a limit of 20 um."""
+    robot = lc.load_robot(name)
+    machine = robot.with_values(sample_truth(robot, 1, 3)[0])
+    instrument = Instrument((Sensor(Pose(), noise(*[20 * URAD] * 3, *[5 * UM] * 3)),))
+    poses = sample_workspace(robot, 30, 7).coordinates
+    options = lc.CalibrationOptions(hold_out=0.25, limit_position=20 * UM)
+    return lc.calibrate(robot, simulate(machine, poses, instrument, 1), options)
+
+
+def test_report_of_a_tripod_says_that_commanded_poses_are_still_missed(tmp_path) -> None:
+    report = calibrate_drawn("3-prs")
+    errors = report.validation
+    assert errors is not None
+    assert any(finding.code == "conformity.conforms" for finding in report.findings)
+    sentence = describe_commanded(errors)
+    rms = 1e3 * np.sqrt(np.mean(errors.commanded_after.position**2))  # [mm]
+    (stated,) = re.findall(r"misses commanded poses by ([0-9.]+) mm", sentence)
+    assert abs(float(stated) - rms) < 1e-2 * rms
+    assert rms > 10.0 * 0.02  # [mm] far above the limit that the predicted poses keep
+    text = " ".join(render_text(view_calibration(report), 100).split())
+    assert sentence in text
+    lc.write_report(tmp_path / "report.html", report)
+    assert (tmp_path / "report.html").read_text("utf-8").count(sentence) == 2  # verdict, errors
+
+
+def test_a_machine_that_can_correct_everything_has_no_such_sentence() -> None:
+    errors = calibrate_drawn("hexapod-42").validation
+    assert errors is not None
+    assert describe_commanded(errors) == ""
