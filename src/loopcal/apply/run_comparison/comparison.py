@@ -67,7 +67,7 @@ class RunComparison(TableResult):
         return any(answers) if answers else None
 
     def plot(self) -> Figure:
-        """Draw the estimates of all runs with their 95 % intervals, and the tested shifts."""
+        """Draw the tested shift of each parameter from the first run, in standard deviations."""
         return draw("draw_run_shifts", self)
 
     def __str__(self) -> str:

@@ -22,7 +22,7 @@ from loopcal.report.notebook.records import (
 from loopcal.report.run_comparison_view import find_shift
 from loopcal.units import SI_SYMBOLS
 
-PARAMETER, VISITED, SOURCE, ROW = "parameter", "visited", "source", "row"
+PARAMETER, SOURCE, ROW = "parameter", "source", "row"
 
 
 @collect_records.register
