@@ -58,7 +58,7 @@ class PointCheck:
     renamed : (row, target) of points and the (row, target) whose prediction they fit.
     far : (row, target) of points that fit no prediction, and their distance [m].
     moved_before : first row after the instrument has moved; None where it stood still.
-    move_gain : ratio of the distances with one instrument frame to those with two, 0 without a move.
+    move_gain : ratio of the distances with one instrument frame to those with two; 0: no move.
         Between `DOUBTED` and `MOVED` the move is likely, but geometric errors hide it.
     shift : 1 where the points of each row fit the row before, -1 where they fit the next one.
     shifted_from : first row whose name is shifted.
