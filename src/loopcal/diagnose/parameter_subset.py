@@ -110,6 +110,28 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
     """Choose a minimal set of parameters for what measurements determine.
 
     The result has as many free parameters as the rank, and does not depend on the machine.
+
+    Parameters
+    ----------
+    identifiability : as from `identifiability(robot, data)`.
+
+    Returns
+    -------
+    IdentifiableSubset; its `robot` has the chosen parameters free and the others fixed at their
+    nominal values. Least squares can identify it.
+
+    Raises
+    ------
+    ArgumentTypeError : a robot or measurements in place of an identifiability.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> robot = lc.load_robot("five-bar")
+    >>> camera = lc.Instrument((lc.Sensor(lc.Component(("x", "y")), lc.Gaussian([2e-5, 2e-5])),))
+    >>> subset = lc.choose_identifiable_subset(lc.identifiability(robot, camera))
+    >>> len(subset.kept), int(subset.robot.parameters.free.sum())
+    (10, 10)
     """
     check_type(
         identifiability, Identifiability, "identifiability", "as from identifiability(robot, data)"

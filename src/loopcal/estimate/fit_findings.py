@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.methods.losses import Loss
+from loopcal.estimate.methods.losses import Loss, describe_loss
 from loopcal.estimate.methods.penalties import MAP, Method, Ridge
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
@@ -77,10 +77,14 @@ def report_weights(data: Measurements, weights: FloatArray, loss: Loss | None) -
         return []
     low = tuple(data.labels[i] for i in np.flatnonzero(weights < LOW_WEIGHT))
     if not low:
-        return [report_finding("fit.full-weights", loss=repr(loss), total=data.n_poses)]
+        return [report_finding("fit.full-weights", loss=describe_loss(loss), total=data.n_poses)]
     return [
         report_finding(
-            "fit.low-weights", loss=repr(loss), count=len(low), total=data.n_poses, poses=low
+            "fit.low-weights",
+            loss=describe_loss(loss),
+            count=len(low),
+            total=data.n_poses,
+            poses=low,
         )
     ]
 

@@ -137,7 +137,8 @@ class Plan(TableResult):
     Attributes
     ----------
     robot : at the values for which the plan was made. instrument : what will measure.
-    options : of the plan. poses : in the order of visiting.
+    options : of the plan. poses : in the order of visiting, with `labels`, `coordinates` (m, c) and
+        `readings` (m, a) [m, rad], and `held_out` (m,); `simulate` takes `poses.coordinates`.
     quality : of the choice. errors : expected over the workspace.
     notes : findings on assumptions and exclusions.
     curve : expected errors by the number of poses, where requested.

@@ -86,6 +86,34 @@ class Tukey:
         return (1.0 - share**2) ** 2
 
 
+def weigh_blocks(loss: Loss, distance: FloatArray, degrees: FloatArray) -> FloatArray:
+    """Return the weights (u,) that a loss gives to blocks; a user may have written it.
+
+    Raises
+    ------
+    EstimationError : not one finite weight of at least 0 for each block.
+    """
+    weight = np.asarray(loss.weight(distance, degrees), dtype=np.float64)
+    if weight.shape != distance.shape:
+        raise EstimationError(
+            f"the loss {describe_loss(loss)} returned weights of shape {weight.shape} for "
+            f"{len(distance)} blocks; its function weight must return one number for each block"
+        )
+    wrong = np.flatnonzero(~(np.isfinite(weight) & (weight >= 0.0)))
+    if len(wrong):
+        raise EstimationError(
+            f"the loss {describe_loss(loss)} returned the weight {weight[wrong[0]]:.3g} at the "
+            f"distance {distance[wrong[0]]:.3g}; weights must be finite and not negative"
+        )
+    return weight
+
+
+def describe_loss(loss: Loss) -> str:
+    """Return the name of a loss: its own `repr`, or that of a class that defines none."""
+    has_own = type(loss).__repr__ is not object.__repr__
+    return repr(loss) if has_own else type(loss).__name__
+
+
 def block_limit(single: float, degrees: FloatArray) -> FloatArray:
     """Return the limit (u,) of a block's norm with the exceedance probability of `single`.
 

@@ -127,7 +127,7 @@ class TruncatedSVD(Method):
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return 0 for the first k directions within the rank, infinity for the others."""
-        k = np.atleast_1d(np.asarray(self.k(decomposition) if callable(self.k) else self.k))
+        k = _apply_rule(self.k, decomposition) if callable(self.k) else np.atleast_1d(self.k)
         first = np.arange(decomposition.singular_values.shape[1]) < k[:, None]
         return np.where(first & decomposition.used, 0.0, np.inf)
 
@@ -192,10 +192,8 @@ class Ridge(Method):
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return lam for every direction; with lam = 0 directions beyond the rank are not used."""
         lam = 1.0 if isinstance(self.lam, tuple) else self.lam
-        lam = np.atleast_1d(
-            np.asarray(lam(decomposition) if callable(lam) else lam, dtype=np.float64)
-        )
-        return _penalize(decomposition, lam)
+        values = _apply_rule(lam, decomposition) if callable(lam) else np.atleast_1d(lam)
+        return _penalize(decomposition, values)
 
     def prior_variance(
         self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
@@ -285,7 +283,7 @@ class MAP(Method):
         rule = self.inflation
         if not callable(rule):
             return np.full(len(decomposition.rows), rule)
-        return np.asarray(rule(decomposition.divided(self.sigma(decomposition))), dtype=np.float64)
+        return _apply_rule(rule, decomposition.divided(self.sigma(decomposition)))
 
     def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
         """Return the factor (t,) on all tolerances that the penalty (t, p) of a fit contains; 1
@@ -315,6 +313,19 @@ class MAP(Method):
         left = decomposition.rows - decomposition.rank
         enough = (left >= FEWEST_DEGREES) & (decomposition.unexplained > 0.0)
         return np.sqrt(np.where(enough, decomposition.unexplained / np.maximum(left, 1), 1.0))
+
+
+def _apply_rule(rule: Rule, decomposition: Decomposition) -> FloatArray:
+    """Return what a rule chooses, (t,) or (1,); EstimationError where it is no number of that."""
+    value = np.atleast_1d(np.asarray(rule(decomposition), dtype=np.float64))
+    trials = len(decomposition.singular_values)
+    if value.shape not in {(1,), (trials,)} or not np.all(np.isfinite(value) & (value >= 0.0)):
+        name = getattr(rule, "__name__", type(rule).__name__)
+        raise EstimationError(
+            f"the rule {name} returned {np.array2string(value, threshold=6)} for {trials} fits; "
+            "return one finite number of at least 0 for each fit, as an array (t,)"
+        )
+    return value
 
 
 def _penalize(decomposition: Decomposition, lam: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.linearization import Start
-from loopcal.estimate.methods.losses import Huber, Loss, Tukey
+from loopcal.estimate.methods.losses import Huber, Loss, Tukey, weigh_blocks
 from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.chi_square import compute_chi_square_quantile
@@ -160,7 +160,7 @@ def _reweight(
         )
         if estimate_scale:
             distance = distance / estimate_scale_of(distance, degrees)
-        weight = loss.weight(distance, degrees)[member]
+        weight = weigh_blocks(loss, distance, degrees)[member]
         if float(np.abs(weight - robust.weight).max()) <= change:
             break
         weighted = problem.weighted(weight)
