@@ -55,7 +55,7 @@ def test_a_wrong_result_of_an_own_rule_is_refused(five_bar, method, value) -> No
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(lc.EstimationError, match="rule choose returned .* for 1 fits"):
+        with pytest.raises(lc.EstimationError, match=r"rule choose returned .* for 1 fits"):
             lc.identify(*five_bar, method(choose))
 
 

@@ -26,7 +26,8 @@ def test_python_code_of_the_page_runs(root, tmp_path, monkeypatch) -> None:
     assert (tmp_path / "residuals.svg").stat().st_size > 10_000
     assert (tmp_path / "histogram.pdf").stat().st_size > 5_000
     place = names["panel"].get_tightbbox().transformed(names["figure"].dpi_scale_trans.inverted())
-    assert 0.0 <= place.x0 < 0.5 and 3.0 < place.x1 <= 88 / 25.4
+    assert 0.0 <= place.x0 < 0.5
+    assert 3.0 < place.x1 <= 88 / 25.4
     assert isinstance(names["frame"], pd.DataFrame)
     assert isinstance(names["arrays"], xr.Dataset)
     assert isinstance(names["fit"], lc.Identification)

@@ -167,7 +167,7 @@ def pose_uncertainty(
     ----------
     fit : the identification, or the posterior of a run folder.
     poses : (n, 4, 4) T_base_platform, (n, c) controlled coordinates [m, rad], or a solution of the
-        calibrated robot.
+        calibrated robot. Readings are not poses: pass `forward(fit.robot, readings)` for them.
     axes : of the components.
     frame : in which the errors are stated. "fitted": after the best rigid fit, over the measured
         poses, of the base and platform frames as far as the measurements do not determine them.

@@ -76,17 +76,10 @@ def report_weights(data: Measurements, weights: FloatArray, loss: Loss | None) -
     if loss is None:
         return []
     low = tuple(data.labels[i] for i in np.flatnonzero(weights < LOW_WEIGHT))
+    name, total = describe_loss(loss), data.n_poses
     if not low:
-        return [report_finding("fit.full-weights", loss=describe_loss(loss), total=data.n_poses)]
-    return [
-        report_finding(
-            "fit.low-weights",
-            loss=describe_loss(loss),
-            count=len(low),
-            total=data.n_poses,
-            poses=low,
-        )
-    ]
+        return [report_finding("fit.full-weights", loss=name, total=total)]
+    return [report_finding("fit.low-weights", loss=name, count=len(low), total=total, poses=low)]
 
 
 def report_used_poses(
