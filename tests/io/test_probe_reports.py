@@ -216,6 +216,16 @@ def test_the_offset_of_a_probe_may_be_in_another_file() -> None:
         ("m503.gcode", "Checking... AC (DRY-RUN)\n.  c:+0.1\n", "states no radius"),
         ("config.g", "G32 bed probe heights: 0.1 not set 0.2, mean 1\n", "a point that was not"),
         ("config.g", "G32 bed probe heights: 0.1 0.2, mean 1\n", "state no G30 P0"),
+        ("m503.gcode", "Bed X: 1,00 Y: 2,00 Z: 0,107\n", "report.txt:1: The numbers of"),
+        ("m503.gcode", "ok\nBed X: 1.00 Y: 2.00 Z: 0,107\n", "report.txt:2: The numbers of this"),
+        ("m503.gcode", "ok\nBed X: 1.00 Y: 2.\n", "cannot be read: 'Bed X: 1.00 Y: 2.'. Marlin"),
+        ("m503.gcode", "X:1,0 Y:2,0 Z:0,1 E:0,0 Count X:1\n", "with decimal points"),
+        ("config.g", "G32 bed probe heights: 0,1 0,2, mean 1\n", "cannot be read: '0,1 0,2'"),
+        (
+            "config.g",
+            "G30 P0 X0 Y0\nG30 P1 X9 Y0\nG30 P2 X0 Y9\nG32 bed probe heights: 0.1 0.2, mean 1\n",
+            "report.txt:4: G32 reports 2 heights, but the files state 3 points",
+        ),
         ("config.g", "RepRapFirmware height map file v2\nx\n", "rows and columns that it states"),
     ],
 )
@@ -251,3 +261,15 @@ def test_calibrate_says_what_to_type_for_a_configuration(name, words, capsys) ->
     assert words in err
     assert "type loopcal import FILE -o printer.yaml --data heights.csv" in err
     assert "then loopcal calibrate printer.yaml heights.csv -o run" in err
+
+
+def test_one_wrong_height_is_an_outlier_and_no_target_that_stands_still(capsys) -> None:
+    robot, truth = make_truth("m503.gcode")
+    heights = probe(robot, truth, POINTS)
+    write_g30([*POINTS, (10.0, -20.0)], [*heights, 9.999])
+    words = "--probes report.txt -o printer.yaml --data heights.csv --sigma-height 0.02mm"
+    assert run(f"import m503.gcode {words}") == 0
+    assert run("calibrate printer.yaml heights.csv -o run") == 2
+    captured = capsys.readouterr()
+    assert "never moves" not in captured.err
+    assert "Pose 14" in captured.out

@@ -49,7 +49,9 @@ FEWEST = 7
 """Points below which six numbers of a firmware cannot be determined and tested."""
 
 NUMBER = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
-SINGLE = re.compile(rf"Bed X:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}", re.IGNORECASE)
+SINGLE = re.compile(rf"Bed X:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}(?![\d.,])", re.IGNORECASE)
+TOUCH = re.compile(r"\bBed X:|^.*?\bX:\s*[-+]?\d*,\d+.*\bCount\b", re.IGNORECASE)
+"""A line that reports a point, whether or not its numbers can be read."""
 POSITION = re.compile(rf"^.*?\bX:\s*{NUMBER}\s*Y:\s*{NUMBER}\s*Z:\s*{NUMBER}\s.*\bCount\b")
 DRY_RUN = re.compile(r"Checking\.\.\. AC(?: at radius:\s*" + NUMBER + r")?.*\(DRY-RUN\)")
 CHECKING = re.compile(r"Checking\.\.\. AC")
@@ -148,6 +150,9 @@ def _read_marlin(texts: Mapping[Path, str]) -> list[ProbedPoint]:
                         report_finding("files.g33-unusable", reason=reason), path, i + 1
                     )
                 radius = float(dry[1])
+            elif TOUCH.search(line):
+                finding = report_finding("files.probe-line-unreadable", line=line.strip())
+                raise FileError(finding, path, i + 1)
             elif radius is not None and line.startswith("."):
                 probed += _read_ring(line, radius, len(probed))
             elif match := POSITION.match(line):
@@ -189,12 +194,18 @@ def _read_reprap(texts: Mapping[Path, str]) -> list[ProbedPoint]:
                 places[int(match[1])] = (float(match[2]), float(match[3]))
     for path, number, cells in reports:
         if not re.fullmatch(rf"(?:\s+{NUMBER})+\s*", cells):
-            raise FileError(report_finding("files.g32-failed"), path, number)
+            if re.search(r"not set|failed", cells, re.IGNORECASE):
+                raise FileError(report_finding("files.g32-failed"), path, number)
+            finding = report_finding("files.g32-unreadable", cells=cells.strip())
+            raise FileError(finding, path, number)
         heights = [float(cell) for cell in cells.split()]
         wanted = set(range(len(heights)))
         if not wanted <= set(places):
             missing = min(wanted - set(places))
             finding = report_finding("files.g32-no-points", count=len(heights), missing=missing)
+            raise FileError(finding, path, number)
+        if set(places) - wanted:
+            finding = report_finding("files.g32-too-few", count=len(heights), points=len(places))
             raise FileError(finding, path, number)
         start = len(points) + 1
         points += [
