@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.apply import HeightErrors, map_height_errors
-from loopcal.apply.height_errors import restore_heights, store_heights
+from loopcal.apply.height_errors import measures_only_heights, restore_heights, store_heights
 from loopcal.estimate import identify
 from loopcal.measure import Gaussian, Instrument, Measurements, Observations, Sensor, simulate
 from loopcal.measure.kinds import Component, Plane, Position
@@ -147,3 +147,17 @@ def test_heights_of_a_platform_that_rotates_are_no_map(heights) -> None:
         assert map_height_errors(fit, data, None) is None
     assert restore_heights(store_heights(heights), robot) is None
     assert "bed" not in str(heights)
+
+
+def test_heights_alone_do_not_test_fixed_lengths(report) -> None:
+    """A fixed angle of a tower defines the x axis: it is no length and not in the finding."""
+    (finding,) = (f for f in report.findings if f.code == "workflow.undetermined-scale")
+    assert finding.data["names"] == ("arm1.length", "arm2.length", "arm3.length")
+    data = report.split.fitted
+    (rows,) = data.observations
+    n = len(rows)
+    places = Observations.from_sigma(
+        Position().with_tool(np.eye(4)), range(n), np.zeros((n, 3)), 1e-5
+    )
+    assert measures_only_heights(data)
+    assert not measures_only_heights(replace(data, observations=(rows, places)))

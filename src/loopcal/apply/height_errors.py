@@ -177,6 +177,11 @@ def restore_heights(arrays: Mapping[str, np.ndarray], robot: Mechanism) -> Heigh
     return HeightErrors(labels, points, before, after, held_out, robot.get_unit(Dimension.LENGTH))
 
 
+def measures_only_heights(data: Measurements) -> bool:
+    """Return whether each row of the data measures one height, and nothing else was measured."""
+    return bool(data.observations) and all(_measures_height(o) for o in data.observations)
+
+
 def _measures_height(rows: Observations) -> bool:
     """Return whether each row measures one height: z of the tool, or the gap of one target."""
     kind = rows.kind

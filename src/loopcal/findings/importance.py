@@ -52,6 +52,7 @@ IMPORTANCE = (
     "residuals.heavy-tailed",
     "noise.doubtful",
     "noise.no-degrees-of-freedom",
+    "workflow.undetermined-scale",
     "noise.consistent",
     "noise.estimated",
     "outliers.none",

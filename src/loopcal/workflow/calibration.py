@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
+from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
     ConventionCheck,
@@ -38,6 +39,7 @@ from loopcal.measure import Measurements, check_instruments, fill_in_reading_sig
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
+from loopcal.units import Dimension
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import DataSplit, split_data
@@ -225,6 +227,7 @@ def _report(
         *_report_repeats(split),
         *_check_instruments(split),
         *_report_freedoms(fit),
+        *_report_scale(fit, fitted),
         start.finding,
         *examined,
         *(() if result.choice is None else (result.choice.finding,)),
@@ -348,6 +351,20 @@ def _check_instruments(split: DataSplit) -> list[Finding]:
     """Return the instruments that were not validly calibrated when they measured."""
     held_out = () if split.held_out is None else split.held_out.observations
     return check_instruments((*split.fitted.observations, *held_out))
+
+
+def _report_scale(fit: Identification, data: Measurements) -> list[Finding]:
+    """Return that heights do not test the fixed lengths from which x and y have their scale."""
+    if not fit.converged or not measures_only_heights(data):
+        return []
+    names = tuple(
+        parameter.name
+        for parameter, is_free in zip(
+            fit.robot.parameters.entries, fit.robot.parameters.free, strict=True
+        )
+        if not is_free and parameter.dimension is Dimension.LENGTH
+    )
+    return [report_finding("workflow.undetermined-scale", names=names)] if names else []
 
 
 def _report_freedoms(fit: Identification) -> list[Finding]:
