@@ -131,6 +131,9 @@ def prepare_exports(root: Path, data: Path) -> None:
     rows = (root / "examples" / "exports" / "poses.csv").read_text("utf-8").splitlines()
     rows = [row for row in rows if row and not row.startswith("#")]
     Path("lengths.txt").write_text("\n".join(row.replace(",", ";") for row in rows) + "\n")
+    copy_example(root, "hexapod-tracker", points_txt="points.txt", hexapod_yaml="hexapod.yaml")
+    Path("plan").mkdir()
+    shutil.copy(root / "examples" / "hexapod-tracker" / "sheet.csv", "plan/measurements.csv")
 
 
 def prepare_files(root: Path, data: Path) -> None:
@@ -153,6 +156,7 @@ def prepare_formats(root: Path, data: Path) -> None:
     shutil.copy(source / "robot.urdf", "robot.urdf")
     shutil.copy(source / "robot.yaml", "robot.yaml")
     copy_example(root, "cable-robot", samples_json="samples.json")
+    copy_example(root, "hexapod-tracker", machine_ini="machine.ini")
 
 
 PREPARATIONS: dict[str, Callable[[Path, Path], object]] = {
@@ -174,10 +178,12 @@ ALTERNATIVES = ("docs/exports.md", "docs/files.md", "docs/formats.md")
 """Pages whose commands show several ways to the same file; each replaces what is there."""
 
 OTHER_ROBOTS = {
+    "loopcal fill robot.yaml": "loopcal fill hexapod.yaml",
+    "loopcal export run --into machine.ini": "loopcal export hexapod.yaml --into machine.ini",
     "loopcal export run --format linuxcnc": "loopcal export hexapod.yaml --format linuxcnc",
     "loopcal export run --format urdf": "loopcal export robot-limbs.yaml --format urdf",
 }
-"""Commands of docs/formats.md with a run of another robot than those before them: here its file."""
+"""Commands with another robot, or a run of one, than those before them: here its file."""
 
 
 def adapt_commands(page: str, text: str) -> str:

@@ -58,7 +58,7 @@ def measure_error(controller: Mechanism, truth: Mechanism, added: FloatArray) ->
     wanted, true = (T[:, None, :3, :3] @ PLACES[:, :, None] for T in (commanded.T, reached))
     a = wanted[..., 0] + commanded.T[:, None, :3, 3]
     b = true[..., 0] + reached[:, None, :3, 3]
-    offset = np.zeros((len(PLACES), 3))
+    offset, fitted, moved = np.zeros((len(PLACES), 3)), b, a
     for _ in range(50):  # the base frame, and where each point is on the platform, in turn
         moved = a + (commanded.T[:, None, :3, :3] @ offset[:, :, None])[..., 0]
         F = align_point_sets(b.reshape(-1, 3), moved.reshape(-1, 3))

@@ -38,11 +38,11 @@ class Own:
 )
 def test_wrong_weights_of_an_own_loss_are_refused(five_bar, function, message) -> None:
     with np.errstate(all="ignore"), pytest.raises(lc.EstimationError, match=message):
-        lc.identify(*five_bar, loss=Own(function))
+        lc.identify(five_bar[0], five_bar[1], loss=Own(function))
 
 
 def test_an_own_loss_without_repr_is_called_by_its_class(five_bar) -> None:
-    fit = lc.identify(*five_bar, loss=Own(lambda d: 1.0 / np.maximum(d, 1.0)))
+    fit = lc.identify(five_bar[0], five_bar[1], loss=Own(lambda d: 1.0 / np.maximum(d, 1.0)))
     (finding,) = (finding for finding in fit.findings if finding.code.endswith("-weights"))
     assert finding.data["loss"] == "Own"
 
@@ -56,10 +56,12 @@ def test_a_wrong_result_of_an_own_rule_is_refused(five_bar, method, value) -> No
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(lc.EstimationError, match=r"rule choose returned .* for 1 fits"):
-            lc.identify(*five_bar, method(choose))
+            lc.identify(five_bar[0], five_bar[1], method(choose))
 
 
 @pytest.mark.parametrize("method", [lc.Ridge, lc.MAP])
 def test_one_number_of_an_own_rule_is_enough(five_bar, method) -> None:
-    by_rule = lc.identify(*five_bar, method(lambda decomposition: 2.0))
-    np.testing.assert_array_equal(by_rule.estimate, lc.identify(*five_bar, method(2.0)).estimate)
+    by_rule = lc.identify(five_bar[0], five_bar[1], method(lambda decomposition: 2.0))
+    np.testing.assert_array_equal(
+        by_rule.estimate, lc.identify(five_bar[0], five_bar[1], method(2.0)).estimate
+    )

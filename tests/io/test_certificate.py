@@ -175,7 +175,7 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
         unit = r"\metre" if row["unit"] == "mm" else r"\radian"
         assert read_text(quantity, "si:real/si:unit") == unit
     assert read_text(root, ".//dcc:metaData/dcc:conformity") == "pass"
-    verdict, limit = (e.text for e in root.findall(".//dcc:declaration/dcc:content", NAMES))
+    verdict, limit = (e.text or "" for e in root.findall(".//dcc:declaration/dcc:content", NAMES))
     content = json.loads((run / "result.json").read_text("utf-8"))
     assert verdict.startswith(content["headline"])
     assert content["expected_error"]["finding"]["text"] in verdict

@@ -98,6 +98,6 @@ def test_other_files_and_settings_are_refused(folder) -> None:
     (folder / "plan.csv").write_text("pose,q1 [mm]\n1,2\n")
     with pytest.raises(FileError, match="name the folder of a plan"):
         read_stops("plan.csv", robot)
-    for settings in ({"feed": 0.0}, {"feed": np.nan}, {"feed": 1.0, "pause": -1.0}):
+    for feed, pause in ((0.0, None), (np.nan, None), (1.0, -1.0)):
         with pytest.raises(DataError, match="finite number above 0"):
-            GcodeSettings(**settings)
+            GcodeSettings(feed, pause=pause)
