@@ -183,7 +183,7 @@ def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> Non
     warnings = [f["text"] for f in content["findings"] if f["severity"] == "warning"]
     assert all(text in verdict for text in warnings)
     judged = content["validation"]["conformity"]["position"]
-    assert f"guard band {judged['guard_band']!r} m" in limit
+    assert f"guard band {1e3 * judged['guard_band']:.3g} mm" in limit
 
 
 @pytest.mark.parametrize(

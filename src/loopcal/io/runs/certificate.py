@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A digital calibration certificate of a run: the XML of PTB's schema, DCC 3.3.0, with D-SI values.
 
-Every value is in SI, with its expanded uncertainty (coverage probability 95 %). The certificate
-states what the run states: parameters, errors at held-out poses, conformity with limits, and the
-instruments. Elements and their order: https://ptb.de/dcc/v3.3.0/; the values:
-https://ptb.de/si/v2.2.1/.
+Every value is in SI, with its expanded uncertainty (coverage probability 95 %); sentences for
+people are in mm and deg. The certificate states what the run states: parameters, errors at
+held-out poses, conformity with limits, and the instruments. Elements and their order:
+https://ptb.de/dcc/v3.3.0/; the values: https://ptb.de/si/v2.2.1/.
 """
 
 from __future__ import annotations
@@ -268,15 +268,20 @@ def _add_statements(parent: Element, content: Mapping[str, Any]) -> None:
     judged = ((content.get("validation") or {}).get("conformity")) or {}
     for quantity, stated in judged.items():
         meta = _add(parent, "metaData")
-        unit = "m" if quantity == "position" else "rad"
+        unit, scale = ("mm", 1e3) if quantity == "position" else ("deg", math.degrees(1.0))
         _add_text(meta, "name", f"Conformity of the largest {quantity} error at held-out poses")
         _add(meta, "norm", "ISO 14253-1:2017")
+        numbers = {
+            "estimate": "Estimate",
+            "expanded": "expanded uncertainty",
+            "limit": "limit",
+            "guard_band": "guard band",
+            "acceptance_limit": "acceptance limit",
+        }
+        lengths = (f"{words} {stated[k] * scale:.3g} {unit}" for k, words in numbers.items())
         declaration = (
-            f"Estimate {stated['estimate']!r} {unit}, expanded uncertainty {stated['expanded']!r} "
-            f"{unit}, limit {stated['limit']!r} {unit}, guard band {stated['guard_band']!r} "
-            f"{unit}, acceptance limit {stated['acceptance_limit']!r} {unit}, probability of "
-            f"conformity {stated['probability']!r}; conformity is accepted from "
-            f"{stated['level']!r}. {PREDICTED}"
+            f"{', '.join(lengths)}, probability of conformity {100 * stated['probability']:.3g} %; "
+            f"conformity is accepted from {100 * stated['level']:.3g} %. {PREDICTED}"
         )
         _add_text(meta, "declaration", declaration)
         _add(meta, "conformity", CONFORMITY[stated["decision"]])
