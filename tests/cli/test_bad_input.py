@@ -351,7 +351,7 @@ USAGE_CASES = {
     ),
     "a robot file as data": ("calibrate hexapod-42 robot.yaml -o r", "robot.yaml is a YAML file"),
     "a robot file as instrument": ("plan hexapod-42 -o p --like r.yaml", "r.yaml is a YAML file"),
-    "an unknown file to write": ("export run -o run.txt", "marlin, reprap, linuxcnc, urdf, json"),
+    "an unknown file to write": ("export run -o run.txt", "reprap, linuxcnc, linuxcnc-ini, urdf"),
     "hold out everything": ("calibrate hexapod-42 d.csv -o r --hold-out 1", "--hold-out"),
     "unknown method": ("calibrate hexapod-42 d.csv -o r --method best", "--method"),
     "negative seed": ("simulate hexapod-42 --poses p.csv -o m.csv --seed -1", "--seed"),

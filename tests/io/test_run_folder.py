@@ -129,4 +129,4 @@ def test_provenance_contains_inputs_and_versions(tmp_path) -> None:
     assert origin["inputs"]["data"]["sha256"].startswith(
         "ba7816bf8f01cfea"
     )  # SHA-256 of "abc", FIPS 180-2 B.1
-    assert set(origin["versions"]) == {"loopcal", "python", "numpy", "scipy"}
+    assert set(origin["versions"]) == {"loopcal", "engine", "python", "numpy", "scipy"}

@@ -231,6 +231,9 @@ def convert_export(
             raise FileError("the profile skips every line of this export; correct it", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
+        if lines[0].header is None and not fitting:
+            # nothing shows that the profile is meant for this file, which may contain secrets
+            raise FileError(f"{sentence}; compare the first one with the profile", path, number)
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
     settings = {"format": FORMAT, **profile.record.settings}
     lines = _format_remarks(path, profile, misfits, findings)
