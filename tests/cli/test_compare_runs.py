@@ -177,6 +177,19 @@ def test_a_run_of_an_older_version_is_shown_without_a_test(runs) -> None:
     assert np.isnan(comparison.pairs[0].p_value)
 
 
+def test_a_run_that_states_no_units_is_shown_without_intervals(compare, runs, tmp_path) -> None:
+    older = tmp_path / "older"
+    shutil.copytree(runs / "june", older)
+    result = json.loads((older / "result.json").read_text("utf-8"))
+    for row in result["fit"]["parameters"]:
+        del row["unit"]
+    (older / "result.json").write_text(json.dumps(result), "utf-8")
+    code, _, err = compare(f"may {older}")
+    assert (code, err) == (0, "")
+    summary = lc.compare_runs([lc.load_run(runs / "may"), lc.load_run(older)]).runs[1]
+    assert set(summary.plus_minus.values()) == {None}
+
+
 def test_the_page_shows_what_its_commands_print(root, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     page = (root / "docs" / "comparing-runs.md").read_text("utf-8")

@@ -159,9 +159,9 @@ def _summarize(name: str, run: StoredRun) -> RunSummary:
     estimates, plus_minus = {}, {}
     for row in fit["parameters"]:
         place = run.robot.parameters.index(row["name"])
-        factor = UNITS[row["unit"]].factor_to_si
-        half = row["plus_minus"]
+        unit, half = UNITS.get(row.get("unit", "")), row["plus_minus"]
         estimates[row["name"]] = float(run.robot.values[place])
-        plus_minus[row["name"]] = None if half is None else half * factor
+        # runs of earlier versions may state no unit, and then no interval is known
+        plus_minus[row["name"]] = None if half is None or unit is None else half * unit.factor_to_si
     verdict = str(run.result.get("verdict", "")).replace("_", " ")
     return RunSummary(name, run.robot.name, fit.get("method", ""), verdict, estimates, plus_minus)
