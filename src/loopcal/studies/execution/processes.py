@@ -12,7 +12,7 @@ from __future__ import annotations
 import signal
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic
 
@@ -121,7 +121,7 @@ class _Pool(Generic[T, R]):
         context = get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._function), daemon=True)
-        with use_one_thread():
+        with use_one_thread(), _without_interrupts():
             process.start()
         theirs.close()  # so that our end notices when the process ends
         self._workers[ours] = _Worker(process, ours, task=task)
@@ -157,6 +157,23 @@ class _Pool(Generic[T, R]):
             worker.process.kill()
         for worker in list(self._workers.values()):
             self._forget(worker)
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Delay Ctrl-C and time limits while a process starts, and keep them from that process.
+
+    A process whose start is interrupted, here or there, prints a traceback. It inherits the blocked
+    signals. Windows cannot block them.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGALRM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
