@@ -17,7 +17,7 @@ from benchmarks.bench_identify import _measured, _poses, _tracker
 from benchmarks.bench_kinematics import _problem
 from benchmarks.bench_sensitivity import _first_answer, _record
 from benchmarks.harness import Metric, measure_ratio
-from loopcal.engine import current_engine
+from loopcal.engine import get_current_engine
 from loopcal.engine.selection import VARIABLE
 from loopcal.estimate import LeastSquares, identify, identify_trials
 from loopcal.io import load_robot
@@ -35,12 +35,12 @@ def use_engine(name: str) -> Iterator[None]:
     """Compute the body with an engine."""
     before = os.environ.get(VARIABLE, "")
     os.environ[VARIABLE] = name
-    current_engine.cache_clear()
+    get_current_engine.cache_clear()
     try:
         yield
     finally:
         os.environ[VARIABLE] = before
-        current_engine.cache_clear()
+        get_current_engine.cache_clear()
 
 
 def _of_each(

@@ -172,9 +172,9 @@ def _print_version(context: click.Context, is_asked: bool) -> None:
         return
     from importlib.metadata import version
 
-    from loopcal.engine import current_engine
+    from loopcal.engine import get_current_engine
 
-    click.echo(f"loopcal {version('loopcal')}\nengine {current_engine()}")
+    click.echo(f"loopcal {version('loopcal')}\nengine {get_current_engine()}")
     context.exit()
 
 

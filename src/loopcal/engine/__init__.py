@@ -21,8 +21,8 @@ from loopcal.engine.program import Slot as Slot
 from loopcal.engine.program import State as State
 from loopcal.engine.program import Task as Task
 from loopcal.engine.selection import Engine as Engine
-from loopcal.engine.selection import current_engine as current_engine
 from loopcal.engine.selection import fold as fold
+from loopcal.engine.selection import get_current_engine as get_current_engine
 from loopcal.engine.selection import linearize as linearize
 from loopcal.engine.selection import select_engine as select_engine
 from loopcal.engine.selection import solve as solve

@@ -74,7 +74,7 @@ def select_engine(choice: str = "") -> Engine:
 
 
 @cache
-def current_engine() -> Engine:
+def get_current_engine() -> Engine:
     """Return the engine that LOOPCAL_ENGINE names, chosen once in a process."""
     return select_engine(os.environ.get(VARIABLE, ""))
 
@@ -101,7 +101,7 @@ def solve(
 
     Rows that fail are marked in `status`; nothing is raised.
     """
-    return current_engine().solve(program, e, q, start, task, free, max_iterations, goal)
+    return get_current_engine().solve(program, e, q, start, task, free, max_iterations, goal)
 
 
 def linearize(
@@ -112,7 +112,7 @@ def linearize(
     e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
     free : eliminate the actuated joints too, at their values in `state`.
     """
-    return current_engine().linearize(program, e, q, state, free)
+    return get_current_engine().linearize(program, e, q, state, free)
 
 
 def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
@@ -122,4 +122,4 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
 
     factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
     """
-    return current_engine().fold(factor, rows)
+    return get_current_engine().fold(factor, rows)

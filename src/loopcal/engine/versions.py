@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from loopcal.engine.selection import current_engine
+from loopcal.engine.selection import get_current_engine
 
 
 def collect_versions() -> dict[str, str]:
@@ -12,4 +12,4 @@ def collect_versions() -> dict[str, str]:
     from importlib.metadata import version
 
     versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")}
-    return versions | {"python": platform.python_version(), "engine": str(current_engine())}
+    return versions | {"python": platform.python_version(), "engine": str(get_current_engine())}

@@ -78,7 +78,7 @@ def linearize_fit(fit: Identification, data: Measurements) -> FitLinearization:
     fit : a fit that converged. data : its measurements, with the sigma of their readings, without
         excluded poses.
     """
-    problem, solution, linearization = _linearize(fit, data, is_setup_known=False)
+    problem, solution, linearization = _linearize(fit, data)
     method = fit.method
     d = decompose_for(
         method,
@@ -96,15 +96,8 @@ def linearize_rows_of(fit: Identification, data: Measurements) -> tuple[Problem,
     """Linearize the rows of other measurements of the poses of a fit at its estimate, such as those
     of another sigma, with an earlier calibration; arguments as of `linearize_fit`.
     """
-    problem, _, linearization = _linearize(fit, data, is_setup_known=False)
+    problem, _, linearization = _linearize(fit, data)
     return problem, linearization
-
-
-def factor_known_setup(fit: Identification, data: Measurements) -> FloatArray:
-    """Return the triangular factor (p, p) of the whitened rows of a fit by the parameters in
-    tolerances, as if its frames, targets, surfaces and offsets were known.
-    """
-    return _linearize(fit, data, is_setup_known=True)[2].factor[0, :-1, :-1]
 
 
 def linearize_smooth_errors(
@@ -120,7 +113,7 @@ def linearize_smooth_errors(
     solution, free = linear.solution, replace(fit.free_parameters, errors=errors)
     if solution.linearized is not None:
         solution = replace(solution, linearized=solution.linearized.with_errors(errors))
-    problem = _state_problem(fit, data, free, is_setup_known=False)
+    problem = _state_problem(fit, data, free)
     # the columns of the errors have no part in the rank of the machine
     problem = replace(problem, consistent=None)
     z, start = _start_at_estimate(fit, problem)
@@ -128,25 +121,21 @@ def linearize_smooth_errors(
 
 
 def _linearize(
-    fit: Identification, data: Measurements, *, is_setup_known: bool
+    fit: Identification, data: Measurements
 ) -> tuple[Problem, PoseSolution, Linearization]:
     """Return the weighted problem of a fit, its solution at the estimate, and its linearization
     there with an earlier calibration.
     """
-    problem = _state_problem(fit, data, fit.free_parameters, is_setup_known=is_setup_known)
+    problem = _state_problem(fit, data, fit.free_parameters)
     z, start = _start_at_estimate(fit, problem)
     solution = problem.solve(z, start, derivatives=True)
     linearization = problem.linearize_at(z, start, solution)
     return problem, solution, _add_prior(fit, problem, linearization)
 
 
-def _state_problem(
-    fit: Identification, data: Measurements, free: FreeParameters, *, is_setup_known: bool
-) -> Problem:
-    """Return the weighted problem of a fit; a known setup is fixed at its estimate."""
+def _state_problem(fit: Identification, data: Measurements, free: FreeParameters) -> Problem:
+    """Return the weighted problem of a fit."""
     setup = data.nuisance_parameters if fit.options.nuisance is None else fit.options.nuisance
-    if is_setup_known and len(setup):
-        setup = setup.with_nominal(fit.nuisance.estimate).with_fixed("*")
     return problem_of(free, data, setup).weighted(fit.pose_weights)
 
 

@@ -8,7 +8,7 @@ instrument that was used after its due date is a finding (ISO/IEC 17025:2017, se
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import date
 from typing import TYPE_CHECKING
 
@@ -105,11 +105,6 @@ def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
                 report_finding("data.instrument-calibrated-later", instrument=str(record), **dates)
             )
     return findings
-
-
-def list_record_fields() -> tuple[str, ...]:
-    """Return the names of the facts, in their order."""
-    return tuple(field.name for field in fields(InstrumentRecord))
 
 
 def _parse_date(key: str, text: str) -> None:

@@ -151,10 +151,5 @@ def _square(value: float | None) -> float | None:
     return None if value is None else value**2
 
 
-def _root(value: float | None) -> float | None:
-    """Return the square root of a number; None where there is none."""
-    return None if value is None else math.sqrt(value)
-
-
 def _show(value: float | None, unit: Any) -> str:
     return ABSENT if value is None else format_in(unit, float(value), 3)

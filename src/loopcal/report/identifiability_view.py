@@ -23,9 +23,6 @@ SD_MEANING = (
 MOST_COMBINATIONS = 8
 """Combinations and suggestions that a page lists; the rest is counted."""
 
-FEW_PARTNERS = 4
-"""Partners of a parameter that a table lists."""
-
 COMBINATIONS = ("fit.unidentifiable", "fit.hardly-observable")
 
 FEW_PARAMETERS = 12

@@ -21,11 +21,7 @@ from loopcal.typing import FloatArray
 def linearize(
     program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
 ) -> ClosureBlocks:
-    """Linearize closure at a state (t, n) and eliminate the passive joints.
-
-    e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
-    free : eliminate the actuated joints too, at their values in `state`.
-    """
+    """Linearize closure and eliminate the passive joints; see `loopcal.engine.linearize`."""
     t, n = state.T.shape[:2]
     T, trial = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0), np.arange(t * n) // n
     closure, passive, eliminated = [], [], []

@@ -53,12 +53,9 @@ def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the triangular factor R with R'R = factor'factor + rows'rows.
+    """Return the triangular factor of a stack; see `loopcal.engine.fold`.
 
-    The stack of both is triangularized by QR, many rows in parts that fit the cache; no product is
-    formed. The signs of the rows of R are arbitrary. A row of zeros changes nothing.
-
-    factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
+    The stack is triangularized by QR, many rows in parts that fit the cache.
     """
     t, p = factor.shape[:2]
     # a factor of no rows would be most of the stack where rows are few

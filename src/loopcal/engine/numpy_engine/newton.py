@@ -99,18 +99,7 @@ def solve(
     max_iterations: int = 60,
     goal: State | None = None,
 ) -> State:
-    """Find the pose and the joints that close every loop.
-
-    e : (t | 1, n_displacements) [m, rad].
-    q : (t | 1, n, n_joints) actuated joint values [m, rad]; with `free` only their first guess.
-    start : first guess, (t | 1, n | 1) rows.
-    task : conditions on the pose, as many as the freed actuators leave open.
-    free : solve for the actuated joints too.
-    goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
-        goal, to which further steps would converge. Its coordinates are those before that step.
-
-    Rows that fail are marked in `status`; nothing is raised.
-    """
+    """Find the pose and the joints that close every loop; see `loopcal.engine.solve`."""
     t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
     links = [place_links(g, e) for g in program.groups]
     unknown = [g.unknown_joints(free) for g in program.groups]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import loopcal
-from loopcal.engine import current_engine
+from loopcal.engine import get_current_engine
 from loopcal.errors import FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.limits import YAML_SIZE
@@ -142,7 +142,7 @@ def load_specification(store: StudyStore) -> Study:
 
 def make_header(study: Study) -> StoreHeader:
     """Return what the store of a study says about it."""
-    numerics, engine = str(NUMERICS), str(current_engine())
+    numerics, engine = str(NUMERICS), str(get_current_engine())
     versions = {PROGRAM: loopcal.__version__, NUMERICS_PART: numerics, ENGINE: engine}
     return StoreHeader(study.to_json(), tuple(c.name for c in study.columns), versions)
 
