@@ -2,7 +2,7 @@
 // The iteration of `solve`: blocks of rows until each has converged, is near its goal, or failed.
 #pragma once
 
-#include "newton.h"
+#include "limbs.h"
 
 namespace INSTRUCTION_SET {
 
@@ -53,6 +53,12 @@ class Solver {
             int outcome = solve_chunk(blocks, left < most ? left : most, first, rows, poses);
             if (outcome) return outcome;
         }
+        return 0;
+    }
+
+    int close_limbs(RowBlock &block, const Frames &frames) {
+        LimbCloser limbs(program_, frames);
+        for (int64_t b = 0; b < division_.blocks(); b++) close(block, b, limbs);
         return 0;
     }
 
@@ -197,6 +203,18 @@ class Solver {
         block.measures.pivot = select(better, trial.pivot, now.pivot);
     }
 
+    // A block whose limbs have a closed form with the platform of the start.
+    void close(RowBlock &block, int64_t number, const LimbCloser &limbs) {
+        begin(block, number);
+        Measures &now = block.measures;
+        if (division_.by_trials)
+            limbs.close(block.placed->lanes(), block.now, block.now + 12, now.residual, now.sign);
+        else
+            limbs.close(block.placed->numbers(), block.now, block.now + 12, now.residual, now.sign);
+        block.status = limbs.judge(now.residual);
+        write(block);
+    }
+
     void write(const RowBlock &block) const {
         for (int lane = 0; lane < block.used; lane++) {
             int64_t row = block.trial[lane] * division_.n + block.pose[lane];
@@ -277,6 +295,7 @@ inline int solve(const int64_t *structure, const double *numbers, const SolveInp
         block[b].step = arena.take<Lanes>(steps);
     }
     solver.units = placed, solver.unit_count = units;
+    if (!m && program.free && have_closed_form(program)) return solver.close_limbs(*block, frames);
     return solver.run(block, rows, poses);
 }
 

@@ -39,7 +39,7 @@ def flatten_program(program: Program, free: bool) -> FlatProgram:
 def _flatten(program: Program, free: bool) -> FlatProgram:
     """Return a program as flat arrays, with the order of program.h."""
     freedoms = list(program.freedoms)
-    require(0 < len(freedoms) <= 6 and set(freedoms) <= set(range(6)), "freedoms of a twist")
+    require(len(freedoms) <= 6 and set(freedoms) <= set(range(6)), "freedoms of a twist")
     whole = [len(program.groups), len(freedoms), program.n_displacements, program.n_joints]
     whole += [program.sigma is not None, free, *freedoms, *[0] * (6 - len(freedoms))]
     reals: list[FloatArray] = [np.array([program.size], float)]

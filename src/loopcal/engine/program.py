@@ -12,7 +12,7 @@ together. The rod of a `distance` ending counts as joint J, whose value is added
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -107,6 +107,11 @@ class Program:
     n_displacements: int
     n_joints: int
     sigma: tuple[float, ...] | None = None
+
+    @cached_property
+    def with_fixed_platform(self) -> Program:
+        """The same limbs with a platform that stays where the start has it."""
+        return replace(self, freedoms=())
 
 
 @dataclass(frozen=True)

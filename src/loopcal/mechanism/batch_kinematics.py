@@ -110,19 +110,38 @@ def inverse_trials(
         return _inverse_with_shared_drives(robot, values, target, begin)
     e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
+    T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
+    if determine_platform(robot):
+        limbs = robot.program.with_fixed_platform
+        state = engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
+        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
     t, n = max(len(values), len(target)), target.shape[1]
-    wanted = np.broadcast_to(target, (t, n, target.shape[2]))
-    flat = wanted.reshape(t * n, target.shape[2])
+    flat = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
 
     def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         return compare_coordinates(T, flat[rows], names, size)
 
-    guess = np.broadcast_to(driven_values(robot.program, begin), (t, n, len(robot.actuators)))
-    T = pose_from_coordinates(wanted, names, robot.home)
-    if start is not None:
-        T = np.broadcast_to(start.T, T.shape)
+    guess = np.broadcast_to(guess, (t, n, len(robot.actuators)))
+    T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
     state = engine.solve(robot.program, e, guess, replace(begin, T=T), command, free=True)
     return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+
+
+def determine_platform(robot: Mechanism) -> bool:
+    """Return whether the controlled coordinates state the whole pose and no limb adds a condition.
+
+    They are all freedoms of the platform, of which the others keep their values at home, and each
+    limb has as many unknown joints as equations.
+    """
+    if any(len(g.rows) != len(g.unknown_joints(free=True)) for g in robot.program.groups):
+        return False
+    if len(robot.controlled) == 6:
+        return True
+    if set(robot.controlled) != {ANGLES.get(freedom, freedom) for freedom in robot.freedoms}:
+        return False
+    at_home = read_coordinates(robot.home, robot.controlled)
+    same = pose_from_coordinates(at_home, robot.controlled, robot.home)
+    return bool(np.abs(same - robot.home).max() < 1e-12)
 
 
 def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> NDArray[np.int8]:

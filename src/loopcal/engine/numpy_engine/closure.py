@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -120,8 +121,6 @@ class Chain:
     arm: FloatArray
     gap: FloatArray
     distance: FloatArray
-    direction: FloatArray
-    moment: FloatArray
 
     def __init__(
         self, group: Group, links: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
@@ -152,8 +151,16 @@ class Chain:
         self.gap = self.arm + T[:, 3, None] - point
         if group.ending == "distance":
             self.distance = np.sqrt(dot(self.gap, self.gap))
-            self.direction = self.gap / self.distance
-            self.moment = cross(self.arm, self.direction)
+
+    @cached_property
+    def direction(self) -> FloatArray:
+        """Unit vector of the gap (3, k, N)."""
+        return self.gap / self.distance
+
+    @cached_property
+    def moment(self) -> FloatArray:
+        """Moment of this unit vector at the attachment about the platform's origin (3, k, N)."""
+        return cross(self.arm, self.direction)
 
     def residual(self) -> FloatArray:
         """Return the closure residual (r, k, N) [m]."""

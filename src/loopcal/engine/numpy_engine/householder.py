@@ -24,7 +24,7 @@ def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatAr
     The determinant is +1 or -1.
     """
     m = matrix.copy()
-    reflections = np.zeros((min(columns, len(m) - 1), *m.shape[2:]))
+    reflections = np.zeros((min(columns, max(len(m) - 1, 0)), *m.shape[2:]))
     for j in range(len(reflections)):
         v, alpha = m[j:, j].copy(), reflections[j]
         np.sqrt(np.add.reduce(v * v, axis=0), out=alpha)

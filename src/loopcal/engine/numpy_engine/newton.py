@@ -24,6 +24,7 @@ from loopcal.engine.numpy_engine.closure import (
     place_links,
 )
 from loopcal.engine.numpy_engine.householder import back_substitute, triangularize
+from loopcal.engine.numpy_engine.limbs import close_limbs, have_closed_form
 from loopcal.engine.program import (
     CONVERGED,
     EXHAUSTED,
@@ -100,6 +101,8 @@ def solve(
     goal: State | None = None,
 ) -> State:
     """Find the pose and the joints that close every loop; see `loopcal.engine.solve`."""
+    if not program.freedoms and free and have_closed_form(program):
+        return close_limbs(program, e, q, start, CHUNK)
     t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
     links = [place_links(g, e) for g in program.groups]
     unknown = [g.unknown_joints(free) for g in program.groups]
