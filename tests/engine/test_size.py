@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The NumPy engine is the specification of every other engine, so it stays readable in one sitting.
 
-The limit: five files and 870 lines of at most 100 columns, about an hour of reading, with the
+The limit: six files and 1,000 lines of at most 100 columns, about an hour of reading, with the
 docstrings that state shapes, units and formulas (a third of the lines). It was 800 lines until each
-attribute of a limb's chain was declared with its type, on a line of its own, and 850 until rows
-could end near a known goal, by which `inverse` tests the working mode.
+attribute of a limb's chain was declared with its type, on a line of its own, 850 until rows could
+end near a known goal, by which `inverse` tests the working mode, and 870 (five files) until limbs
+were closed one by one at a given platform.
 """
 
 import ast
@@ -17,10 +18,10 @@ def list_files(root: Path) -> list[Path]:
     return [folder / "program.py", *sorted((folder / "numpy_engine").glob("*.py"))]
 
 
-def test_engine_has_at_most_five_files_and_870_lines(root: Path):
+def test_engine_has_at_most_six_files_and_1000_lines(root: Path):
     files = list_files(root)
-    assert len(files) <= 5
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 870
+    assert len(files) <= 6
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 1000
 
 
 def test_engine_imports_numpy_only(root: Path):

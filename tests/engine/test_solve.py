@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NEAR_GOAL, NOT_FINITE, STALLED, Slot
+from loopcal.io import load_robot
 from loopcal.mechanism import build
 from tests import zoo
 from tests.engine.cases import (
@@ -108,6 +109,68 @@ def test_solving_for_a_pose_recovers_the_actuated_joints(engine):
             actuated_joint_values(one.program, back), one.q, atol=1e-13
         )  # [m, rad] rounding times a condition near 10
         assert_allclose(back.T, state.T, atol=1e-14)
+
+
+def has_square_limbs(program):
+    """Return whether every limb alone determines its joints."""
+    return all(len(g.rows) == len(g.unknown_joints(free=True)) for g in program.groups)
+
+
+@pytest.mark.parametrize("robot", ["mixed_hexapod", "hexapod", "delta", "five_bar", "planar_rrr"])
+def test_limbs_close_alone_where_the_platform_is_given(engine, robot):
+    case = make_case(getattr(zoo, robot)(), t=3)
+    assert has_square_limbs(case.program)
+    q = case.home_q + 0.1 * (case.q - case.home_q)  # near enough for the working mode of home
+    state = engine.solve(case.program, case.e, q, case.home)
+    given = replace(case.home, T=state.T)
+    back = engine.solve(case.program.with_fixed_platform, case.e, case.home_q, given, free=True)
+    assert_array_equal(back.status, CONVERGED)
+    assert_array_equal(back.T, state.T)
+    assert closure_gap(case.program, back, case.e).max() <= CLOSED * case.program.size
+    for mine, theirs in zip(back.joints, state.joints, strict=True):
+        assert_allclose(mine, theirs, atol=1e-13)  # [m, rad] rounding times a condition near 10
+    alone = engine.solve(
+        case.program.with_fixed_platform,
+        case.e[1:2],
+        case.home_q,
+        replace(case.home, T=state.T[1:2, 2:3]),
+        free=True,
+    )
+    assert_same(take_rows(back, [1], [2]), alone)
+
+
+@pytest.fixture(scope="module", params=["6-pus", "linear-delta"])
+def sliding(request):
+    """Robots whose drives are slides at the feet of rods."""
+    return make_case(load_robot(request.param), n=1)
+
+
+def test_a_slide_stays_on_the_side_of_its_rod_where_it_started(engine, sliding):
+    limbs, home = sliding.program.with_fixed_platform, sliding.home
+    first = engine.solve(limbs, sliding.e, sliding.home_q, home, free=True)
+    beyond = sliding.home_q + 2 * sliding.program.size * np.array([[[1.0], [-1.0]]])
+    sides = engine.solve(
+        limbs, sliding.e, beyond, replace(home, T=np.repeat(home.T, 2, axis=1)), free=True
+    )
+    assert_array_equal(sides.status, CONVERGED)
+    signs, limb_count = sides.closure_sign[0], sum(len(g.limbs) for g in limbs.groups)
+    assert signs[0] * signs[1] == (-1) ** limb_count
+    assert closure_gap(limbs, sides, sliding.e).max() <= CLOSED * limbs.size
+    upper, lower = actuated_joint_values(limbs, sides)[0]
+    assert (upper > lower + 1e-3 * limbs.size).all()
+    mine = actuated_joint_values(limbs, first)[0, 0]
+    assert (np.isclose(mine, upper, atol=1e-12) | np.isclose(mine, lower, atol=1e-12)).all()
+
+
+def test_a_given_platform_out_of_reach_is_marked_with_the_open_gap(engine, sliding):
+    limbs, T = sliding.program.with_fixed_platform, np.repeat(sliding.home.T, 3, axis=1)
+    T[0, 0, :3, 3] += 100 * limbs.size
+    T[0, 1, 0, 0] = np.nan
+    given = replace(sliding.home, T=T)
+    state = engine.solve(limbs, sliding.e, sliding.home_q, given, free=True)
+    assert_array_equal(state.status, [[STALLED, NOT_FINITE, CONVERGED]])
+    gap = closure_gap(limbs, take_rows(state, [0], [0]), sliding.e)
+    assert_allclose(state.residual[:, :1], gap, rtol=1e-12)
 
 
 @pytest.mark.parametrize("robot", ["mixed_hexapod", "three_prs", "delta"])

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal import engine, geometry
+from loopcal import engine
 from loopcal.engine import State
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import linearize_limbs, name_passive_joints, solve_passive_motion
@@ -48,19 +48,8 @@ def solve_at_pose(
     values : (t | 1, p). begin : (t, n), whose joints select the branch of each limb.
     """
     e, tau = robot.slots(values)
-    freedoms, scale = list(robot.program.freedoms), robot.twist_scale
-    target = np.array(T, dtype=np.float64).reshape(-1, 4, 4)
-
-    def prescribe(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance from the target pose and its slopes in the twist."""
-        whole = np.zeros((len(current), 4, 4))
-        whole[:, :3], whole[:, 3, 3] = current, 1.0
-        gap = geometry.pose_difference(whole, target[rows]) * scale
-        slopes = np.diag(scale)[freedoms]
-        return gap[:, freedoms], np.broadcast_to(slopes, (len(current), len(freedoms), 6))
-
-    guess = driven_values(robot.program, begin)
-    state = engine.solve(robot.program, e, guess, replace(begin, T=T), prescribe, free=True)
+    guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
+    state = engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
     joints = driven_values(robot.program, state)
     return state, readings_from_joints(joints, tau, robot.slots.frequency)
 

@@ -81,6 +81,23 @@ def test_inverse_solutions_agree_with_numpy_and_between_instruction_sets(name):
     assert_same_bits(solved)
 
 
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(("t", "n"), [(1, 21), (9, 3)])
+def test_limbs_of_a_given_platform_agree_with_numpy_and_between_instruction_sets(name, t, n):
+    case = make_robot_case(name, t, n)
+    limbs = case.program.with_fixed_platform
+    given = NUMPY.solve(case.program, case.e, case.q, case.home)
+    given = replace(case.home, T=given.T)
+    arguments = limbs, case.e, case.home_q, given, None, True
+    solved = [e.solve(*arguments) for e in ENGINES.values()]
+    expected = NUMPY.solve(*arguments)
+    for field in ("T", "status", "iterations", "closure_sign"):
+        assert_array_equal(getattr(solved[0], field), getattr(expected, field), err_msg=field)
+    for mine, theirs in zip(solved[0].joints, expected.joints, strict=True):
+        assert_allclose(mine, theirs, atol=ROUNDING * max(case.program.size, 1.0))
+    assert_same_bits(solved)
+
+
 @pytest.mark.parametrize("columns", [1, 2, 7, 43])
 @pytest.mark.parametrize("trials", [1, 3, 8, 13])
 def test_factors_agree_with_numpy_and_between_instruction_sets(columns, trials):
