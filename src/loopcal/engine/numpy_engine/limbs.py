@@ -28,9 +28,7 @@ def have_closed_form(program: Program) -> bool:
     )
 
 
-def close_limbs(
-    program: Program, e: FloatArray, q: FloatArray, start: State, chunk: int
-) -> State:
+def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State, chunk: int) -> State:
     """Return the state (t, n) with the platform of the start, `chunk` rows at a time.
 
     A prismatic joint stays on the side of the start's value where the distance increases, or
