@@ -13,22 +13,28 @@ export PYTHON
 unexport PYTHONDONTWRITEBYTECODE
 # Tests of a file stay together, so that what they share is made once.
 PARALLEL := -n 2 --dist worksteal
+# Whatever the native engine is made of; a change of these files builds it again.
+NATIVE := tools/native.sh $(shell find native -type f -not -path '*/build/*' -not -path '*.egg-info/*' \
+  -not -path '*/__pycache__/*' -not -name 'libloopcal.*')
 
-.PHONY: help demo test quick evidence docs site fuzz bench bench-update viewer check format constraints clean
+.NOTPARALLEL:
+.PHONY: help demo test quick native evidence docs site fuzz bench bench-update viewer check format constraints clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: .venv/core.stamp  ## calibrate the shipped hexapod from its measurement file into runs/demo
+demo: .venv/core.stamp native  ## calibrate the shipped hexapod from its measurement file into runs/demo
 	$(BIN)/loopcal calibrate $(ROBOT) $(DATA) -o runs/demo --hold-out 0.25 --force
 
-test: .venv/dev.stamp  ## every test except the full-size statistics
+test: .venv/dev.stamp native  ## every test except the full-size statistics
 	$(BIN)/pytest $(PARALLEL) -m "not evidence"
 
-quick: .venv/dev.stamp  ## the tests that together take under 30 s
+quick: .venv/dev.stamp native  ## the tests that together take under 30 s
 	$(BIN)/pytest $(PARALLEL) -m "quick or not (slow or evidence)"
 
-evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
+native: .venv/native.stamp  ## build the native engine into .venv; without a C++ compiler NumPy computes
+
+evidence: .venv/dev.stamp native  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
 	$(BIN)/python -m tools.evidence
 	$(BIN)/pytest $(PARALLEL) -m evidence
 
@@ -44,14 +50,14 @@ site: .venv/dev.stamp  ## build the documentation site, build/site/index.html; w
 	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
 	$(BIN)/python -m tools.check_site build/site --browser
 
-fuzz: .venv/dev.stamp  ## run N more random inputs through the command line (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
+fuzz: .venv/dev.stamp native  ## run N more random inputs through the command line (N=1000 WORKERS=1 FUZZ=runs/fuzz.json)
 	@mkdir -p $(dir $(FUZZ))
 	$(BIN)/python -m tools.fuzz --count $(N) --workers $(WORKERS) --add $(FUZZ)
 
-bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse
+bench: .venv/dev.stamp native  ## benchmarks against the committed baseline; fails when one got worse
 	$(BIN)/python -m benchmarks.run --gate
 
-bench-update: .venv/dev.stamp  ## measure again and rewrite benchmarks/baseline.json (REASON="another machine")
+bench-update: .venv/dev.stamp native  ## measure again and rewrite benchmarks/baseline.json (REASON="another machine")
 	$(BIN)/python -m benchmarks.run --update --reason "$(REASON)"
 
 viewer:  ## build the script of the 3-D view from tools/viewer (needs Node.js >= 18 and the npm registry)
@@ -84,3 +90,7 @@ clean:  ## remove the environment and what the tools left behind
 .venv/dev.stamp: pyproject.toml $(wildcard constraints/*.txt)
 	@tools/setup.sh dev
 	@touch .venv/core.stamp $@
+
+# Without a compiler, or where the build fails, the stamp is not written and a line says so.
+.venv/native.stamp: $(NATIVE) | .venv/core.stamp
+	@tools/native.sh $@

@@ -13,6 +13,8 @@ import shlex
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from setuptools import Distribution, setup
@@ -25,6 +27,8 @@ ENDING = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 LIBRARY = f"libloopcal{ENDING}"
 OPTIONS = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-exceptions")
 OPTIONS += ("-fno-rtti", "-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-psabi")
+LINK_OPTIONS = {"linux": ("-Wl,--strip-all", "-Wl,-z,relro,-z,now"), "darwin": ("-Wl,-x",)}
+"""No symbols but those of the interface, so that the library names no file of the build machine."""
 GCC_OPTIONS = ("-fno-tree-loop-distribute-patterns",)
 """GCC would copy vectors in pieces, which stall the loads of whole ones."""
 AVX512 = "f bw cd dq vl"
@@ -43,36 +47,48 @@ def find_compiler() -> list[str]:
     """Return the words that call a C++ compiler."""
     if os.environ.get("CXX"):
         return shlex.split(os.environ["CXX"])
-    names = ("clang++", "g++") if sys.platform == "win32" else ("g++", "clang++", "c++")
+    # GCC for Windows puts vectors of 32 bytes at addresses of 16 on the stack (its bug 54412)
+    names = ("clang++",) if sys.platform == "win32" else ("g++", "clang++", "c++")
     found = next((name for name in names if shutil.which(name)), None)
     if found is None:
-        sys.exit("loopcal-native needs GCC or Clang; install one, or name it in CXX.")
+        sys.exit(f"loopcal-native needs one of {', '.join(names)}; install it, or name one in CXX.")
     return [found]
 
 
 def compile_library(target: Path, work: Path) -> None:
     """Compile the library; every instruction set by a call of its own."""
-    is_x86 = platform.machine().lower() in ("x86_64", "amd64")
-    sets = SETS["x86" if is_x86 else "other"]
+    sets = SETS["x86" if build_machine() in ("x86_64", "amd64") else "other"]
     compiler = find_compiler()
     about = subprocess.run([*compiler, "--version"], check=True, capture_output=True, text=True)
     compiler += OPTIONS if "clang" in about.stdout else (*OPTIONS, *GCC_OPTIONS)
-    compiler += shlex.split(os.environ.get("CXXFLAGS", ""))
+    compiler += [*list_architecture(), *shlex.split(os.environ.get("CXXFLAGS", ""))]
     if sys.platform != "win32":
         compiler.append("-fPIC")
     work.mkdir(parents=True, exist_ok=True)
     target.parent.mkdir(parents=True, exist_ok=True)
-    objects, calls = [], []
+    calls = [("dispatch", "dispatch.cpp", [f"-DWITH_{name.upper()}" for name in sets])]
     for name, (lanes, options) in sets.items():
         words = [f"-DINSTRUCTION_SET={name}", f"-DLANES={lanes}", *options]
         calls.append((name, "kernels.cpp", words))
-    calls.append(("dispatch", "dispatch.cpp", [f"-DWITH_{name.upper()}" for name in sets]))
-    for name, source, words in calls:
-        objects.append(str(work / f"{name}.o"))
-        subprocess.run(
-            [*compiler, *words, "-c", str(SOURCES / source), "-o", objects[-1]], check=True
-        )
-    subprocess.run([*compiler, "-shared", *objects, "-o", str(target)], check=True)
+    run = partial(subprocess.run, check=True, cwd=SOURCES)  # relative names: no path gets inside
+    objects = [str((work / f"{name}.o").resolve()) for name, _, _ in calls]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        pairs = zip(calls, objects, strict=True)
+        words = [[*compiler, *own, "-c", file, "-o", out] for (_, file, own), out in pairs]
+        list(pool.map(run, words))
+    link = () if os.environ.get("CXXFLAGS") else LINK_OPTIONS.get(sys.platform, ())
+    run([*compiler, "-shared", *objects, *link, "-o", str(target.resolve())])
+
+
+def list_architecture() -> list[str]:
+    """Return the options that name the processor to build for, where it may be another one."""
+    # on macOS cibuildwheel sets ARCHFLAGS="-arch x86_64" also on a machine with an ARM processor
+    return shlex.split(os.environ.get("ARCHFLAGS", "")) if sys.platform == "darwin" else []
+
+
+def build_machine() -> str:
+    """Return the name of the processor to build for."""
+    return (list_architecture() or [platform.machine()])[-1].lower()
 
 
 class BuildWithLibrary(build_py):

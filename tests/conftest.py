@@ -37,6 +37,13 @@ ROOT = Path(__file__).resolve().parent.parent
 STRICT = os.environ.get("LOOPCAL_STRICT") == "1"
 
 
+def pytest_report_header() -> str:
+    """Return the line that says which engine computes in the tests."""
+    from loopcal.engine import get_current_engine
+
+    return f"engine: {get_current_engine()}"
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     """Return the folder of the repository."""

@@ -2,6 +2,7 @@
 // The C interface. This file is compiled for the baseline of the platform: it asks the processor
 // what it has before any other code runs.
 #include "interface.h"
+#include "processor.h"
 
 namespace baseline {
 extern const loopcal::Kernels kernels;
@@ -36,17 +37,10 @@ struct Set {
 const Set *list_sets() {
     static const Set sets[] = {
 #if defined(WITH_V4)
-        {"v4", __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-                       __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
-                       __builtin_cpu_supports("avx512vl")
-                   ? &v4::kernels
-                   : nullptr},
+        {"v4", processor::has_v4() ? &v4::kernels : nullptr},
 #endif
 #if defined(WITH_V3)
-        {"v3", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                       __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2")
-                   ? &v3::kernels
-                   : nullptr},
+        {"v3", processor::has_v3() ? &v3::kernels : nullptr},
 #endif
         {"baseline", &baseline::kernels},
         {nullptr, nullptr},
