@@ -185,8 +185,9 @@ def test_map_equals_ridge_one_and_reduces_uncertainty(data, fit):
 
 
 def test_truncation_at_full_rank_equals_least_squares(data, fit):
+    # [m] rounding: the singular values of one fit against the back substitution of the other
     np.testing.assert_allclose(
-        identify(hexapod(), data, TruncatedSVD(42)).estimate, fit.estimate, rtol=0, atol=1e-15
+        identify(hexapod(), data, TruncatedSVD(42)).estimate, fit.estimate, rtol=0, atol=1e-14
     )
 
 

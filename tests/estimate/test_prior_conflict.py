@@ -185,9 +185,10 @@ def test_too_small_sigma_is_not_reported_as_narrow_tolerances():
 def test_inflation_factor_is_at_least_one():
     robot, measured = simulate_hexapods(10)
     wide = with_tolerance(robot, 0.35e-3)
-    assert np.array_equal(
-        identify_trials(wide, measured).values, identify_trials(wide, measured, MAP()).values
-    )
+    inflated, stated = identify_trials(wide, measured), identify_trials(wide, measured, MAP())
+    assert np.array_equal(inflated.penalty, stated.penalty)
+    # [m] rounding: a rule is asked with the decomposition, a stated factor needs none for its steps
+    np.testing.assert_allclose(inflated.values, stated.values, rtol=0, atol=1e-14)
     assert MAP(InflatedTolerances()) == MAP(InflatedTolerances())
 
 

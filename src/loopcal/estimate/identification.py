@@ -186,9 +186,8 @@ def identify_trials(
         fit.iterations,
         fit.cost,
         free,
-        fit.decomposition,
-        fit.penalty,
-        method.prior_variance(fit.decomposition, fit.penalty, free),
+        fit.linear_model,
+        method,
     )
 
 

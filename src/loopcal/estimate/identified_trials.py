@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.linear_model import LinearModel
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.presentation import TableResult
@@ -20,8 +23,7 @@ class IdentifiedTrials(TableResult):
     ----------
     values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
     cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
-    decomposition, penalty : variances and leverages are read from them.
-    prior_variance : (t, p) see `Method.prior_variance`.
+    linear_model : of the last rows. method : with what `adapt_method` entered.
     """
 
     values: FloatArray
@@ -29,9 +31,8 @@ class IdentifiedTrials(TableResult):
     iterations: IntArray
     cost: FloatArray
     free_parameters: FreeParameters
-    decomposition: Decomposition
-    penalty: FloatArray
-    prior_variance: FloatArray | None = None
+    linear_model: LinearModel
+    method: Method
 
     def __repr__(self) -> str:
         """Return the number of trials and how many converged."""
@@ -39,6 +40,21 @@ class IdentifiedTrials(TableResult):
             f"<IdentifiedTrials of {self.free_parameters.robot.name}: {len(self.values)} trials of "
             f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
         )
+
+    @property
+    def decomposition(self) -> Decomposition:
+        """The decompositions of the rows: variances and leverages are read from them."""
+        return self.linear_model.decomposition
+
+    @property
+    def penalty(self) -> FloatArray:
+        """(t, p free) of the directions of the decompositions."""
+        return self.linear_model.penalty
+
+    @cached_property
+    def prior_variance(self) -> FloatArray | None:
+        """(t, p free) see `Method.prior_variance`."""
+        return self.method.prior_variance(self.decomposition, self.penalty, self.free_parameters)
 
     @property
     def converged(self) -> BoolArray:

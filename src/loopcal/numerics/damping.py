@@ -7,6 +7,8 @@ problems" (2004).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -28,24 +30,31 @@ class Damping:
     Parameters
     ----------
     first : (t,) damping of the first step.
-    floor : (t,) damping after the first rejected step, at least.
+    floor : from trials (a,) to their damping after the first rejected step (a,), at least; asked
+        only for trials with a rejected step.
     """
 
     value: FloatArray
-    floor: FloatArray
     growth: FloatArray
 
-    def __init__(self, first: FloatArray, floor: FloatArray) -> None:
-        self.value, self.floor = np.array(first), floor
+    def __init__(self, first: FloatArray, floor: Callable[[IntArray], FloatArray]) -> None:
+        self.value, self._ask_floor = np.array(first), floor
         self.growth = np.full(len(self.value), 2.0)
+        self._floor = np.full(len(self.value), np.nan)
 
     def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
         """Lower the damping after a good step; raise it ever faster after rejected ones.
 
         `ratio` (a,) is the decrease over the predicted one.
         """
+        if accepted.all() and not self.value[trials].any():
+            self.growth[trials] = 2.0
+            return
+        unknown = trials[~accepted & np.isnan(self._floor[trials])]
+        if unknown.size:
+            self._floor[unknown] = self._ask_floor(unknown)
         less = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
-        more = np.maximum(self.value[trials] * self.growth[trials], self.floor[trials])
+        more = np.fmax(self.value[trials] * self.growth[trials], self._floor[trials])
         self.value[trials] = np.where(accepted, self.value[trials] * less, more)
         self.growth[trials] = np.where(accepted, 2.0, 2.0 * self.growth[trials])
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The descent to the filtered solution: damped Gauss-Newton, many trials at once.
 
-At every accepted point the whitened, scaled rows are one triangular factor and that factor one
-decomposition. The first step tried is the full one to the filtered solution for the TOTAL deviation
-z from nominal. Where it does not lower the sum of squares plus penalty, Levenberg-Marquardt damping
-shortens it (`filtered_step`). A trial ends without a solution where it makes no progress. See
-docs/theory/identification.md.
+At every accepted point the whitened, scaled rows are one triangular factor, from which the step
+follows (`linear_model`). The first step tried is the full one to the filtered solution for the
+TOTAL deviation z from nominal. Where it does not lower the sum of squares plus penalty,
+Levenberg-Marquardt damping shortens it (`filtered_step`). A trial ends without a solution where it
+makes no progress. See docs/theory/identification.md.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.methods.penalties import Method, decompose_for
-from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
+from loopcal.estimate.methods.fixed_penalty import FixedPenalty, fix_penalty
+from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.filtered_step import FilteredStep
+from loopcal.estimate.minimization.linear_model import LinearModel, SpectralModel, make_linear_model
 from loopcal.measure.array_checks import check_number, check_type
 from loopcal.numerics.damping import Damping
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
@@ -146,8 +148,7 @@ class Descent:
     Attributes
     ----------
     deviation : (t, p) total deviation z from nominal, in tolerances.
-    decomposition : of the rows next to `deviation`, for the total deviation.
-    penalty : (t, p) what the method penalized there.
+    linear_model : of the rows next to `deviation`.
     cost : (t,) sum of squares of the whitened residuals.
     status : (t,) DescentStatus. iterations : (t,) steps taken.
     start : warm start of the last points at which rows were evaluated and accepted.
@@ -157,8 +158,7 @@ class Descent:
     """
 
     deviation: FloatArray
-    decomposition: Decomposition
-    penalty: FloatArray
+    linear_model: LinearModel
     cost: FloatArray
     status: IntArray
     iterations: IntArray
@@ -166,6 +166,16 @@ class Descent:
     deviation_history: FloatArray
     cost_history: FloatArray
     is_start_exhausted: bool = False
+
+    @property
+    def decomposition(self) -> Decomposition:
+        """The decomposition of the rows next to `deviation`, for the total deviation."""
+        return self.linear_model.decomposition
+
+    @property
+    def penalty(self) -> FloatArray:
+        """(t, p) what the method penalized there."""
+        return self.linear_model.penalty
 
     def after(self, first: Descent) -> Descent:
         """Return this descent with the steps of the one that led to its start before its own."""
@@ -181,12 +191,14 @@ class Descent:
         """Return this descent with where some trials ended taken from another one; start and
         history stay.
         """
-        names = ("deviation", "penalty", "cost", "status", "iterations")
+        names = ("deviation", "cost", "status", "iterations")
         arrays = {name: np.array(getattr(self, name)) for name in names}
         for name, array in arrays.items():
             array[trials] = getattr(other, name)
         decomposition = self.decomposition.with_dual().put(trials, other.decomposition.with_dual())
-        return replace(self, **arrays, decomposition=decomposition)
+        penalty = self.penalty.copy()
+        penalty[trials] = other.penalty
+        return replace(self, **arrays, linear_model=SpectralModel(decomposition, penalty))
 
 
 def descend(
@@ -214,7 +226,8 @@ def descend(
     Descent; a trial that fails is marked in `status` and never stops the others.
     """
     control = control or StepControl()
-    model = _FilteredDescent(problem, method, tolerance, control)
+    fixed = fix_penalty(method, problem.parameters)
+    model = _FilteredDescent(problem, method, tolerance, control, fixed)
     z = np.array(deviation, dtype=np.float64)
     progress(0, 1, "fitting")
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
@@ -223,8 +236,8 @@ def descend(
     good = np.isfinite(first.cost) & np.isfinite(first.factor).all(axis=(1, 2))
     factor = np.where(good[:, None, None], first.factor, 0.0)
     cost = np.where(good, first.cost, np.inf)
-    point = model.decompose(replace(first, deviation=z, factor=factor, cost=cost))
-    largest = point.decomposition.singular_values[:, 0] ** 2
+    point = model.locate(replace(first, deviation=z, factor=factor, cost=cost))
+    linear_model = point.linear_model
     deviations, costs = [z.copy()], [point.cost.copy()]
 
     def observe(moved: _Point) -> None:
@@ -232,7 +245,14 @@ def descend(
         costs.append(moved.cost.copy())
         progress(0, 1, f"fitting, step {len(costs) - 1}: sum of squares {moved.cost[0]:.4g}")
 
-    damping = Damping(control.damping * largest, FIRST_DAMPING * largest)
+    def measure_curvature(trials: IntArray) -> FloatArray:
+        decomposition = linear_model.take(trials).decomposition
+        return decomposition.singular_values.max(axis=1, initial=0.0) ** 2
+
+    first_damping = np.zeros(len(z))
+    if control.damping:
+        first_damping = control.damping * measure_curvature(np.arange(len(z)))
+    damping = Damping(first_damping, lambda trials: FIRST_DAMPING * measure_curvature(trials))
     minimum = minimize(model, point, damping, control.iterations, observe)
     last: _Point = minimum.point
     if (last.z != deviations[-1]).any():
@@ -240,8 +260,7 @@ def descend(
         costs.append(last.cost)
     return Descent(
         deviation=last.z,
-        decomposition=last.decomposition,
-        penalty=last.penalty,
+        linear_model=last.linear_model,
         cost=last.cost,
         status=minimum.status,
         iterations=minimum.iterations,
@@ -253,12 +272,11 @@ def descend(
 
 @dataclass(frozen=True, eq=False)
 class _Point(TrialBatch):
-    """Deviations z (a, p) with sums of squares (a,), decomposition, penalty and warm start."""
+    """Deviations z (a, p) with sums of squares (a,), linear model and warm start."""
 
     z: FloatArray
     cost: FloatArray
-    decomposition: Decomposition
-    penalty: FloatArray
+    linear_model: LinearModel
     start: Start
 
     @property
@@ -269,8 +287,8 @@ class _Point(TrialBatch):
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """The linearization at proposed deviations, cost (a,) infinite where it is not finite;
-    decomposed where it is needed.
+    """The linearization at proposed deviations, cost (a,) infinite where it is not finite; its
+    linear model is made where it is needed.
     """
 
     model: _FilteredDescent
@@ -280,7 +298,7 @@ class _Candidate:
     def take(self, trials: IntArray) -> _Point:
         """Return the points of some trials."""
         needed = replace(self.linearized, nuisance=None, poses=None)  # the rest is not copied
-        return self.model.decompose(needed.take(trials))
+        return self.model.locate(needed.take(trials))
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,19 +309,16 @@ class _FilteredDescent:
     method: Method
     tolerance: float
     control: StepControl
+    fixed: FixedPenalty | None
 
-    def decompose(self, linearized: Linearization) -> _Point:
+    def locate(self, linearized: Linearization) -> _Point:
         """Return the points of a linearization."""
-        z = linearized.deviation
-        decomposition = decompose_for(
-            self.method, linearized.factor, linearized.equations, z, self.tolerance
-        )
-        penalty = np.array(self.method.penalty(decomposition), dtype=np.float64)
-        return _Point(z, linearized.cost, decomposition, penalty, linearized.next_start)
+        linear_model = make_linear_model(linearized, self.method, self.tolerance, self.fixed)
+        return _Point(linearized.deviation, linearized.cost, linear_model, linearized.next_start)
 
     def propose(self, point: _Point, damping: FloatArray) -> FilteredStep:
         """Return the damped steps."""
-        return propose_step(point.z, point.decomposition, point.penalty, damping)
+        return point.linear_model.propose(point.z, damping)
 
     def is_negligible(self, point: _Point, step: FilteredStep) -> BoolArray:
         """Return which steps are the last."""
@@ -325,7 +340,7 @@ class _FilteredDescent:
     ) -> tuple[BoolArray, FloatArray]:
         """Accept steps that bring a share of the decrease that was predicted."""
         before = self.objective(point)
-        after = candidate.cost + penalize(point.decomposition, point.penalty, step.deviation)
+        after = candidate.cost + point.linear_model.penalize(step.deviation)
         gained = before - after + ROUNDING * before
         # a truncated direction on its way back to nominal may cost something: up to twice what was
         # predicted
@@ -335,7 +350,7 @@ class _FilteredDescent:
 
     def objective(self, point: _Point) -> FloatArray:
         """Return the sum of squares plus penalty."""
-        return point.cost + penalize(point.decomposition, point.penalty, point.z)
+        return point.cost + point.linear_model.penalize(point.z)
 
     def ending(
         self, point: _Point, step: FilteredStep, candidate: _Candidate, accepted: BoolArray

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangular systems are solved to rounding, and what counts as regular certainly is."""
+
+import numpy as np
+import pytest
+
+from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.triangular_systems import MARGIN, ROUNDING, solve_regular, solve_triangles
+
+T = 5
+
+
+def make_triangles(p: int, weakest: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Return triangular factors (T, p, p) whose smallest singular value is `weakest` times the
+    largest.
+    """
+    rng = np.random.default_rng(seed)
+    u, v = (np.linalg.qr(rng.standard_normal((T, p, p)))[0] for _ in range(2))
+    s = np.geomspace(1.0, weakest, p)
+    return np.array(np.linalg.qr(u * s @ v, mode="r"))
+
+
+@pytest.mark.parametrize("p", [1, 3, 12, 13, 24, 42])
+def test_back_substitution_in_parts_solves_the_systems(p):
+    triangle, right = make_triangles(p, 1e-3), np.random.default_rng(1).standard_normal((T, p))
+    x = solve_triangles(triangle, right)
+    # [1] rounding of p products, relative to the sizes of the terms
+    np.testing.assert_allclose(
+        (triangle @ x[:, :, None])[:, :, 0], right, rtol=0, atol=1e-15 * p * np.abs(x).max()
+    )
+
+
+@pytest.mark.parametrize("weakest", [1.0, 1e-3, 1e-6, 1e-9, 1e-10, 3e-11, 1e-11, 1e-12, 1e-15])
+@pytest.mark.parametrize("p", [2, 12, 42])
+def test_no_matrix_within_the_tolerance_counts_as_regular(p, weakest):
+    for seed in range(5):
+        triangle = make_triangles(p, weakest, seed)
+        _, is_regular = solve_regular(triangle, np.ones((T, p)), RANK_TOLERANCE)
+        s = np.linalg.svd(triangle, compute_uv=False)
+        assert (s[is_regular, -1] > MARGIN * RANK_TOLERANCE * s[is_regular, 0]).all()
+        if weakest >= 1e-9:  # far above the tolerance the second bound always says so
+            assert is_regular.all()
+
+
+def test_no_matrix_is_regular_by_rounding_alone():
+    _, is_regular = solve_regular(make_triangles(6, 0.5 * ROUNDING), np.ones((T, 6)), 1e-300)
+    assert not is_regular.any()
+
+
+def test_matrices_that_are_singular_or_not_finite_do_not_disturb_others():
+    triangle, right = make_triangles(14, 1e-2), np.random.default_rng(2).standard_normal((T, 14))
+    x, _ = solve_regular(triangle, right, RANK_TOLERANCE)
+    damaged, other = triangle.copy(), right.copy()
+    damaged[0, 3, 3] = 0.0
+    damaged[1, 2, 5] = np.nan
+    other[2, 1] = np.inf
+    mixed, is_regular = solve_regular(damaged, other, RANK_TOLERANCE)
+    assert is_regular.tolist() == [False, False, False, True, True]
+    assert np.array_equal(mixed[3:], x[3:])
+    assert not mixed[:3].any()
+
+
+def test_systems_do_not_depend_on_those_beside_them_bit_for_bit():
+    triangle, right = make_triangles(42, 1e-8), np.random.default_rng(3).standard_normal((T, 42))
+    together, is_regular = solve_regular(triangle, right, RANK_TOLERANCE)
+    assert is_regular.all()
+    for i in range(T):
+        alone, _ = solve_regular(triangle[i : i + 1], right[i : i + 1], RANK_TOLERANCE)
+        assert np.array_equal(alone[0], together[i])
