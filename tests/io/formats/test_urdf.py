@@ -11,8 +11,10 @@ from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.io.formats import urdf, urdf_tree
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
+from loopcal.io.formats.urdf_closures import read_mechanism
 from loopcal.mechanism import Mechanism, forward, inverse
 from loopcal.mechanism.joint_graph import find_limb_paths
+from tests.io.formats.urdf_machines import UrdfSolver
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
 FRAME = {FIVE_BAR: "effector", DELTA: "eff"}
@@ -55,17 +57,22 @@ def test_loops_are_closed_at_the_home_pose(read, name) -> None:
 @pytest.mark.parametrize("name", COUNTS)
 def test_poses_agree_with_the_tree_after_closing_its_loops(files, read, name) -> None:
     """The reference closes all loops of the tree by Newton's method, branches included."""
-    robot, tree = read[name][1], urdf_tree.read(files[name])
-    body, frame = tree.find_body(FRAME[name]), tree.place_in_body(FRAME[name])
-    loops = urdf_tree.read_joint_graph(tree, files[name].with_name("robot.yaml"))
-    near = list(find_limb_paths(loops, body).graph.list_nearby())
-    assert len(near) > 2
-    q = np.array([[one.values[motor] for motor in loops.motors] for one in near])
-    found = forward(robot, q)
+    robot = read[name][1]
+    solver = UrdfSolver(files[name], files[name].with_name("robot.yaml"))
+    mechanism = read_mechanism(urdf_tree.read(files[name]), files[name].with_name("robot.yaml"))
+    paths = find_limb_paths(mechanism.graph, mechanism.locate(FRAME[name])[0])
+    start = np.zeros(len(solver.values))
+    for joint, value in zip(paths.graph.names, paths.home, strict=True):
+        start[solver.columns[joint]] = value
+    near = paths.home[paths.graph.is_driven] + 0.05 * np.random.default_rng(1).uniform(
+        -1, 1, (5, 2)
+    )
+    found = forward(robot, near)
     assert found.converged.all()
-    np.testing.assert_allclose(
-        found.T, [one.places[body] @ frame for one in near], rtol=0, atol=1e-11
-    )  # [m, 1]
+    start = solver.solve(paths.home[paths.graph.is_driven], start)
+    expected = [solver.forward(q, FRAME[name], start) for q in near]
+    np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-11)  # [m, 1]
+    np.testing.assert_allclose(inverse(robot, found.T).q, near, rtol=0, atol=1e-10)  # [rad]
 
 
 @pytest.mark.parametrize("name", COUNTS)
@@ -174,10 +181,18 @@ def test_invalid_urdf_is_refused_in_one_sentence(tmp_path, text, sentence) -> No
     [
         (
             "closed_loop: [[a, b]]\ntype: ['6d']\nname_mot: [a]\n",
-            ":1: the closure 'b' is not a joint of a.urdf",
+            ":1: the closure 'b' is not a joint or link of a.urdf",
         ),
         ("closed_loop: []\ntype: []\nname_mot: []\n", "no motor is named"),
-        ("closed_loop: [[a, a]]\ntype: ['3d']\nname_mot: []\n", ":2: closure 'a' is of type '3d'"),
+        (
+            "closed_loop: [[a, arm]]\ntype: ['2d']\nname_mot: []\n",
+            ":2: closure 'a' is of type '2d'",
+        ),
+        (
+            "closed_loop: [[a, a]]\ntype: ['3d']\nname_mot: [a]\n",
+            ":1: .* names the frame 'a' twice",
+        ),
+        ("closed_loop: [[a, arm]]\ntype: ['6d']\nname_mot: []\n", "no motor is named"),
         ("closed_loop: 1\n", "write 'closed_loop:' as a list of pairs"),
         ("closed_loop: []\ntype: []\nname_mot: [z]\n", ":3: the motor 'z' is not a movable joint"),
     ],

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -34,28 +33,28 @@ from loopcal.io.formats.program_format import (
     get_record,
     report_changes,
 )
-from loopcal.io.formats.urdf_tree import Urdf, read_joint_graph
+from loopcal.io.formats.urdf_closures import UrdfMechanism, read_mechanism
+from loopcal.io.formats.urdf_limbs import format_limb, format_pose
+from loopcal.io.formats.urdf_tree import Urdf
 from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.joint_graph import (
-    GraphJoint,
-    JointGraph,
     LimbPaths,
     choose_coordinates,
+    count_repeated_closures,
     find_limb_paths,
-    get_other_body,
-    orient_path,
+    list_nearby,
+    list_possible_platforms,
 )
 from loopcal.typing import FloatArray
 
-ZERO = 1e-15
-"""Numbers below this are rounding and written as 0 [m, rad]."""
+MIMICS = 1e-9
+"""Largest difference between a joint and the one that it mimics [rad, m]."""
 
 PLACED = 1e-9
 """Accepted difference between the places of a joint in URDF and robot file [m, 1]."""
 
 COORDINATES = {"rx": "roll", "ry": "pitch", "rz": "yaw", "x": "x", "y": "y", "z": "z"}
-POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 
 REMARK = "Limbs are named after their first joint, joints as in the URDF."
 ROBOT = """\
@@ -65,17 +64,7 @@ actuators:
 {actuators}
 limbs:
 {limbs}
-home: {home}
-"""
-LIMB = """\
-  - name: {name}
-    chain:
-{chain}
-    ending: {ending}
-    tip: {tip}
-    attach: {attach}
-    errors:
-{errors}
+{parameters}home: {home}
 """
 
 
@@ -87,34 +76,40 @@ def read(path: Path, options: ImportOptions) -> Imported:
     FileError : the file is not valid, its loops do not close, or its limbs branch.
     """
     urdf = urdf_tree.read(path)
-    closures = options.closures or path.with_suffix(".yaml")
-    if not closures.exists():
-        raise FileError(report_finding("files.closures-missing"), path)
-    graph = read_joint_graph(urdf, closures)
-    platform, frame = _find_platform(urdf, graph, options.platform)
+    closures: Path | None = options.closures or path.with_suffix(".yaml")
+    assert closures is not None
+    if options.closures is None and not closures.exists():
+        if not urdf.constraints:
+            raise FileError(report_finding("files.closures-missing"), path)
+        closures = None
+    mechanism = read_mechanism(urdf, closures)
+    platform, frame = _find_platform(mechanism, options.platform)
     try:
-        paths = find_limb_paths(graph, platform)
+        paths = find_limb_paths(mechanism.graph, platform)
     except MechanismError as error:
         finding = error.args[0]
         joints = finding.data.get("joints", ("",))
         raise urdf.error(finding, joints[-1]) from None
-    graph = paths.graph
-    T_body_frame = geometry.invert_pose(urdf.place_in_body(platform)) @ urdf.place_in_body(frame)
-    motion = graph.motions()
-    turns = any(name.startswith("r") for name in paths.freedoms)
-    home = graph.places[platform] @ T_body_frame
-    coordinates = choose_coordinates(graph.twists(platform, home[:3, 3]) @ motion)
+    graph, T_body_frame = paths.graph, mechanism.locate(frame)[1]
+    _check_mimics(urdf, paths)
+    motion = graph.find_motions(paths.home)
+    twists = graph.find_twists(paths.home, platform, T_body_frame)
+    home = graph.get_place(graph.place(paths.home[None]), platform)[0] @ T_body_frame
     drives = (f"  {quote_scalar(name)}: {_format_drive(urdf, name)}" for name in graph.motors)
-    what = f"a URDF with loop closures in {closures.name}"
+    closing = closures.name if closures is not None else "its constraints"
+    what = f"a URDF with loop closures in {closing}"
+    limbs = [format_limb(paths, limb, T_body_frame) for limb in paths.limbs]
+    parameters = "".join(limb.parameters for limb in limbs)
     head = format_head(path, what, "limbs", options.name, ("m", "rad"), REMARK)
     text = head + ROBOT.format(
         freedoms=", ".join(paths.freedoms),
-        controlled=", ".join(COORDINATES[name] for name in coordinates),
+        controlled=", ".join(COORDINATES[n] for n in choose_coordinates(twists @ motion)),
         actuators="\n".join(drives),
-        limbs="".join(_format_limb(graph, limb, T_body_frame, turns) for limb in paths.limbs),
-        home=_format_pose(home),
+        limbs="".join(limb.text for limb in limbs),
+        parameters=f"parameters:\n{parameters}\n" if parameters else "",
+        home=format_pose(home),
     )
-    return Imported(text, None, tuple(_report_structure(urdf, paths, motion.shape[1], frame)))
+    return Imported(text, None, tuple(_report_structure(mechanism, paths, frame)))
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
@@ -175,38 +170,79 @@ def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], s
     ------
     FileError : a limb begins at another place than in the robot file.
     """
+    named = [parameter.name for parameter in record.parameters]
     for limb in record.limbs:
-        first = limb.chain[0]
-        if first.name in urdf.joints:
-            joint = urdf.joints[first.name]
-            place = urdf.place_in_body(joint.parent) @ joint.origin
-            if np.abs(place - matrix_from_place(first.at)).max() > PLACED:
-                sentence = f"joint {first.name!r} has another place in the robot file"
-                raise urdf.error(f"{sentence}; export into the URDF it was read from", first.name)
+        first = limb.chain[0] if limb.chain else None
+        if first is not None and first.name in urdf.joints:
+            _check_place(urdf, first.name, matrix_from_place(first.at))
         driven = (j for j in limb.chain if isinstance(j, Revolute | Prismatic))
         motors = {joint.name: joint.actuated for joint in driven if joint.actuated}
+        prefix = f"{limb.name}."
         names = [entry.name or entry.of for entry in limb.errors] + list(motors)
+        names += [n.removeprefix(prefix)[:-2] for n in named if n.startswith(prefix)]
         for name in dict.fromkeys(names):
             if name in urdf.joints:
                 shifts = [f"{limb.name}.{name}.{axis}" for axis in "xyz"]
                 yield name, shifts, motors.get(name) or ""
 
 
-def _find_platform(urdf: Urdf, graph: JointGraph, name: str | None) -> tuple[str, str]:
-    """Return the platform's body, and the link whose frame is the platform frame."""
+def _check_place(urdf: Urdf, name: str, stated: FloatArray) -> None:
+    """Refuse a URDF in which the first joint of a limb has another place; raises FileError."""
+    joint = urdf.joints[name]
+    if urdf.find_body(joint.parent) != urdf.root:
+        return  # a closure carries it
+    place = urdf.place_in_body(joint.parent) @ joint.origin
+    if np.abs(place - stated).max() > PLACED:
+        sentence = f"joint {name!r} has another place in the robot file"
+        raise urdf.error(f"{sentence}; export into the URDF it was read from", name)
+
+
+def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str]:
+    """Return the platform's body, and the link whose frame is the platform frame.
+
+    It is the link that is named; else the only frame (a link on a fixed joint that closes no loop)
+    on a moving body, of several the only one on a body that limbs join to the base; else that body.
+    """
+    urdf, graph = mechanism.urdf, mechanism.graph
     moving = graph.bodies[1:]
+    possible = list_possible_platforms(graph)
+    links = tuple(link for body in possible or moving for link in mechanism.list_links(body))
     if name is not None:
-        body = urdf.find_body(name) if name in {*urdf.carrier, urdf.root} else None
+        known = name in {*urdf.carrier, urdf.root}
+        body = mechanism.locate(name)[0] if known else None
         if body not in moving:
-            finding = report_finding("files.platform-unknown", platform=name, links=moving)
+            finding = report_finding("files.platform-unknown", platform=name, links=links)
             raise FileError(finding, urdf.path)
         return str(body), name
-    fixed = (joint for joint in urdf.joints.values() if not joint.kind)
-    frames = tuple(joint.child for joint in fixed if urdf.find_body(joint.parent) in moving)
-    if len(frames) != 1:
-        finding = report_finding("files.platform-unclear", frames=frames, links=moving)
-        raise FileError(finding, urdf.path)
-    return urdf.find_body(frames[0]), frames[0]
+    fixed = (joint.child for joint in urdf.joints.values() if not joint.kind)
+    frames = [link for link in fixed if link not in mechanism.frames]
+    frames = [link for link in frames if mechanism.locate(link)[0] in moving]
+    suited = [link for link in frames if mechanism.locate(link)[0] in possible]
+    chosen = frames if len(frames) == 1 else suited
+    if len(chosen) == 1:
+        return mechanism.locate(chosen[0])[0], chosen[0]
+    if not chosen and len(possible) == 1:
+        return possible[0], mechanism.list_links(possible[0])[0]
+    finding = report_finding("files.platform-unclear", frames=tuple(frames), links=links)
+    raise FileError(finding, urdf.path)
+
+
+def _check_mimics(urdf: Urdf, paths: LimbPaths) -> None:
+    """Refuse a joint that mimics another where the loops do not make it so; raises FileError."""
+    graph = paths.graph
+    near = list_nearby(graph, paths.home)
+    for joint in urdf.joints.values():
+        if joint.mimic is None or joint.name in paths.dangling or not joint.kind:
+            continue
+        followed, factor, offset = joint.mimic
+        if {joint.name, followed} <= {*graph.names}:
+            i, j = graph.names.index(joint.name), graph.names.index(followed)
+            gap = near[:, i] - factor * near[:, j] - offset
+            turns = np.round(gap[0] / (2 * np.pi)) * 2 * np.pi if joint.kind == "R" else 0.0
+            if len(near) > 1 and np.abs(gap - turns).max() < MIMICS:
+                continue
+        finding = report_finding("files.joint-mimics", joint=joint.name, followed=followed)
+        raise urdf.error(finding, joint.name)
 
 
 def _format_drive(urdf: Urdf, name: str) -> str:
@@ -216,95 +252,35 @@ def _format_drive(urdf: Urdf, name: str) -> str:
     return f"{{reads: {'angle' if joint.kind == 'R' else 'length'}, unknown: [offset]{stroke}}}"
 
 
-def _format_limb(
-    graph: JointGraph, limb: tuple[GraphJoint, ...], T_body_frame: FloatArray, turns: bool
-) -> str:
-    """Return one limb of the robot file.
-
-    On a platform that does not turn, its last joint is the point that it turns about.
-    """
-    chain, errors, body = [], [], graph.base
-    pending: FloatArray = np.eye(4)
-    tip: FloatArray = np.eye(4)
-    path = orient_path(limb, graph.base)
-    for joint in path:
-        forward = joint.body_a == body
-        place = pending @ (joint.T_a if forward else joint.T_b)
-        axis = joint.axis if forward else -joint.axis
-        is_tip = joint is path[-1] and not turns
-        if is_tip:
-            tip = place
-        else:
-            chain.append(_format_joint(graph, joint, place, axis))
-        if forward:
-            name = f"tip, name: {quote_scalar(joint.name)}" if is_tip else quote_scalar(joint.name)
-            errors.append(f"      - {{of: {name}, shift: [{_list_across(axis)}]}}")
-        pending = geometry.invert_pose(joint.T_b if forward else joint.T_a)
-        body = get_other_body(joint, body)
-    last = path[-1]
-    attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
-    if last.is_pin:
-        # the far end of the pin, a joint of its own in the URDF
-        far = f"of: platform, name: {quote_scalar(last.far)}"
-        errors.append(f"      - {{{far}, shift: [{_list_across(last.axis)}]}}")
-    elif turns:
-        tip, attach = pending @ T_body_frame, np.eye(4)
-    return LIMB.format(
-        name=quote_scalar(limb[0].name),
-        chain="\n".join(chain),
-        ending="rigid" if turns else "ball",
-        tip=_format_pose(tip),
-        attach=_format_pose(attach),
-        errors="\n".join(errors),
-    )
-
-
-def _format_joint(graph: JointGraph, joint: GraphJoint, place: FloatArray, axis: FloatArray) -> str:
-    """Return one joint of a limb."""
-    start = float(graph.get_pin_angle(joint) if joint.is_pin else graph.values[joint.name])
-    motor = f", actuated: {quote_scalar(joint.name)}" if joint.name in graph.motors else ""
-    head = f"joint: {joint.kind}, name: {quote_scalar(joint.name)}"
-    where = f"at: {_format_pose(place)}, axis: {_format_list(axis)}"
-    return f"      - {{{head}, {where}, start: {start!r}{motor}}}"
-
-
-def _list_across(axis: FloatArray) -> str:
-    """Return the axes of the joint's frame that are not the joint's."""
-    return ", ".join(a for a, part in zip("xyz", axis, strict=True) if abs(part) < 1 - 1e-9)
-
-
-def _report_structure(urdf: Urdf, paths: LimbPaths, mobility: int, frame: str) -> Iterator[Finding]:
+def _report_structure(mechanism: UrdfMechanism, paths: LimbPaths, frame: str) -> Iterator[Finding]:
     """Yield the size of the mechanism, its home, and what the robot file does not express."""
-    graph = paths.graph
+    graph, motions = paths.graph, paths.motions
     yield report_finding(
         "files.urdf-structure",
         bodies=len(graph.bodies),
-        links=len(urdf.carrier) + 1,
+        links=len(mechanism.urdf.carrier) + 1,
         joints=len(graph.joints),
-        loops=len(graph.pins),
+        loops=len(graph.closing),
         motors=len(graph.motors),
-        mobility=mobility,
+        mobility=motions.mobility,
     )
-    residual = float(np.abs(graph.linearize_closure()[0]).max(initial=0.0))
+    residual = float(np.abs(graph.linearize(paths.home[None])[0]).max(initial=0.0)) * graph.size
     yield report_finding(
         "files.urdf-home", residual=f"{residual:.1g} m", frame=frame, freedoms=paths.freedoms
     )
+    if motions.idle:
+        yield report_finding("files.idle-motions", count=motions.idle, joints=motions.moved)
+    if paths.dangling:
+        yield report_finding("files.joints-dangling", joints=paths.dangling)
     if paths.replaced:
         yield report_finding("files.joints-replaced", joints=paths.replaced)
-    if mobility != len(graph.motors):
-        yield report_finding("files.motors-differ", mobility=mobility, motors=len(graph.motors))
-
-
-def _format_pose(T: FloatArray) -> str:
-    """Return a pose as a flow mapping without zeros."""
-    values = [*T[:3, 3], *geometry.matrix_to_euler(T[:3, :3], "xyz")]
-    pairs = zip(POSE, values, strict=True)
-    shown = [f"{name}: {float(value)!r}" for name, value in pairs if abs(value) > ZERO]
-    return f"{{{', '.join(shown)}}}" if shown else "[0, 0, 0]"
-
-
-def _format_list(vector: Any) -> str:
-    return f"[{', '.join(repr(float(v)) if abs(v) > ZERO else '0' for v in vector)}]"
+    if motions.mobility != len(graph.motors):
+        yield report_finding(
+            "files.motors-differ",
+            mobility=motions.mobility,
+            motors=len(graph.motors),
+            repeated=count_repeated_closures(graph, paths.home),
+        )
 
 
 FORMAT = Format(

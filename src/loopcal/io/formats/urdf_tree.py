@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF file as a tree of links and joints, and its loop closures.
+"""A URDF file as a tree of links and joints, with the constraints that close its loops.
 
 A joint's frame is its parent link's frame moved by `<origin xyz rpy>`, rpy about fixed axes (R = Rz
 Ry Rx); the child turns about, or slides along, `<axis>` in that frame. Lengths are meters, angles
 radians. Source: the specification of URDF's joint element (ROS wiki).
 
-A second file closes the loops: `closed_loop: [[A, B]]` with `type: ['6d']` makes one pin of two
-revolute joints whose child links coincide, which turn about the same axis; `name_mot` lists the
-motors. This is the convention of the example-parallel-robots collection.
+A `<constraint>` joins two links that the tree has placed already: `<parent link>` with
+`<parent_origin>` and `<parent_axis>`, `<child link>` with `<child_origin>` and `<child_axis>`.
+Source: pull request 264 of ros/urdfdom. Motors may be named by `<transmission>` or
+`<ros2_control>`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -22,52 +23,42 @@ from xml.parsers import expat
 import numpy as np
 
 from loopcal import geometry
-from loopcal.errors import FileError, MechanismError
+from loopcal.errors import FileError, suggest_names
+from loopcal.findings import report_finding
 from loopcal.io.core.limits import XML_DEPTH, XML_ELEMENTS, XML_JOINTS
 from loopcal.io.core.names import find_fault
 from loopcal.io.core.text_file import read_text
-from loopcal.io.core.yaml_file import YamlFile, read_yaml
-from loopcal.io.formats.program_format import parse_number
-from loopcal.mechanism.joint_graph import GraphJoint, JointGraph, find_home
-from loopcal.plain_text import quote
+from loopcal.io.formats.urdf_elements import (
+    OpenElement,
+    UrdfConstraint,
+    UrdfJoint,
+    build_constraint,
+    build_joint,
+)
 from loopcal.typing import FloatArray
 
 WHAT = "URDF file"
-KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
-
-
-@dataclass(frozen=True)
-class UrdfJoint:
-    """A joint.
-
-    Attributes
-    ----------
-    kind : R, P, or "" for a fixed joint. parent, child : links.
-    origin : (4, 4) T_parent_joint [m]. axis : (3,) unit vector. limits : [rad or m].
-    line : of the joint, from 1. start, end : bytes of its origin's tag, -1 without.
-    """
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    origin: FloatArray
-    axis: FloatArray
-    limits: tuple[float, float] | None
-    line: int
-    start: int
-    end: int
+OTHER_LOOPS = ("loop_joint", "loop")
+"""Elements by which other programs close loops in a URDF."""
 
 
 @dataclass(frozen=True)
 class Urdf:
-    """A file: its text, joints by name, root link, and the joint that carries each other link."""
+    """A file.
+
+    Attributes
+    ----------
+    joints : by name. root : the link that no joint carries. carrier : link -> joint that carries
+        it. constraints : that close loops. motors : joint -> line, of transmissions.
+    """
 
     path: Path
     text: str
     joints: Mapping[str, UrdfJoint]
     root: str
     carrier: Mapping[str, UrdfJoint]
+    constraints: tuple[UrdfConstraint, ...] = ()
+    motors: Mapping[str, int] = field(default_factory=dict)
 
     def error(self, sentence: Any, joint: str) -> FileError:
         """Return an error at the line of a joint."""
@@ -86,6 +77,15 @@ class Urdf:
         while link in self.carrier and not self.carrier[link].kind:
             T, link = self.carrier[link].origin @ T, self.carrier[link].parent
         return T
+
+    def with_fixed(self, names: Collection[str]) -> Urdf:
+        """Return the tree with some joints fixed at zero."""
+        joints = {
+            name: replace(joint, kind="") if name in names else joint
+            for name, joint in self.joints.items()
+        }
+        carrier = {link: joints[joint.name] for link, joint in self.carrier.items()}
+        return replace(self, joints=joints, carrier=carrier)
 
     def with_origin(self, joint: str, origin: FloatArray, turned: bool) -> Urdf:
         """Return the file with another origin of a joint; its rpy changes only where it `turned`.
@@ -114,17 +114,6 @@ class Urdf:
         return tag[: match.start(2)] + text + tag[match.end(2) :]
 
 
-@dataclass
-class _OpenJoint:
-    """A joint while it is parsed: attributes of its elements by name."""
-
-    name: str
-    kind: str
-    line: int
-    elements: dict[str, dict[str, str]] = field(default_factory=dict)
-    start: int = -1
-
-
 class _Parser:
     """Handlers of expat that collect links and joints."""
 
@@ -132,9 +121,12 @@ class _Parser:
         self.raw, self.path = raw, path
         self.links: list[str] = []
         self.joints: dict[str, UrdfJoint] = {}
+        self.constraints: dict[str, UrdfConstraint] = {}
+        self.motors: dict[str, int] = {}
+        self._commanded = ""
         self._stack: list[str] = []
         self._count = 0
-        self._joint: _OpenJoint | None = None
+        self._joint: OpenElement | None = None
         self._expat = expat.ParserCreate()
         self._expat.StartElementHandler = self._start
         self._expat.EndElementHandler = self._end
@@ -158,25 +150,50 @@ class _Parser:
             raise XML_DEPTH.make_error(WHAT, self.path, line=line)
         if len(self._stack) < 3 and (fault := find_fault(attributes.get("name", ""))) is not None:
             raise FileError(fault, self.path, line)
+        self._refuse_element(name, attributes, line)
+        text = attributes.get("name", "")
         if self._stack == ["robot", "link"]:
-            self.links.append(attributes.get("name", ""))
-        elif self._stack == ["robot", "joint"]:
-            self._joint = _OpenJoint(attributes.get("name", ""), attributes.get("type", ""), line)
+            if text in self.links:
+                raise FileError(f"duplicate link {text!r}; rename one", self.path, line)
+            self.links.append(text)
+        elif self._stack in (["robot", "joint"], ["robot", "constraint"]):
+            self._joint = OpenElement(text, attributes.get("type", ""), line)
         elif self._joint is not None and len(self._stack) == 3:
             self._joint.elements[name] = attributes
             if name == "origin":
                 self._joint.start = self._expat.CurrentByteIndex
+        elif self._stack == ["robot", "transmission", "joint"]:
+            self.motors[text] = line
+        elif self._stack == ["robot", "ros2_control", "joint"]:
+            self._commanded = text
+        elif self._stack == ["robot", "ros2_control", "joint", "command_interface"]:
+            self.motors[self._commanded] = line
 
     def _end(self, name: str) -> None:
         del name
-        if self._stack == ["robot", "joint"] and self._joint is not None:
+        known: Mapping[str, object] = self.joints
+        if self._joint is not None and len(self._stack) == 2:
             joint, self._joint = self._joint, None
-            if joint.name in self.joints:
-                sentence = f"duplicate joint {joint.name!r}; rename one"
+            what = self._stack[1]
+            known = self.joints if what == "joint" else self.constraints
+            if joint.name in known:
+                sentence = f"duplicate {what} {joint.name!r}; rename one"
                 raise FileError(sentence, self.path, joint.line)
-            XML_JOINTS.check(len(self.joints) + 1, WHAT, self.path, joint.line)
-            self.joints[joint.name] = _build_joint(joint, self.raw, self.path)
+            XML_JOINTS.check(len(known) + 1, WHAT, self.path, joint.line)
+            if what == "joint":
+                self.joints[joint.name] = build_joint(joint, self.raw, self.path)
+            else:
+                self.constraints[joint.name] = build_constraint(joint, self.path)
         self._stack.pop()
+
+    def _refuse_element(self, name: str, attributes: Mapping[str, str], line: int) -> None:
+        """Refuse elements whose neglect would give another machine."""
+        is_macro = name.startswith("xacro:") or any(v.startswith("${") for v in attributes.values())
+        if is_macro and len(self._stack) < 4:
+            finding = report_finding("files.urdf-macro", element=name)
+            raise FileError(finding, self.path, line)
+        if len(self._stack) == 2 and name in OTHER_LOOPS:
+            raise FileError(report_finding("files.urdf-other-loop", element=name), self.path, line)
 
     def _refuse_doctype(self, *_: Any) -> None:
         sentence = "a URDF has no document type; remove <!DOCTYPE ..>"
@@ -192,48 +209,15 @@ def parse(text: str, path: Path) -> Urdf:
     """Find links and joints; FileError for bad XML, an unknown type of joint, or not one tree."""
     parser = _Parser(text.encode(), path)
     parser.run()
-    return _build_tree(text, path, parser.links, parser.joints)
-
-
-def _build_joint(joint: _OpenJoint, raw: bytes, path: Path) -> UrdfJoint:
-    """Return a joint from its elements."""
-    name, elements, line = joint.name, joint.elements, joint.line
-    if joint.kind not in KINDS:
-        sentence = f"joint {name!r} is of type {joint.kind!r}; allowed: {', '.join(KINDS)}"
-        raise FileError(sentence, path, line)
-    for needed in ("parent", "child"):
-        if not elements.get(needed, {}).get("link"):
-            sentence = f"joint {name!r} names no {needed} link; add <{needed} link=..>"
-            raise FileError(sentence, path, line)
-    origin, limit = elements.get("origin", {}), elements.get("limit", {})
-    xyz = _parse_three(origin.get("xyz", "0 0 0"), f"xyz of joint {name!r}", path, line)
-    rpy = _parse_three(origin.get("rpy", "0 0 0"), f"rpy of joint {name!r}", path, line)
-    direction = elements.get("axis", {}).get("xyz", "1 0 0")
-    axis = _parse_three(direction, f"the axis of joint {name!r}", path, line)
-    kind, length = KINDS[joint.kind], float(np.linalg.norm(axis))
-    if kind and not length > 0:
-        raise FileError(f"joint {name!r} has the axis 0 0 0; write a direction", path, line)
-    limits = None
-    if kind and joint.kind != "continuous" and {"lower", "upper"} <= limit.keys():
-        low, high = (
-            parse_number(limit[key], f"{key} of joint {name!r}", path, line)
-            for key in ("lower", "upper")
-        )
-        limits = (low, high) if low < high else None
-    end = raw.index(b">", joint.start) + 1 if joint.start >= 0 else -1
-    T = geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
-    parent, child = elements["parent"]["link"], elements["child"]["link"]
-    axis = axis / (length or 1.0)
-    return UrdfJoint(name, kind, parent, child, T, axis, limits, line, joint.start, end)
-
-
-def _parse_three(text: str, what: str, path: Path, line: int) -> FloatArray:
-    """Return three numbers."""
-    numbers = text.split()
-    if len(numbers) != 3:
-        sentence = f"{what} is {text!r}, but three numbers are needed; correct it"
-        raise FileError(sentence, path, line)
-    return np.array([parse_number(number, what, path, line) for number in numbers])
+    tree = _build_tree(text, path, parser.links, parser.joints)
+    constraints = tuple(parser.constraints.values())
+    for constraint in constraints:
+        for link in constraint.links:
+            if link not in parser.links:
+                what = f"constraint {constraint.name!r} names the link {link!r}"
+                sentence = f"{what}, which does not exist{suggest_names(link, parser.links)}"
+                raise FileError(f"{sentence}; correct it", path, constraint.line)
+    return replace(tree, constraints=constraints, motors=parser.motors)
 
 
 def _build_tree(text: str, path: Path, links: list[str], joints: dict[str, UrdfJoint]) -> Urdf:
@@ -274,92 +258,3 @@ def _refuse_cycles(
             sentence = f"joint {joint.name!r} closes a circle of links: {joint.child!r} is carried"
             raise FileError(f"{sentence} by itself; correct its parent", path, joint.line)
         carried |= chain.keys()
-
-
-PARALLEL = 1e-9
-"""Difference of two axes that count as the same [1]."""
-
-
-def read_joint_graph(urdf: Urdf, closures: Path) -> JointGraph:
-    """Return the mechanism of a URDF with its loops closed.
-
-    Raises
-    ------
-    FileError : an unknown joint, a closure that is not a pin, or loops that do not close.
-    """
-    file = read_yaml(closures, "file of loop closures")
-    pairs, motors = _read_names(file, urdf)
-    ends = {name for pair in pairs for name in pair}
-    for name in motors:
-        if name not in urdf.joints or not urdf.joints[name].kind or name in ends:
-            sentence = f"the motor {name!r} is not a movable joint of {urdf.path.name}; correct it"
-            raise file.error(sentence, ("name_mot",))
-    if not motors:
-        raise file.error("no motor is named; list the driven joints in 'name_mot:'")
-    tree = _list_tree_joints(urdf, ends)
-    pins = tuple(_build_pin(urdf, first, second) for first, second in pairs)
-    values = {joint.name: 0.0 for joint in tree}
-    try:
-        return find_home(JointGraph(urdf.root, tree, pins, motors, values))
-    except MechanismError as error:
-        raise FileError(f"{urdf.path.name}: {error}", closures) from None
-
-
-def _read_names(file: YamlFile, urdf: Urdf) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
-    """Return the pairs of joints that close loops, and the motors."""
-    pairs, kinds, motors = (file.content.get(k, []) for k in ("closed_loop", "type", "name_mot"))
-    lists = isinstance(pairs, list) and isinstance(kinds, list) and isinstance(motors, list)
-    is_valid = lists and len(kinds) == len(pairs)
-    if not is_valid or any(not _is_pair_of_names(pair) for pair in pairs):
-        sentence = "write 'closed_loop:' as a list of pairs, 'type:' with one entry for each, and"
-        raise file.error(f"{sentence} 'name_mot:' as a list")
-    for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
-        for name in pair:
-            if not isinstance(name, str) or name not in urdf.joints:
-                sentence = f"the closure {quote(name)} is not a joint of {urdf.path.name}"
-                raise file.error(f"{sentence}; correct it", ("closed_loop", i))
-        if str(kind).lower() != "6d":
-            sentence = f"closure {pair[0]!r} is of type {kind!r}, but only '6d' is allowed"
-            raise file.error(f"{sentence}, between two revolute joints", ("type", i))
-    return [(a, b) for a, b in pairs], tuple(str(name) for name in motors)
-
-
-def _is_pair_of_names(value: Any) -> bool:
-    return isinstance(value, list) and [type(name) for name in value] == [str, str]
-
-
-def _list_tree_joints(urdf: Urdf, ends: set[str]) -> tuple[GraphJoint, ...]:
-    """Return the movable joints of the tree, each after the one that carries it."""
-    joints, bodies = [], {urdf.root}
-    waiting = [joint for joint in urdf.joints.values() if joint.kind and joint.name not in ends]
-    while waiting:
-        ready = [joint for joint in waiting if urdf.find_body(joint.parent) in bodies]
-        if not ready:
-            name = waiting[0].name
-            sentence = f"joint {name!r} is carried by a link that a closure holds"
-            raise urdf.error(f"{sentence}; close the loop at another joint", name)
-        for joint in ready:
-            body = urdf.find_body(joint.parent)
-            place = urdf.place_in_body(joint.parent) @ joint.origin
-            joints.append(
-                GraphJoint(joint.name, joint.kind, body, joint.child, place, np.eye(4), joint.axis)
-            )
-            bodies.add(joint.child)
-        waiting = [joint for joint in waiting if joint not in ready]
-    return tuple(joints)
-
-
-def _build_pin(urdf: Urdf, first: str, second: str) -> GraphJoint:
-    """Return the pin of two revolute joints whose child links coincide."""
-    ends = urdf.joints[first], urdf.joints[second]
-    for joint in ends:
-        if joint.kind != "R":
-            sentence = f"closure joint {joint.name!r} is not revolute, but closures must be"
-            raise urdf.error(f"{sentence}; correct it", joint.name)
-    if np.abs(ends[0].axis - ends[1].axis).max() > PARALLEL:
-        sentence = f"closure joints {first!r} and {second!r} have different axes"
-        raise urdf.error(f"{sentence}; give them the same axis", second)
-    (a, T_a), (b, T_b) = (
-        (urdf.find_body(j.parent), urdf.place_in_body(j.parent) @ j.origin) for j in ends
-    )
-    return GraphJoint(first, "R", a, b, T_a, T_b, ends[0].axis, is_pin=True, far=second)

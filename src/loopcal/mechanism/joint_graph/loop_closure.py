@@ -1,85 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mechanism as bodies and joints: a tree of joints from the base, and pins that close its loops.
+"""A mechanism as bodies and joints: a tree of joints from the base, and joints that close loops.
 
-A pin turns about one axis that both bodies carry: T_a R(axis, q) = T_b.
+With q the values of the tree, joint by joint, every joint of the tree places a body, T_b = T_a J(q)
+(frames of both bodies on the joint). A joint that closes a loop adds equations between two bodies
+that the tree has placed already: a ball joint p_a = p_b for its centers, a rotary joint also a_a =
+a_b for its axes, and a slide equal orientations and (p_a - p_b) x a = 0. Their derivatives by q are
+those of the two points and directions, which only the joints below each body move.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from loopcal import geometry
-from loopcal.errors import MechanismError
+from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 CLOSURE_RANK_TOLERANCE = 1e-8
-"""Singular value of the closures, relative to the largest, that counts as zero [1]."""
+"""Singular value of the scaled closures, relative to the largest, that counts as zero [1]."""
 
 CLOSED = 1e-13
-"""Largest closure residual of a home pose [m, 1]."""
+"""Largest closure residual of a home pose, lengths as a share of the largest one [1]."""
 
-STARTS, STEPS, SPREAD = 24, 40, 0.6
-"""Tries to close the loops, Newton steps of each, and range of their first joint values [rad]."""
-
-NEAR, NEAR_RANGE = 4, 0.15
-"""Number of poses near a pose, and range of their motors [rad, m]."""
+STEPS, LARGEST_STEP = 40, 0.6
+"""Newton steps, and the largest change of a joint value in one of them [rad, sizes]."""
 
 
 @dataclass(frozen=True)
-class GraphJoint:
-    """A joint between two bodies: `T_a` moved by the joint is `T_b`, each (4, 4) in its body.
+class Placement:
+    """Places of a tree at n joint values.
 
     Attributes
     ----------
-    kind : R or P. body_a, body_b : the bodies. axis : (3,) unit vector in the frame of the joint.
-    is_pin : whether it closes a loop; then `name` is its end on the first body, `far` on the other.
+    T : (n, bodies, 4, 4) T_base_body [m]. axes, points : (n, j, 3) axis and a point of each joint.
     """
 
-    name: str
-    kind: str
-    body_a: str
-    body_b: str
-    T_a: FloatArray
-    T_b: FloatArray
-    axis: FloatArray
-    is_pin: bool = False
-    far: str = ""
-
-    def flip(self) -> GraphJoint:
-        """Return a pin as the other body carries it."""
-        swapped = replace(self, body_a=self.body_b, body_b=self.body_a, T_a=self.T_b, T_b=self.T_a)
-        return replace(swapped, name=self.far, far=self.name)
-
-    def move(self, value: float) -> FloatArray:
-        """Return the joint frame of the other body (4, 4) in the first body."""
-        turn, shift = (value, 0.0) if self.kind == "R" else (0.0, value)
-        return self.T_a @ geometry.make_pose(geometry.exp_so3(turn * self.axis), shift * self.axis)
+    T: FloatArray
+    axes: FloatArray
+    points: FloatArray
 
 
 @dataclass(frozen=True)
 class JointGraph:
-    """A mechanism at joint values.
+    """A mechanism.
 
     Attributes
     ----------
-    base : the root body. tree : joints, each after the one that carries it. pins : close the loops.
-    motors : names of driven joints. values : joint -> value [rad or m].
-    homes : joint values that close the loops, those nearest to zero first.
+    base : the root body. tree : joints, each after the one that carries its first body.
+    closing : joints that close loops. motors : names of driven joints, all in the tree.
     """
 
     base: str
     tree: tuple[GraphJoint, ...]
-    pins: tuple[GraphJoint, ...]
+    closing: tuple[GraphJoint, ...]
     motors: tuple[str, ...]
-    values: Mapping[str, float]
-    homes: tuple[Mapping[str, float], ...] = ()
 
-    @property
+    @cached_property
     def bodies(self) -> tuple[str, ...]:
         """All bodies, the base first."""
         return (self.base, *(joint.body_b for joint in self.tree))
@@ -87,121 +68,163 @@ class JointGraph:
     @property
     def joints(self) -> tuple[GraphJoint, ...]:
         """All joints."""
-        return self.tree + self.pins
+        return self.tree + self.closing
 
     @cached_property
-    def places(self) -> dict[str, FloatArray]:
-        """Body -> T_base_body (4, 4)."""
-        T = {self.base: np.eye(4)}
-        for joint in self.tree:
-            T[joint.body_b] = T[joint.body_a] @ joint.move(self.values[joint.name])
-        return T
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints of the tree."""
+        return tuple(joint.name for joint in self.tree)
 
-    def twists(self, body: str, point: FloatArray) -> FloatArray:
-        """Return twists (6, j) (omega, v of a point [m] of the body) of the joints of the tree."""
-        T, columns = self.places, np.zeros((6, len(self.tree)))
-        index = {joint.body_b: i for i, joint in enumerate(self.tree)}
-        while body in index:
-            i = index[body]
-            joint = self.tree[i]
-            frame = T[joint.body_a] @ joint.T_a
-            axis = frame[:3, :3] @ joint.axis
-            arm = np.cross(axis, point - frame[:3, 3])
-            columns[:, i] = np.concatenate(
-                [axis, arm] if joint.kind == "R" else [np.zeros(3), axis]
-            )
-            body = joint.body_a
-        return columns
+    @cached_property
+    def is_driven(self) -> BoolArray:
+        """Which joints of the tree are driven (j,)."""
+        return np.array([name in self.motors for name in self.names], dtype=bool)
 
-    def linearize_closure(self) -> tuple[FloatArray, FloatArray]:
-        """Return residuals (6 c,) [m, 1] of the c pins, and derivatives (6 c, j) by the tree."""
-        T, residual, rows = self.places, [], []
-        for pin in self.pins:
-            frames = T[pin.body_a] @ pin.T_a, T[pin.body_b] @ pin.T_b
-            (p, q), (a, b) = (f[:3, 3] for f in frames), (f[:3, :3] @ pin.axis for f in frames)
-            A, B = self.twists(pin.body_a, p), self.twists(pin.body_b, q)
-            residual += [p - q, a - b]
-            rows += [A[3:] - B[3:], geometry.hat(b) @ B[:3] - geometry.hat(a) @ A[:3]]
-        if not rows:
-            return np.zeros(0), np.zeros((0, len(self.tree)))
-        return np.concatenate(residual), np.concatenate(rows)
+    @cached_property
+    def turns(self) -> BoolArray:
+        """Which joints of the tree are rotary (j,)."""
+        return np.array([joint.kind == "R" for joint in self.tree], dtype=bool)
 
-    def motions(self) -> FloatArray:
-        """Return joint rates (j, m) that keep the loops closed; m is the mobility."""
-        _, rows = self.linearize_closure()
-        if not len(rows):
-            return np.eye(len(self.tree))
-        _, s, V = np.linalg.svd(rows)
-        return V[int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum()) :].T
+    @cached_property
+    def size(self) -> float:
+        """Largest distance of a joint from the frame of its body [m]; 1 where all are zero."""
+        places = [T[:3, 3] for joint in self.joints for T in (joint.T_a, joint.T_b)]
+        return float(np.linalg.norm(places, axis=-1).max(initial=0.0)) or 1.0
 
-    def measure_firmness(self, platform: str) -> float:
-        """Return how well the motors hold the passive joints and move the platform.
+    @cached_property
+    def _columns(self) -> FloatArray:
+        """Unit of each joint value in the scaled closures (j,) [rad, m]."""
+        return np.where(self.turns, 1.0, self.size)
 
-        It is the product of two smallest singular values: of the closures by the passive joints,
-        and of the platform's twist by the joint rates that keep the loops closed.
+    @cached_property
+    def _index(self) -> Mapping[str, int]:
+        return {body: i for i, body in enumerate(self.bodies)}
+
+    @cached_property
+    def _is_below(self) -> BoolArray:
+        """Which joints (j,) of the tree move each body (bodies, j)."""
+        below = np.zeros((len(self.bodies), len(self.tree)), dtype=bool)
+        for i, joint in enumerate(self.tree):
+            below[i + 1] = below[self._index[joint.body_a]]
+            below[i + 1, i] = True
+        return below
+
+    def place(self, q: FloatArray) -> Placement:
+        """Return the places of all bodies and joints at joint values (n, j)."""
+        n, j = q.shape
+        T = np.tile(np.eye(4), (n, j + 1, 1, 1))
+        axes, points = np.zeros((n, j, 3)), np.zeros((n, j, 3))
+        for i, joint in enumerate(self.tree):
+            carrier = T[:, self._index[joint.body_a]]
+            T[:, i + 1] = carrier @ joint.move(q[:, i]) @ geometry.invert_pose(joint.T_b)
+            frame = carrier @ joint.T_a
+            axes[:, i], points[:, i] = frame[:, :3, :3] @ joint.axis, frame[:, :3, 3]
+        return Placement(T, axes, points)
+
+    def get_place(self, placement: Placement, body: str) -> FloatArray:
+        """Return the places (n, 4, 4) of a body."""
+        return placement.T[:, self._index[body]]
+
+    def differentiate(
+        self, placement: Placement, body: str, point: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return turn and velocity (n, 3, j) of a point (n, 3) [m] of a body by joint values."""
+        below = self._is_below[self._index[body]][:, None]
+        turns = self.turns[:, None]
+        arms = np.cross(placement.axes, point[:, None] - placement.points)
+        velocity = np.where(turns, arms, placement.axes) * below
+        return (
+            np.where(turns & below, placement.axes, 0.0).swapaxes(-1, -2),
+            velocity.swapaxes(-1, -2),
+        )
+
+    def linearize(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (n, e) of the closures at joint values (n, j), and derivatives by them.
+
+        Lengths are divided by `size`, and a slide's value is counted in it.
         """
-        _, rows = self.linearize_closure()
-        passive = rows[:, [joint.name not in self.motors for joint in self.tree]]
-        hold = 1.0
-        if passive.size:
-            hold = float(np.linalg.svd(passive, compute_uv=False)[passive.shape[1] - 1])
-        twists = self.twists(platform, self.places[platform][:3, 3]) @ self.motions()
-        return hold * float(np.linalg.svd(twists, compute_uv=False)[-1])
+        placement = self.place(q)
+        residual, rows = [np.zeros((len(q), 0))], [np.zeros((len(q), 0, len(self.tree)))]
+        for joint in self.closing:
+            r, J = self._linearize_joint(placement, joint)
+            residual.append(r)
+            rows.append(J * self._columns)
+        return np.concatenate(residual, axis=1), np.concatenate(rows, axis=1)
 
-    def close(self, start: Mapping[str, float], fixed: tuple[str, ...] = ()) -> JointGraph | None:
-        """Close the loops by Newton's method from joint values; None where it does not converge."""
-        free = np.array([joint.name not in fixed for joint in self.tree])
-        graph = replace(self, values=dict(start))
+    def _linearize_joint(
+        self, placement: Placement, joint: GraphJoint
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return residuals and derivatives of one closure."""
+        P = self.get_place(placement, joint.body_a) @ joint.T_a
+        Q = self.get_place(placement, joint.body_b) @ joint.T_b
+        p, q = P[:, :3, 3], Q[:, :3, 3]
+        turn_p, speed_p = self.differentiate(placement, joint.body_a, p)
+        turn_q, speed_q = self.differentiate(placement, joint.body_b, q)
+        gap, gap_rows = (p - q) / self.size, (speed_p - speed_q) / self.size
+        if joint.kind == "S":
+            return gap, gap_rows
+        # directions that the joint keeps equal on both bodies
+        kept = [joint.axis] if joint.kind == "R" else list(np.eye(3))
+        u = [P[:, :3, :3] @ v for v in kept]
+        w = [Q[:, :3, :3] @ v for v in kept]
+        apart = np.concatenate([a - b for a, b in zip(u, w, strict=True)], axis=1)
+        turned = [
+            geometry.hat(b) @ turn_q - geometry.hat(a) @ turn_p for a, b in zip(u, w, strict=True)
+        ]
+        if joint.kind == "P":
+            axis = P[:, :3, :3] @ joint.axis
+            # d (axis x gap) = axis x d gap - gap x (turn x axis)
+            swing = geometry.hat(gap) @ geometry.hat(axis) @ turn_p
+            gap, gap_rows = np.cross(axis, gap), geometry.hat(axis) @ gap_rows + swing
+        return (np.concatenate([gap, apart], axis=1), np.concatenate([gap_rows, *turned], axis=1))
+
+    def close(self, starts: FloatArray, fixed: BoolArray | None = None) -> FloatArray:
+        """Close the loops by Newton's method from joint values (n, j); NaN where it diverges.
+
+        `fixed` (j,) are joints that keep their values. Steps are of least norm.
+        """
+        q, is_closed = starts.copy(), np.zeros(len(starts), dtype=bool)
+        free = np.ones(len(self.tree), dtype=bool) if fixed is None else ~fixed
         for _ in range(STEPS):
-            residual, rows = graph.linearize_closure()
-            if np.abs(residual).max(initial=0.0) < CLOSED:
-                return graph
-            step = np.zeros(len(free))
-            step[free] = np.linalg.lstsq(rows[:, free], -residual, rcond=CLOSURE_RANK_TOLERANCE)[0]
-            step *= min(1.0, SPREAD / max(float(np.abs(step).max()), 1e-300))
-            values = {j.name: graph.values[j.name] + step[i] for i, j in enumerate(self.tree)}
-            graph = replace(graph, values=values)
-        return None
+            left = np.flatnonzero(~is_closed)
+            if not left.size:
+                break
+            residual, rows = self.linearize(q[left])
+            is_closed[left] = np.abs(residual).max(axis=1, initial=0.0) < CLOSED
+            active = ~is_closed[left]
+            step = np.zeros((int(active.sum()), len(free)))
+            inverse = np.linalg.pinv(rows[active][:, :, free], rcond=CLOSURE_RANK_TOLERANCE)
+            step[:, free] = -(inverse @ residual[active][:, :, None])[:, :, 0]
+            largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
+            q[left[active]] += step * np.minimum(1.0, LARGEST_STEP / largest) * self._columns
+        q[~is_closed] = np.nan
+        return q
 
-    def list_nearby(self) -> Iterator[JointGraph]:
-        """Yield this pose, and others with the motors moved a little."""
-        yield self
-        for seed in range(NEAR):
-            rng = np.random.default_rng(seed)
-            start = {
-                name: value + (rng.uniform(-NEAR_RANGE, NEAR_RANGE) if name in self.motors else 0.0)
-                for name, value in self.values.items()
-            }
-            closed = self.close(start, self.motors)
-            if closed is not None:
-                yield closed
+    def find_motions(self, q: FloatArray) -> FloatArray:
+        """Return rates (j, m) that keep the loops closed at joint values (j,); m is the mobility.
 
-    def get_pin_angle(self, pin: GraphJoint) -> float:
-        """Return the angle of a pin [rad]."""
-        T = self.places
-        between = geometry.invert_pose(T[pin.body_a] @ pin.T_a) @ T[pin.body_b] @ pin.T_b
-        return float(geometry.log_so3(between[:3, :3]) @ pin.axis)
+        Rates are orthonormal in the scaled values.
+        """
+        rows = self.linearize(q[None])[1][0]
+        if not len(rows):
+            return np.diag(self._columns)
+        _, s, V = np.linalg.svd(rows)
+        null = V[int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum()) :]
+        return self._columns[:, None] * null.T
 
+    def find_twists(self, q: FloatArray, body: str, frame: FloatArray) -> FloatArray:
+        """Return the twist (6, j) of a frame (4, 4) of a body by joint values (j,), about its
+        origin in base axes, as (turn, velocity) [rad, m].
+        """
+        placement = self.place(q[None])
+        point = (self.get_place(placement, body) @ frame)[:, :3, 3]
+        return np.concatenate(self.differentiate(placement, body, point), axis=1)[0]
 
-def find_home(graph: JointGraph) -> JointGraph:
-    """Return the mechanism at the closed pose nearest to zero, with further ones as `homes`.
-
-    Poses of larger mobility, from which a link could move either way, are left out.
-
-    Raises
-    ------
-    MechanismError : the loops do not close.
-    """
-    closed = []
-    for seed in range(STARTS):
-        rng = np.random.default_rng(seed)
-        spread = 0.0 if seed == 0 else SPREAD
-        solution = graph.close({name: rng.uniform(-spread, spread) for name in graph.values})
-        if solution is not None:
-            closed.append(solution)
-    if not closed:
-        raise MechanismError("the loops do not close from any start; check the closures")
-    mobilities = [pose.motions().shape[1] for pose in closed]
-    regular = [pose for pose, m in zip(closed, mobilities, strict=True) if m == min(mobilities)]
-    nearest = sorted(regular, key=lambda pose: sum(value**2 for value in pose.values.values()))
-    return replace(nearest[0], homes=tuple(pose.values for pose in nearest))
+    def without(self, bodies: frozenset[str]) -> JointGraph:
+        """Return the mechanism without bodies that carry no others, and without their joints."""
+        ends = lambda joint: bodies & {joint.body_a, joint.body_b}  # noqa: E731
+        return replace(
+            self,
+            tree=tuple(joint for joint in self.tree if not ends(joint)),
+            closing=tuple(joint for joint in self.closing if not ends(joint)),
+        )

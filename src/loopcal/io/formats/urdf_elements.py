@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints and constraints of a URDF, from the attributes of their elements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import FileError
+from loopcal.io.formats.program_format import parse_number
+from loopcal.typing import FloatArray
+
+SAME_AXIS = 1e-9
+"""Difference of two axes that count as the same [1]."""
+KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
+CONSTRAINTS = {
+    "fixed": "",
+    "link": "",
+    "revolute": "R",
+    "continuous": "R",
+    "spherical": "S",
+    "ball": "S",
+    "universal": "U",
+}
+"""Types of a constraint -> the joint that it is; "" for none."""
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A joint.
+
+    Attributes
+    ----------
+    kind : R, P, or "" for a fixed joint. parent, child : links.
+    origin : (4, 4) T_parent_joint [m]. axis : (3,) unit vector. limits : [rad or m].
+    line : of the joint, from 1. start, end : bytes of its origin's tag, -1 without.
+    mimic : the joint that it follows, factor and offset [rad or m]; None without.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: FloatArray
+    axis: FloatArray
+    limits: tuple[float, float] | None
+    line: int
+    start: int
+    end: int
+    mimic: tuple[str, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class UrdfConstraint:
+    """A constraint between two links.
+
+    Attributes
+    ----------
+    kind : R, S, U, or "" for a rigid link that was cut. links : parent and child.
+    origins : (4, 4) of each in its link [m]. axes : (3,) unit vector in each of these frames.
+    """
+
+    name: str
+    kind: str
+    links: tuple[str, str]
+    origins: tuple[FloatArray, FloatArray]
+    axes: tuple[FloatArray, FloatArray]
+    line: int
+
+
+@dataclass
+class OpenElement:
+    """A joint or constraint while it is parsed: attributes of its elements by name."""
+
+    name: str
+    kind: str
+    line: int
+    elements: dict[str, dict[str, str]] = field(default_factory=dict)
+    start: int = -1
+
+
+def build_joint(joint: OpenElement, raw: bytes, path: Path) -> UrdfJoint:
+    """Return a joint from its elements."""
+    name, elements, line = joint.name, joint.elements, joint.line
+    if joint.kind not in KINDS:
+        sentence = f"joint {name!r} is of type {joint.kind!r}; allowed: {', '.join(KINDS)}"
+        raise FileError(sentence, path, line)
+    parent, child = _get_links(joint, "joint", path)
+    limit, kind = elements.get("limit", {}), KINDS[joint.kind]
+    T = _parse_origin(elements.get("origin", {}), f"joint {name!r}", path, line)
+    axis = np.array([1.0, 0.0, 0.0])
+    if kind:
+        axis = _parse_axis(elements.get("axis", {}), f"joint {name!r}", path, line)
+    limits = None
+    if kind and joint.kind != "continuous" and {"lower", "upper"} <= limit.keys():
+        low, high = (
+            parse_number(limit[key], f"{key} of joint {name!r}", path, line)
+            for key in ("lower", "upper")
+        )
+        limits = (low, high) if low < high else None
+    end = raw.index(b">", joint.start) + 1 if joint.start >= 0 else -1
+    mimic = elements.get("mimic")
+    followed = None
+    if mimic is not None:
+        factor, offset = (
+            parse_number(mimic.get(key, default), f"{key} of joint {name!r}", path, line)
+            for key, default in (("multiplier", "1"), ("offset", "0"))
+        )
+        followed = mimic.get("joint", ""), factor, offset
+    return UrdfJoint(name, kind, parent, child, T, axis, limits, line, joint.start, end, followed)
+
+
+def build_constraint(constraint: OpenElement, path: Path) -> UrdfConstraint:
+    """Return a constraint from its elements."""
+    name, elements, line = constraint.name, constraint.elements, constraint.line
+    what = f"constraint {name!r}"
+    if constraint.kind.lower() not in CONSTRAINTS:
+        sentence = f"{what} is of type {constraint.kind!r}; allowed: {', '.join(CONSTRAINTS)}"
+        raise FileError(sentence, path, line)
+    kind, links = CONSTRAINTS[constraint.kind.lower()], _get_links(constraint, "constraint", path)
+    first, second = (
+        _parse_origin(elements.get(f"{end}_origin", {}), what, path, line)
+        for end in ("parent", "child")
+    )
+    stated = [end for end in ("parent", "child") if f"{end}_axis" in elements]
+    needed = {"R": ["parent"], "U": ["parent", "child"]}.get(kind, [])
+    if missing := [end for end in needed if end not in stated]:
+        sentence = f"{what} is {constraint.kind} and states no axis; add <{missing[0]}_axis xyz=..>"
+        raise FileError(sentence, path, line)
+    axes = {
+        end: _parse_axis(elements[f"{end}_axis"], what, path, line)
+        if end in needed
+        else np.eye(3)[2]
+        for end in ("parent", "child")
+    }
+    if kind == "R" and "child" in stated:
+        other = _parse_axis(elements["child_axis"], what, path, line)
+        if np.abs(other - axes["parent"]).max() > SAME_AXIS:
+            sentence = f"{what} is {constraint.kind}, but its child_axis is not its parent_axis"
+            action = "turn child_origin so that both frames share the axis, or leave child_axis out"
+            raise FileError(f"{sentence}; {action}", path, line)
+    return UrdfConstraint(name, kind, links, (first, second), (axes["parent"], axes["child"]), line)
+
+
+def _get_links(joint: OpenElement, what: str, path: Path) -> tuple[str, str]:
+    """Return the links that a joint or constraint names."""
+    for needed in ("parent", "child"):
+        if not joint.elements.get(needed, {}).get("link"):
+            sentence = f"{what} {joint.name!r} names no {needed} link; add <{needed} link=..>"
+            raise FileError(sentence, path, joint.line)
+    return joint.elements["parent"]["link"], joint.elements["child"]["link"]
+
+
+def _parse_origin(origin: Mapping[str, str], what: str, path: Path, line: int) -> FloatArray:
+    """Return an origin as (4, 4)."""
+    xyz = _parse_three(origin.get("xyz", "0 0 0"), f"xyz of {what}", path, line)
+    rpy = _parse_three(origin.get("rpy", "0 0 0"), f"rpy of {what}", path, line)
+    return geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
+
+
+def _parse_axis(axis: Mapping[str, str], what: str, path: Path, line: int) -> FloatArray:
+    """Return an axis as unit vector (3,)."""
+    vector = _parse_three(axis.get("xyz", "1 0 0"), f"the axis of {what}", path, line)
+    length = float(np.linalg.norm(vector))
+    if not length > 0:
+        raise FileError(f"{what} has the axis 0 0 0; write a direction", path, line)
+    return vector / length
+
+
+def _parse_three(text: str, what: str, path: Path, line: int) -> FloatArray:
+    """Return three numbers."""
+    numbers = text.split()
+    if len(numbers) != 3:
+        sentence = f"{what} is {text!r}, but three numbers are needed; correct it"
+        raise FileError(sentence, path, line)
+    return np.array([parse_number(number, what, path, line) for number in numbers])

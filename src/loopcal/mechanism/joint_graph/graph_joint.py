@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A joint between two bodies of a mechanism."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.typing import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class GraphJoint:
+    """A joint: the frame `T_a` of one body, moved by the joint, is the frame `T_b` of the other.
+
+    Attributes
+    ----------
+    kind : R (rotary), P (slide) or S (ball joint). body_a, body_b : the bodies.
+    T_a, T_b : (4, 4) frames in their bodies [m]. axis : (3,) unit vector in both; unused for S.
+    origin_a, origin_b : names of the places in the source file that give these frames; empty where
+        nothing can be shifted there.
+    shifts : axes of these frames along which a shift changes the mechanism.
+    limits : allowed values [rad or m], or None.
+    """
+
+    name: str
+    kind: Literal["R", "P", "S"]
+    body_a: str
+    body_b: str
+    T_a: FloatArray
+    T_b: FloatArray
+    axis: FloatArray
+    origin_a: str = ""
+    origin_b: str = ""
+    shifts: str = "xyz"
+    limits: tuple[float, float] | None = None
+
+    @property
+    def is_pin(self) -> bool:
+        """Return whether this rotary joint has places of its own on both bodies."""
+        return self.kind == "R" and bool(self.origin_a and self.origin_b)
+
+    def reverse(self) -> GraphJoint:
+        """Return the joint from the other body; its value stays the same.
+
+        T_a J(q) = T_b means T_b J(-q) = T_a, and J(-q) about an axis is J(q) about its opposite. A
+        pin has the name of the place on its first body.
+        """
+        swapped = replace(
+            self,
+            body_a=self.body_b,
+            body_b=self.body_a,
+            T_a=self.T_b,
+            T_b=self.T_a,
+            axis=-self.axis,
+            origin_a=self.origin_b,
+            origin_b=self.origin_a,
+        )
+        return replace(swapped, name=self.origin_b) if self.is_pin else swapped
+
+    def orient(self, body: str) -> GraphJoint:
+        """Return the joint from one of its bodies."""
+        return self if body == self.body_a else self.reverse()
+
+    def get_other_body(self, body: str) -> str:
+        """Return the body at the other end."""
+        return self.body_b if body == self.body_a else self.body_a
+
+    def move(self, values: FloatArray) -> FloatArray:
+        """Return the frames (.., 4, 4) of the second body in the first one, at values (..)."""
+        vectors = values[..., None] * self.axis
+        turn, shift = (vectors, 0 * vectors) if self.kind == "R" else (0 * vectors, vectors)
+        return self.T_a @ geometry.make_pose(geometry.exp_so3(turn), shift)
+
+
+def list_axes_across(axis: FloatArray) -> str:
+    """Return the axes of a joint's frame that are not the joint's."""
+    return "".join(a for a, part in zip("xyz", np.abs(axis), strict=True) if part < 1 - 1e-9)

@@ -1,0 +1,271 @@
+"""URDF files of machines that are drawn at home, and a solver of their closures without loopcal.
+
+A machine is a list of joints between bodies, with frames in the base. `write_machine` spans a tree,
+in an order that a seed decides, and writes the other joints as closures. `UrdfSolver` reads any
+such URDF with xml and yaml, and closes its loops by Newton's method with finite differences.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
+
+BASE, PLATFORM = "base", "platform"
+TOOL = (0.02, -0.01, 0.05)
+"""Place of the platform frame in its link [m]."""
+
+
+@dataclass(frozen=True)
+class MachineJoint:
+    """A joint R, P (about or along z), U (about x, then y) or S of two bodies; T in the base."""
+
+    name: str
+    kind: str
+    a: str
+    b: str
+    T: np.ndarray
+    is_motor: bool = False
+
+
+def make_pose(R: np.ndarray, p: Sequence[float]) -> np.ndarray:
+    """Return a pose (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, p
+    return T
+
+
+def make_hexapod(legs: Sequence[str], seed: int = 0) -> list[MachineJoint]:
+    """Return a hexapod whose legs are chains such as UPS or RUS, with irregular joint centers.
+
+    The one letter P, or else the first R, is driven.
+    """
+    rng = np.random.default_rng(seed)
+    is_second = np.arange(6) % 2 == 1
+    below = np.deg2rad(120) * (np.arange(6) // 2) + np.where(is_second, 0.2, -0.2)
+    above = below + np.where(is_second, 0.7, -0.7)
+    joints = []
+    for k, letters in enumerate(legs):
+        foot = np.array([0.5 * np.cos(below[k]), 0.5 * np.sin(below[k]), 0.0])
+        head = np.array([0.3 * np.cos(above[k]), 0.3 * np.sin(above[k]), 0.6])
+        foot, head = foot + rng.uniform(-0.02, 0.02, 3), head + rng.uniform(-0.02, 0.02, 3)
+        knee = foot + np.array([0.0, 0.0, 0.1]) if letters[0] == "P" else foot
+        if letters[0] == "R":
+            knee = foot + 0.15 * np.array([-np.sin(below[k]), np.cos(below[k]), 0.3])
+        along = Rotation.align_vectors([head - knee], [[0.0, 0.0, 1.0]])[0].as_matrix()
+        across = Rotation.from_euler("zy", [below[k], np.pi / 2]).as_matrix()
+        places = {
+            "UPS": [(along, foot), (along, (foot + head) / 2), (along, head)],
+            "PUS": [(np.eye(3), foot), (along, knee), (along, head)],
+            "RUS": [(across, foot), (along, knee), (along, head)],
+        }
+        frames = places["PUS" if letters[0] == "P" else "RUS" if letters[0] == "R" else "UPS"]
+        bodies = [BASE, f"leg{k + 1}_a", f"leg{k + 1}_b", PLATFORM]
+        driven = letters.index("P") if "P" in letters else 0
+        for i, (letter, (R, p)) in enumerate(zip(letters, frames, strict=True)):
+            name = f"{letter.lower()}{k + 1}_{i + 1}"
+            joint = MachineJoint(name, letter, *bodies[i : i + 2], make_pose(R, p), i == driven)
+            joints.append(joint)
+    return joints
+
+
+def write_machine(joints: Sequence[MachineJoint], seed: int | None = None) -> tuple[str, str]:
+    """Return a URDF and its closure file.
+
+    The tree grows from the base in the order of the joints, or in a random one. Other joints are
+    closures: of type 3d at ball joints, else of type 6d between a link that the joint moves and a
+    frame on the other body.
+    """
+    order = list(joints)
+    if seed is not None:
+        np.random.default_rng(seed).shuffle(order)  # type: ignore[arg-type]
+    frames, text, closures, kinds = {BASE: np.eye(4)}, [], [], []
+    overrides: dict[str, str] = {}
+    links = [BASE]
+    waiting = sorted(order, key=lambda j: not j.is_motor) if seed is not None else order
+    while True:
+        ready = [j for j in waiting if (j.a in frames) != (j.b in frames)]
+        if not ready:
+            break
+        joint = ready[0]
+        parent, child = (joint.a, joint.b) if joint.a in frames else (joint.b, joint.a)
+        text.append(_write_joint(joint, parent, child, frames[parent], overrides))
+        frames[child] = joint.T
+        links.append(child)
+        waiting = [j for j in waiting if j is not joint]
+    for joint in waiting:
+        near, far = f"{joint.name}_near", f"{joint.name}_far"
+        links += [near, far]
+        carrier = joint.a
+        if joint.kind != "S":
+            carrier = f"{joint.name}_moved"
+            links.append(carrier)
+            text.append(_write_joint(joint, joint.a, carrier, frames[joint.a], overrides))
+            frames[carrier] = joint.T
+        for link, on in ((near, carrier), (far, joint.b)):
+            place = np.linalg.inv(frames[on]) @ joint.T
+            text.append(write_element(f"{link}_frame", "fixed", on, link, place))
+        closures.append([near, far])
+        kinds.append("3d" if joint.kind == "S" else "6d")
+    links.append("tool")
+    text.append(write_element("tool_frame", "fixed", PLATFORM, "tool", make_pose(np.eye(3), TOOL)))
+    names = "".join(f'<link name="{link}"/>\n' for link in links)
+    urdf = f'<robot name="machine">\n{names}{"".join(text)}</robot>\n'
+    motors = [joint.name for joint in joints if joint.is_motor]
+    closing = f"closed_loop: {closures}\ntype: {kinds}\nname_mot: {motors}\n"
+    replaced = f"joint_name: {list(overrides)}\njoint_type: {list(overrides.values())}\n"
+    return urdf, closing + replaced
+
+
+def _write_joint(
+    joint: MachineJoint, parent: str, child: str, frame: np.ndarray, overrides: dict[str, str]
+) -> str:
+    """Return a joint of the tree; a reversed one has the opposite axis, so that values agree."""
+    is_reversed = parent != joint.a
+    if joint.kind in "US":
+        universal = "UJOINT_YX" if is_reversed else "UJOINT_XY"
+        overrides[joint.name] = universal if joint.kind == "U" else "SPHERICAL"
+    kind = "prismatic" if joint.kind == "P" else "revolute"
+    axis = "0 0 -1" if is_reversed else "0 0 1"
+    place = np.linalg.inv(frame) @ joint.T
+    return write_element(joint.name, kind, parent, child, place, axis)
+
+
+def write_element(
+    name: str, kind: str, parent: str, child: str, T: np.ndarray, axis: str = "0 0 1"
+) -> str:
+    """Return a <joint>."""
+    xyz = " ".join(repr(float(v)) for v in T[:3, 3])
+    rpy = " ".join(repr(float(v)) for v in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
+    return (
+        f'<joint name="{name}" type="{kind}">\n  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
+        f'  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
+        f'  <axis xyz="{axis}"/>\n</joint>\n'
+    )
+
+
+class UrdfSolver:
+    """Closes the loops of a URDF; an implementation of its own, for comparison."""
+
+    def __init__(self, urdf: Path, closures: Path | None) -> None:
+        self.root = ET.fromstring(urdf.read_text())
+        content = {} if closures is None else YAML(typ="safe").load(closures.read_text())
+        self.pairs = content.get("closed_loop", [])
+        self.kinds = [str(kind).lower() for kind in content.get("type", [])]
+        self.motors = content.get("name_mot", [])
+        self.overrides = dict(
+            zip(content.get("joint_name", []), content.get("joint_type", []), strict=True)
+        )
+        self.joints = {joint.get("name"): joint for joint in self.root.findall("joint")}
+        self.columns: dict[str, slice] = {}
+        n = 0
+        for name, joint in self.joints.items():
+            kind = self.overrides.get(name, joint.get("type"))
+            width = {"SPHERICAL": 3, "FIXED": 0, "fixed": 0}.get(kind, 2 if "UJ" in kind else 1)
+            self.columns[name] = slice(n, n + width)
+            n += width
+        self.values = np.zeros(n)
+        driven = [i for name in self.motors for i in range(n)[self.columns[name]]]
+        self.driven, self.free = np.array(driven), np.setdiff1d(np.arange(n), driven)
+
+    def place(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the poses of all links in the base."""
+        left = dict(self.joints)
+        children = {joint.find("child").get("link") for joint in left.values()}
+        links = [link.get("name") for link in self.root.findall("link")]
+        T = {next(link for link in links if link not in children): np.eye(4)}
+        while left:
+            for name, joint in list(left.items()):
+                parent = joint.find("parent").get("link")
+                if parent in T:
+                    origin = read_origin(joint.find("origin"))
+                    motion = self._move(name, joint, values[self.columns[name]])
+                    T[joint.find("child").get("link")] = T[parent] @ origin @ motion
+                    del left[name]
+        return T
+
+    def _move(self, name: str, joint: ET.Element, value: np.ndarray) -> np.ndarray:
+        kind = self.overrides.get(name, joint.get("type"))
+        if not value.size:
+            return np.eye(4)
+        if kind == "SPHERICAL":
+            return make_pose(Rotation.from_rotvec(value).as_matrix(), np.zeros(3))
+        if "UJOINT" in kind:
+            return make_pose(Rotation.from_euler(kind[-2:], value).as_matrix(), np.zeros(3))
+        axis = read_vector(joint.find("axis"), (1.0, 0.0, 0.0))
+        axis /= np.linalg.norm(axis)
+        if kind == "prismatic":
+            return make_pose(np.eye(3), value[0] * axis)
+        return make_pose(Rotation.from_rotvec(value[0] * axis).as_matrix(), np.zeros(3))
+
+    def _residual(self, values: np.ndarray) -> np.ndarray:
+        T = self.place(values)
+        parts = []
+        for pair, kind in zip(self.pairs, self.kinds, strict=True):
+            A, B = (
+                T[self.joints[n].find("child").get("link") if n in self.joints else n] for n in pair
+            )
+            parts.append(A[:3, 3] - B[:3, 3])
+            if kind == "6d":
+                parts.append(Rotation.from_matrix(A[:3, :3].T @ B[:3, :3]).as_rotvec())
+        for constraint in self.root.findall("constraint"):
+            A, B = (
+                T[constraint.find(end).get("link")] @ read_origin(constraint.find(f"{end}_origin"))
+                for end in ("parent", "child")
+            )
+            parts.append(A[:3, 3] - B[:3, 3])
+            R = A[:3, :3].T @ B[:3, :3]
+            first, second = (
+                read_vector(constraint.find(f"{end}_axis"), (0.0, 0.0, 1.0))
+                for end in ("parent", "child")
+            )
+            if constraint.get("type") == "fixed":
+                parts.append(Rotation.from_matrix(R).as_rotvec())
+            elif constraint.get("type") == "revolute":
+                parts.append(np.cross(first, R @ first))
+            elif constraint.get("type") == "universal":
+                parts.append(np.array([first @ R @ second]))
+        return np.concatenate(parts)
+
+    def solve(self, q: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """Return all joint values with the motors at q, with idle motions as at the start."""
+        values = np.zeros(len(self.values)) if start is None else start.copy()
+        values[self.driven] = q
+        for _ in range(25):
+            r = self._residual(values)
+            if np.abs(r).max() < 1e-14:
+                break
+            J = np.empty((len(r), len(self.free)))
+            for column, i in enumerate(self.free):
+                moved = values.copy()
+                moved[i] += 1e-7
+                J[:, column] = (self._residual(moved) - r) / 1e-7
+            values[self.free] -= np.linalg.lstsq(J, r, rcond=1e-6)[0]
+        assert np.abs(r).max() < 1e-11  # [m, rad]
+        return values
+
+    def forward(self, q: np.ndarray, link: str, start: np.ndarray | None = None) -> np.ndarray:
+        """Return the pose of a link with the motors at q."""
+        return self.place(self.solve(q, start))[link]
+
+
+def read_origin(origin: ET.Element | None) -> np.ndarray:
+    """Return an origin as (4, 4)."""
+    if origin is None:
+        return np.eye(4)
+    xyz, rpy = (
+        np.array([float(v) for v in origin.get(k, "0 0 0").split()]) for k in ("xyz", "rpy")
+    )
+    return make_pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
+
+
+def read_vector(element: ET.Element | None, default: tuple[float, float, float]) -> np.ndarray:
+    """Return the xyz of an element."""
+    if element is None or element.get("xyz") is None:
+        return np.array(default)
+    return np.array([float(v) for v in element.get("xyz").split()])
