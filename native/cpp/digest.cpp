@@ -17,6 +17,9 @@ const char *loopcal_instruction_set(int i, int *works);
 int loopcal_fold(int, const double *, const double *, double *, int64_t, int64_t, int64_t, int64_t);
 int loopcal_linearize(int, const int64_t *, const double *, const loopcal::Strided *,
                       const loopcal::Strided *, double *const *, int64_t, int64_t);
+int loopcal_differentiate(int, const int64_t *, const double *, const int64_t *,
+                          const loopcal::Strided *, const loopcal::Strided *, double *, double *,
+                          int64_t, int64_t);
 int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
                   const loopcal::Strided *, int64_t, int64_t, int64_t, loopcal::Task, void *,
                   double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
@@ -116,6 +119,28 @@ struct Machine {
     }
 };
 
+// A map with a parameter for every slot of a limb, which moves it in both limbs of a group, and two
+// functions of the pose for every drive.
+std::vector<int64_t> list_entries(int64_t *parameters) {
+    std::vector<int64_t> out = {0, 2};
+    int64_t place = 0, parameter = 0, drive = 0;
+    for (const GroupShape &shape : SHAPES) {
+        int64_t joints = 0;
+        while (shape.joints[joints]) joints++;
+        int64_t slots = 6 * (joints + 2) + (joints > 0) + (shape.ending == 2);
+        for (int k = 0; k < LIMBS; k++, drive++) {
+            out.push_back(slots + 2);
+            for (int64_t s = 0; s < slots; s++)
+                out.insert(out.end(), {s, parameter + s, place++, -1});
+            for (int64_t f = 0; f < 2; f++)
+                out.insert(out.end(), {slots + shape.driven, parameter + f, 2 * drive + f, 2 * drive + f});
+        }
+        parameter += slots;
+    }
+    *parameters = out[0] = parameter;
+    return out;
+}
+
 void add_kinematics(int set, bool free, int64_t t, int64_t n, Digest &digest) {
     Random random;
     Machine machine(random, free);
@@ -150,6 +175,19 @@ void add_kinematics(int set, bool free, int64_t t, int64_t n, Digest &digest) {
     arrays[2] = {poses.data(), 16 * n, 16};
     loopcal_linearize(set, machine.structure.data(), machine.numbers.data(), arrays, solved.data(),
                       rows_out.data(), t, n);
+    int64_t parameters = 0;
+    std::vector<int64_t> entries = list_entries(&parameters);
+    Reals scales = random.reals((size_t)(t * machine.displacements), 1.0);
+    Reals terms = random.reals((size_t)(t * 2 * DRIVES), 1.0);
+    Reals basis = random.reals((size_t)(n * 2 * DRIVES), 1.0), gains = random.reals(DRIVES, 1.0);
+    Reals twists((size_t)(6 * t * n * parameters)), driven((size_t)(6 * t * n * DRIVES));
+    loopcal::Strided mapped[] = {arrays[0], arrays[1], arrays[2],
+                                 {scales.data(), machine.displacements, 0},
+                                 {terms.data(), 2 * DRIVES, 0}, {basis.data(), 0, 2 * DRIVES},
+                                 {gains.data(), 0, 0}};
+    loopcal_differentiate(set, machine.structure.data(), machine.numbers.data(), entries.data(),
+                          mapped, solved.data(), twists.data(), driven.data(), t, n);
+    if (!free) digest.add(twists), digest.add(driven);
     digest.add(poses), digest.add(residual), digest.add(iterations);
     digest.add(status), digest.add(sign);
     for (size_t g = 0; g < GROUPS; g++) digest.add(joints[g]), digest.add(rows[g]);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 1;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 2;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -70,6 +70,14 @@ EXPORT int loopcal_linearize(int set, const int64_t *structure, const double *nu
                              const loopcal::Strided *arrays, const loopcal::Strided *joints,
                              double *const *out, int64_t t, int64_t n) {
     return list_sets()[set].kernels->linearize(structure, numbers, arrays, joints, out, t, n);
+}
+
+EXPORT int loopcal_differentiate(int set, const int64_t *structure, const double *numbers,
+                                 const int64_t *entries, const loopcal::Strided *arrays,
+                                 const loopcal::Strided *joints, double *by_parameter,
+                                 double *by_reading, int64_t t, int64_t n) {
+    return list_sets()[set].kernels->differentiate(structure, numbers, entries, arrays, joints,
+                                                   by_parameter, by_reading, t, n);
 }
 
 EXPORT int loopcal_solve(int set, const int64_t *structure, const double *numbers,

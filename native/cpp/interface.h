@@ -32,6 +32,10 @@ struct Kernels {
     // structure, numbers : see library.py. joints, out : one for each group.
     int (*linearize)(const int64_t *structure, const double *numbers, const Strided *arrays,
                      const Strided *joints, double *const *out, int64_t t, int64_t n);
+    // arrays : see sensitivity.h
+    int (*differentiate)(const int64_t *structure, const double *numbers, const int64_t *entries,
+                         const Strided *arrays, const Strided *joints, double *by_parameter,
+                         double *by_reading, int64_t t, int64_t n);
     int (*solve)(const int64_t *structure, const double *numbers, const Strided *arrays,
                  const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, Task task,
                  void *context, double *T, double *const *joints_out, double *residual,

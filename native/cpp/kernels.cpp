@@ -4,6 +4,7 @@
 #include "fold.h"
 #include "interface.h"
 #include "linearize.h"
+#include "sensitivity.h"
 #include "solve.h"
 
 namespace INSTRUCTION_SET {
@@ -28,6 +29,6 @@ static int call_solve(const int64_t *structure, const double *numbers,
 }
 
 extern const loopcal::Kernels kernels;
-const loopcal::Kernels kernels = {fold, call_linearize, call_solve};
+const loopcal::Kernels kernels = {fold, call_linearize, differentiate, call_solve};
 
 }  // namespace INSTRUCTION_SET

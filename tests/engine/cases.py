@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.engine import LENGTH, PITCH, Block, Group, Program, State
+from loopcal.engine import LENGTH, PITCH, Block, Group, MapPattern, ParameterMap, Program, State
 from loopcal.mechanism import Mechanism
 
 Array = NDArray[np.float64]
@@ -254,3 +254,49 @@ def dense_derivatives(program: Program, blocks: Any, free: bool = False) -> Arra
             rows = block.A[:, :, k] @ platform + own_rows
             parts.append(-np.linalg.solve(U, rows))
     return np.concatenate(parts, axis=2)
+
+
+# --- maps of parameters ---------------------------------------------------------------------------
+
+
+def draw_map(program: Program, shape: tuple[int, int], per_trial: bool) -> ParameterMap:
+    """Draw the derivatives of displacements and joint values by parameters for (t, n) rows.
+
+    One parameter for each displacement in another order, two that move many, some of them twice,
+    and three functions of the pose for each joint. Without `per_trial` trials and poses share what
+    they can.
+    """
+    rng, (t, n) = np.random.default_rng(program.n_displacements), shape
+    s, a = program.n_displacements, program.n_joints
+    many = np.arange(0, s, 2)
+    places = np.concatenate([np.arange(s), many, many[::3]])
+    parameters = np.concatenate([rng.permutation(s), np.full(len(many), s), many[::3] * 0 + s + 1])
+    joint, function = (grid.ravel() for grid in np.mgrid[:a, :3])
+    parameter = np.where(function == 0, s + 2, np.where(function == 1, s + 1, s + 3 + joint))
+    pattern = MapPattern(
+        s + 3 + a,
+        np.column_stack([places, parameters]),
+        np.column_stack([joint, function, parameter]),
+    )
+    first, rows = (t, (t, n)) if per_trial else (1, (1, 1))
+    return ParameterMap(
+        pattern,
+        rng.normal(size=(first, len(places))),
+        rng.normal(size=(first, len(joint))),
+        rng.normal(size=(*rows, a, 3)),
+        rng.uniform(0.5, 2.0, (*rows, a)),
+    )
+
+
+def spread_map(
+    program: Program, inputs: ParameterMap, shape: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return de/dp (t, n, s, p) and dq/dp (t, n, a, p) of a map."""
+    p, (t, n) = inputs.pattern.parameters, shape
+    of_e, of_q = np.zeros((t, n, program.n_displacements, p)), np.zeros((t, n, program.n_joints, p))
+    for z, (place, parameter) in enumerate(inputs.pattern.displacements):
+        of_e[..., place, parameter] += inputs.displacements[:, None, z]
+    for y, (joint, function, parameter) in enumerate(inputs.pattern.joints):
+        change = inputs.basis[..., joint, function] * inputs.joints[:, None, y]
+        of_q[..., joint, parameter] += change
+    return of_e, of_q

@@ -28,7 +28,8 @@ def make_counting_engine(variant: str) -> Engine:
     """Return the NumPy engine under another name, as an entry point would."""
     if variant not in ("", "fast"):
         raise ValueError(f"no variant {variant!r}")
-    functions = numpy_engine.solve, numpy_engine.linearize, lambda factor, rows: factor + len(rows)
+    own = numpy_engine
+    functions = own.solve, own.linearize, lambda factor, rows: factor + len(rows), own.differentiate
     return Engine(f"counting:{variant}", "1.0", *functions)
 
 

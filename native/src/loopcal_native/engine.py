@@ -10,8 +10,8 @@ from importlib.metadata import version
 
 import numpy as np
 
-from loopcal.engine import Block, ClosureBlocks, Engine, Program, State, Task
-from loopcal.typing import FloatArray
+from loopcal.engine import Block, ClosureBlocks, Engine, ParameterMap, Program, State, Task
+from loopcal.typing import FloatArray, IntArray
 from loopcal_native.library import (
     TASK_FAILED,
     Strided,
@@ -21,7 +21,7 @@ from loopcal_native.library import (
     load_library,
     require_done,
 )
-from loopcal_native.programs import flatten_program, require
+from loopcal_native.programs import flatten_pattern, flatten_program, require
 from loopcal_native.tasks import NO_TASK, TaskCalls
 
 
@@ -38,7 +38,7 @@ def make_engine(variant: str = "") -> Engine:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
     own = NativeFunctions(sets[name])
     number = version("loopcal-native")
-    return Engine(f"native:{name}", number, own.solve, own.linearize, own.fold)
+    return Engine(f"native:{name}", number, own.solve, own.linearize, own.fold, own.differentiate)
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,36 @@ class NativeFunctions:
                 blocks.append(Block(*(part[..., cuts[i] : cuts[i + 1]] for i in range(4))))
         return ClosureBlocks(tuple(closure), tuple(passive), flat.unknown)
 
+    def differentiate(
+        self, program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+    ) -> tuple[FloatArray, FloatArray]:
+        """Differentiate the platform in parameters and readings."""
+        t, n = shape = state.T.shape[:2]
+        flat = flatten_program(program, False)
+        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
+        joints = [as_reals(a) for a in joints]
+        _require_arrays(program, arrays, joints, shape)
+        entries, numbers = _flatten_map(program, inputs, shape)
+        p, a = inputs.pattern.parameters, program.n_joints
+        by_parameter, by_reading = np.empty((t, n, 6, p)), np.empty((t, n, 6, a))
+        if t * n:
+            call = load_library().loopcal_differentiate
+            require_done(
+                call(
+                    self.instruction_set,
+                    flat.structure.ctypes.data,
+                    flat.numbers.ctypes.data,
+                    entries.ctypes.data,
+                    _describe_all([*arrays, *numbers]),
+                    _describe_all(joints),
+                    by_parameter.ctypes.data,
+                    by_reading.ctypes.data,
+                    t,
+                    n,
+                )
+            )
+        return by_parameter, by_reading
+
     def fold(self, factor: FloatArray, rows: FloatArray) -> FloatArray:
         """Return the triangular factor R with R'R = factor'factor + rows'rows."""
         factor, rows = as_reals(factor), as_reals(rows)
@@ -166,6 +196,25 @@ def _require_arrays(
         is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
         is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
         require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
+
+
+def _flatten_map(
+    program: Program, inputs: ParameterMap, shape: tuple[int, int]
+) -> tuple[IntArray, list[FloatArray]]:
+    """Return the entries of a map and its four arrays of numbers."""
+    (t, n), a = shape, program.n_joints
+    pattern, basis = inputs.pattern, as_reals(inputs.basis)
+    require(basis.ndim == 4, "a basis (t | 1, n | 1, joints, functions)")
+    entries = flatten_pattern(program, pattern, basis.shape[3])
+    coefficients = [as_reals(inputs.displacements), as_reals(inputs.joints)]
+    for array, pairs in zip(coefficients, (pattern.displacements, pattern.joints), strict=True):
+        is_right = array.ndim == 2 and array.shape[1] == len(pairs) and len(array) in (1, t)
+        require(is_right, f"coefficients ({t} | 1, {len(pairs)}), not {array.shape}")
+    readings = as_reals(inputs.readings)
+    for array, end in ((basis, (a, basis.shape[3])), (readings, (a,))):
+        is_right = array.shape[2:] == end and array.shape[0] in (1, t) and array.shape[1] in (1, n)
+        require(is_right, f"derivatives ({t} | 1, {n} | 1, {end}), not {array.shape}")
+    return entries, [*coefficients, basis, readings]
 
 
 def _describe_all(arrays: Sequence[FloatArray | None]) -> ctypes.Array[Strided]:

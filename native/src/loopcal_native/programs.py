@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.engine import LENGTH, PITCH, Group, Program
+from loopcal.engine import LENGTH, PITCH, Group, MapPattern, Program
 from loopcal.typing import FloatArray, IntArray
 
 ENDINGS = {"rigid": 0, "ball": 1, "distance": 2}
@@ -57,6 +57,53 @@ def _flatten(program: Program, free: bool) -> FlatProgram:
         reals += [group.pitch, group.length]
     numbers = np.concatenate([np.asarray(a, np.float64).ravel() for a in reals])
     return FlatProgram(np.array(whole, np.int64), numbers, tuple(unknown))
+
+
+def flatten_pattern(program: Program, pattern: MapPattern, functions: int) -> IntArray:
+    """Return the entries of a map limb by limb, as `InputMap` of sensitivity.h; kept with it.
+
+    Raises
+    ------
+    ValueError : an entry points beyond the arrays of the program.
+    """
+    kept = vars(pattern).get("_native")
+    if kept is None or kept[0] is not program or kept[1] != functions:
+        entries = _list_entries(program, pattern, functions)
+        kept = vars(pattern)["_native"] = program, functions, entries
+    return kept[2]
+
+
+def _list_entries(program: Program, pattern: MapPattern, functions: int) -> IntArray:
+    """Return the entries of a map with a number for each lane's coefficient and basis."""
+    p = pattern.parameters
+    places, triples = (np.asarray(a, np.int64) for a in (pattern.displacements, pattern.joints))
+    require(places.ndim == 2 and places.shape[1] == 2, "displacements (z, 2)")
+    require(triples.ndim == 2 and triples.shape[1] == 3, "joints (y, 3)")
+    require(0 <= p < 2**31, "a number of parameters")
+    for indices, ends in (
+        (places, (program.n_displacements, p)),
+        (triples, (program.n_joints, functions, p)),
+    ):
+        inside = (indices >= 0).all() and (indices < np.array(ends)).all()
+        require(bool(inside), "entries of its displacements, joints, functions and parameters")
+    of_limbs = [np.array([p, functions], np.int64)]
+    for group in program.groups:
+        slots, first = len(group.slots), group.columns.start or 0
+        for k in range(len(group.limbs)):
+            begin = first + k * slots
+            own = np.flatnonzero((places[:, 0] >= begin) & (places[:, 0] < begin + slots))
+            none = np.full(len(own), -1)
+            parts = [np.column_stack([places[own, 0] - begin, places[own, 1], own, none])]
+            for j in np.flatnonzero(group.actuator[:, k] >= 0):
+                own = np.flatnonzero(triples[:, 0] == group.actuator[j, k])
+                joint, function, parameter = triples[own].T
+                column = np.full(len(own), slots + j)
+                basis = joint * functions + function
+                parts.append(np.column_stack([column, parameter, own, basis]))
+            entries = np.concatenate(parts)
+            entries = entries[np.argsort(entries[:, 0], kind="stable")]
+            of_limbs += [np.array([len(entries)]), entries.ravel()]
+    return np.concatenate(of_limbs).astype(np.int64)
 
 
 def _list_structure(group: Group, unknown: tuple[int, ...]) -> list[int]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine: solve closed loops, linearize them, fold rows into a factor.
+"""The engine: solve closed loops, linearize and differentiate them, fold rows into a factor.
 
-Nothing outside this package depends on how these three functions work or on which engine computes:
+Nothing outside this package depends on how these functions work or on which engine computes:
 another engine is accepted when it passes tests/engine. All functions are pure; threads may call
 them at the same time.
 """
@@ -16,11 +16,14 @@ from loopcal.engine.program import STALLED as STALLED
 from loopcal.engine.program import Block as Block
 from loopcal.engine.program import ClosureBlocks as ClosureBlocks
 from loopcal.engine.program import Group as Group
+from loopcal.engine.program import MapPattern as MapPattern
+from loopcal.engine.program import ParameterMap as ParameterMap
 from loopcal.engine.program import Program as Program
 from loopcal.engine.program import Slot as Slot
 from loopcal.engine.program import State as State
 from loopcal.engine.program import Task as Task
 from loopcal.engine.selection import Engine as Engine
+from loopcal.engine.selection import differentiate as differentiate
 from loopcal.engine.selection import fold as fold
 from loopcal.engine.selection import get_current_engine as get_current_engine
 from loopcal.engine.selection import linearize as linearize

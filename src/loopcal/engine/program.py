@@ -160,3 +160,34 @@ class ClosureBlocks:
     closure: tuple[Block, ...]
     passive: tuple[Block, ...]
     joints: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class MapPattern:
+    """Which of p parameters move which displacements and actuated joints.
+
+    parameters : p. displacements : (z, 2) pairs of a place in e and a parameter.
+    joints : (y, 3) a column of q, the number of a basis function, and a parameter.
+    """
+
+    parameters: int
+    displacements: IntArray
+    joints: IntArray
+
+
+@dataclass(frozen=True)
+class ParameterMap:
+    """Derivatives of displacements e and actuated joints q by parameters and by readings.
+
+    de = sum of displacements * dp over the pairs of the pattern;
+    dq = sum of basis * joints * dp over its triples, + readings * d reading.
+
+    displacements : (t | 1, z). joints : (t | 1, y).
+    basis : (t | 1, n | 1, n_joints, functions). readings : (t | 1, n | 1, n_joints).
+    """
+
+    pattern: MapPattern
+    displacements: FloatArray
+    joints: FloatArray
+    basis: FloatArray
+    readings: FloatArray

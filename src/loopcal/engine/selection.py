@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which engine computes, and the three functions that call it.
+"""Which engine computes, and the functions that call it.
 
 The environment variable LOOPCAL_ENGINE names the engine of a process: `numpy`, or the name of an
 entry point of the group `loopcal.engines`, such as `native`, with a variant of that engine behind a
@@ -18,7 +18,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from loopcal.engine import numpy_engine
-from loopcal.engine.program import ClosureBlocks, Program, State, Task
+from loopcal.engine.program import ClosureBlocks, ParameterMap, Program, State, Task
 from loopcal.errors import MissingPackageError
 from loopcal.findings import report_finding
 from loopcal.typing import FloatArray
@@ -31,7 +31,7 @@ NATIVE_MODULE = "loopcal_native"
 
 @dataclass(frozen=True)
 class Engine:
-    """An implementation of `solve`, `linearize` and `fold`, whose docstrings are below.
+    """An implementation of the functions whose docstrings are below.
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
     """
@@ -41,6 +41,7 @@ class Engine:
     solve: Callable[..., State]
     linearize: Callable[..., ClosureBlocks]
     fold: Callable[[FloatArray, FloatArray], FloatArray]
+    differentiate: Callable[..., tuple[FloatArray, FloatArray]]
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -58,7 +59,8 @@ def select_engine(choice: str = "") -> Engine:
     choice = choice.strip() or (NATIVE if find_spec(NATIVE_MODULE) else NUMPY)
     name, _, variant = choice.partition(":")
     if choice == NUMPY:
-        functions = numpy_engine.solve, numpy_engine.linearize, numpy_engine.fold
+        own = numpy_engine
+        functions = own.solve, own.linearize, own.fold, own.differentiate
         return Engine(NUMPY, np.__version__, *functions)
     from importlib.metadata import entry_points
 
@@ -123,3 +125,22 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
     """
     return get_current_engine().fold(factor, rows)
+
+
+def differentiate(
+    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+) -> tuple[FloatArray, FloatArray]:
+    """Differentiate the platform at a state (t, n), D = -A^-1 [E de/dp + Q dq/dp].
+
+    e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
+    inputs : how parameters and readings move e and q.
+
+    Redundant actuators are weighted by the standard deviations of the program. Singular rows have
+    infinities or NaN.
+
+    Returns
+    -------
+    by_parameter, by_reading : (t, n, 6, p) and (t, n, 6, n_joints) twist of the platform per unit
+        of each, zero outside its freedoms.
+    """
+    return get_current_engine().differentiate(program, e, q, state, inputs)

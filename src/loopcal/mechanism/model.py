@@ -15,6 +15,7 @@ from loopcal.engine import Group, Program, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
+from loopcal.mechanism.parameter_units import ParameterUnits
 from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
 from loopcal.presentation import TableResult, draw
@@ -223,6 +224,12 @@ class Mechanism(TableResult):
             tuple(_map_limb(self.program, g, k, self.slots) for k in range(len(g.limbs)))
             for g in self.program.groups
         )
+
+    @cached_property
+    def all_parameters(self) -> ParameterUnits:
+        """All parameters in SI, as columns of derivatives."""
+        count = len(self.parameters)
+        return ParameterUnits(self.slots, np.arange(count), np.ones(count))
 
     @property
     def nominal(self) -> Mechanism:

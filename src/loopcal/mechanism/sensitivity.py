@@ -2,10 +2,9 @@
 """Derivatives of the platform pose and of passive joints in parameters and readings.
 
 Linearized closure without passive joints reads A y + E de + Q dq = 0, so that the platform's twist
-is y = -A^-1 (E de/dp + Q dq/dp). The equations of a limb contain its own displacements and
-actuators only; its part of the right-hand side has few columns. Its eliminated joints follow from
-U dtheta + A y + E de + Q dq = 0. Rows are computed in blocks that fit the cache. Derivation:
-docs/theory/engine.md.
+is y = -A^-1 (E de/dp + Q dq/dp), which the engine computes. A limb's eliminated joints follow from
+U dtheta + A y + E de + Q dq = 0; these equations contain its own displacements and actuators only.
+They are computed in blocks that fit the cache. Derivation: docs/theory/engine.md.
 
 Arguments are values (t | 1, p), readings q (t | 1, n, a) and the states (t, n) that they lead to.
 Failed rows have NaN.
@@ -21,7 +20,8 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Block, State
-from loopcal.mechanism.model import Columns, LimbMap, Mechanism, as_columns
+from loopcal.mechanism.model import Columns, LimbMap, Mechanism
+from loopcal.mechanism.parameter_units import ParameterUnits
 from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
@@ -46,25 +46,27 @@ class PoseSensitivity:
 
 
 def differentiate_pose(
-    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+    robot: Mechanism,
+    values: FloatArray,
+    q: FloatArray,
+    state: State,
+    columns: ParameterUnits | None = None,
 ) -> PoseSensitivity:
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
-    Rows of singular states have infinities or NaN.
+    `columns` : the parameters and their units; all parameters in SI without it. Rows of singular
+    states have infinities or NaN.
     """
-    t, n = state.T.shape[:2]
-    # six freedoms are a view, not an index
-    freedoms = as_columns(np.array(robot.program.freedoms))
-    parameters = np.zeros((t, n, 6, len(robot.parameters)))
-    readings = np.zeros((t, n, 6, len(robot.actuators)))
-    for rows, limbs in linearize_limbs(robot, values, q, state):
-        by_parameter, by_reading = limbs.solve_platform()
-        parameters[rows][:, :, freedoms] = by_parameter
-        readings[rows][:, :, freedoms] = by_reading
+    e, tau = robot.slots(values)
+    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    chosen = robot.all_parameters if columns is None else columns
+    inputs = chosen.linearize(values, tau, q)
+    derivatives = engine.differentiate(robot.program, e, joints, state, inputs)
     lost = ~is_closed(state.status)
     if lost.any():
-        parameters[lost], readings[lost] = np.nan, np.nan
-    return PoseSensitivity(parameters, readings)
+        for derivative in derivatives:
+            derivative[lost] = np.nan
+    return PoseSensitivity(*derivatives)
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,10 @@ def differentiate_passive_joints(
     names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
     parameters = np.zeros((t, n, len(names), len(robot.parameters)))
     readings = np.zeros((t, n, len(names), len(robot.actuators)))
+    platform, freedoms = differentiate_pose(robot, values, q, state), list(robot.program.freedoms)
     for rows, limbs in linearize_limbs(robot, values, q, state):
-        by_parameter, by_reading = limbs.solve_platform()
+        by_parameter = platform.parameters[rows][:, :, freedoms]
+        by_reading = platform.readings[rows][:, :, freedoms]
         for places, U, limb in limbs.passive_joints(names):
             moved, driven = np.matmul(limb.A, by_parameter), np.matmul(limb.A, by_reading)
             moved[..., limb.parameters] += limb.by_parameter
@@ -227,23 +231,6 @@ class LinearizedLimbs:
                     chosen = [f"{limbs[i].name}.{limbs[i].joints[j].name}" for j in joints]
                     yield [names.index(name) for name in chosen], block.U[:, :, k], rows
 
-    def solve_platform(self) -> tuple[FloatArray, FloatArray]:
-        """Return d freedoms / d parameters (t, n, m, p) and / d readings (t, n, m, a)."""
-        program = self.robot.program
-        weights = _weigh_rows(program, self.blocks)
-        inverse = _invert(stack_platform_rows(self.blocks), weights)
-        m = len(program.freedoms)
-        by_parameter = np.zeros((*inverse.shape[:2], m, len(self.robot.parameters)))
-        by_reading = np.zeros((*inverse.shape[:2], m, program.n_joints))
-        first = 0
-        for limb in self.rows(self.blocks.closure):
-            for i in range(limb.A.shape[2]):
-                column = inverse[..., first + i, None]
-                by_parameter[..., limb.parameters] -= column * limb.by_parameter[:, :, i, None]
-                by_reading[..., limb.readings] -= column * limb.by_reading[:, :, i, None]
-            first += limb.A.shape[2]
-        return by_parameter, by_reading
-
     def _differentiate_by_parameters(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
         """Return d rows / d parameters of limb k (t, n, r, ..)."""
         right = block.E[:, :, k]
@@ -283,39 +270,3 @@ def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) 
                     Q[..., columns[k]] = block.Q[:, :, k, :, j]
             columns_of_limbs.append(Q)
     return np.concatenate(columns_of_limbs, axis=2)
-
-
-def _weigh_rows(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray | None:
-    """Return one over the standard deviation that a redundant actuator gives each row (t, n, c).
-
-    None without redundancy.
-    """
-    if program.sigma is None:
-        return None
-    weights = []
-    for group, block in zip(program.groups, blocks.closure, strict=True):
-        j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
-        drive = np.abs(block.Q[..., j]) * np.array(program.sigma)[group.actuator[j], None]
-        weights.append(1.0 / drive.reshape(*drive.shape[:2], -1))
-    return np.concatenate(weights, axis=2)
-
-
-def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
-    """Return the inverse, or weighted pseudo-inverse, of A (t, n, c, m) as (t, n, m, c).
-
-    Matrices that are not finite give NaN.
-    """
-    if weights is not None:
-        A = A * weights[..., None]
-    good = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
-    safe = A if good.all() else np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
-    if A.shape[-1] == A.shape[-2]:
-        try:
-            out: np.ndarray = np.linalg.solve(safe, np.eye(A.shape[-1]))
-        except np.linalg.LinAlgError:
-            out = np.linalg.pinv(safe)
-    else:
-        out = np.linalg.pinv(safe)
-    if not good.all():
-        out = np.where(good[..., None, None], out, np.nan)
-    return out if weights is None else out * weights[..., None, :]

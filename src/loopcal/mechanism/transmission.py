@@ -60,14 +60,26 @@ def harmonic_frequencies(actuators: Sequence[Actuator]) -> FloatArray:
     return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
 
 
-def term_derivatives(q: FloatArray, w: FloatArray) -> list[FloatArray]:
-    """Return the derivative of the joint values in each of the 8 terms, arrays (t | 1, n, a)."""
+def term_derivatives(
+    q: FloatArray, w: FloatArray, terms: Sequence[int] = range(len(TERMS))
+) -> list[FloatArray]:
+    """Return the derivative of the joint values in each of the 8 terms, or in some of them, arrays
+    (t | 1, n, a).
+    """
     r, approach = split_readings(q, len(w))
     # with w = 0 the cosines would repeat the offset
     on = (w != 0).astype(float)
-    turn = w * r
-    waves = [np.sin(turn), on * np.cos(turn), np.sin(2 * turn), on * np.cos(2 * turn)]
-    return [np.ones_like(r), r, r * r, *waves, 0.5 * approach]
+    columns = {
+        "offset": lambda: np.ones_like(r),
+        "gain": lambda: r,
+        "curve": lambda: r * r,
+        "sin1": lambda: np.sin(w * r),
+        "cos1": lambda: on * np.cos(w * r),
+        "sin2": lambda: np.sin(2 * w * r),
+        "cos2": lambda: on * np.cos(2 * w * r),
+        "backlash": lambda: 0.5 * approach,
+    }
+    return [columns[TERMS[term]]() for term in terms]
 
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
@@ -82,10 +94,10 @@ def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> Float
 
 
 def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return d joint / d reading (t, n, a)."""
-    r, _ = split_readings(q, len(w))
+    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a)."""
     if not tau[..., 2:7].any():
-        return np.broadcast_to(tau[:, None, :, 1], (max(len(tau), len(r)), *r.shape[1:]))
+        return tau[:, None, :, 1]
+    r, _ = split_readings(q, len(w))
     turn = w * r
     _, gain, curve, sin1, cos1, sin2, cos2, _ = np.moveaxis(tau[:, None], -1, 0)
     first = w * (sin1 * np.cos(turn) - cos1 * np.sin(turn))

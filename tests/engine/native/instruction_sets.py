@@ -22,10 +22,12 @@ def make_robot_case(name: str, t: int, n: int) -> Case:
     return make_case(load_robot(name), t=t, n=n)
 
 
-def list_arrays(result: State | ClosureBlocks | np.ndarray) -> dict[str, np.ndarray]:
+def list_arrays(result: State | ClosureBlocks | tuple | np.ndarray) -> dict[str, np.ndarray]:
     """Return the arrays of a result by name."""
     if isinstance(result, np.ndarray):
         return {"R": result}
+    if isinstance(result, tuple):
+        return {f"part {i}": array for i, array in enumerate(result)}
     if isinstance(result, State):
         named = {"joints": np.concatenate([a.ravel() for a in result.joints])}
         fields = ("T", "status", "residual", "iterations", "closure_sign")

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.engine import select_engine
-from tests.engine.cases import displacement_units, pose_demand
+from tests.engine.cases import displacement_units, draw_map, pose_demand
 from tests.engine.native.instruction_sets import ROBOTS, list_arrays, make_engines, make_robot_case
 
 ENGINES = make_engines()
@@ -54,6 +54,19 @@ def test_blocks_agree_with_numpy_and_between_instruction_sets(name, free):
     for block, array in list_arrays(calls[0]).items():
         assert_allclose(array, expected[block], atol=1e-14 * largest, err_msg=block)
     assert calls[0].joints == tuple(tuple(g.unknown_joints(free)) for g in case.program.groups)
+    assert_same_bits(calls)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(("t", "n"), [(1, 21), (5, 17), (9, 3)])
+@pytest.mark.parametrize("per_trial", [False, True])
+def test_derivatives_agree_with_numpy_and_between_instruction_sets(name, t, n, per_trial):
+    case = make_robot_case(name, t, n)
+    state = NUMPY.solve(case.program, case.e, case.q, case.home)
+    arguments = case.program, case.e, case.q, state, draw_map(case.program, (t, n), per_trial)
+    calls = [e.differentiate(*arguments) for e in ENGINES.values()]
+    for mine, theirs in zip(calls[0], NUMPY.differentiate(*arguments), strict=True):
+        assert_allclose(mine, theirs, atol=1e-12 * np.abs(theirs).max())
     assert_same_bits(calls)
 
 

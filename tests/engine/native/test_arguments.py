@@ -2,12 +2,14 @@
 """Arrays of wrong shape are refused before the library reads them; any numbers are answered."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from loopcal.engine import CONVERGED, Engine, Program, Slot, State
 from loopcal.errors import MissingPackageError
+from tests.engine.cases import draw_map
 from tests.engine.native.instruction_sets import ROBOTS, make_engines, make_robot_case
 
 NATIVE = next(iter(make_engines().values()))
@@ -50,8 +52,36 @@ def test_arrays_of_wrong_shape_are_refused(what):
     state = NATIVE.solve(PROGRAM, E, Q, HOME)
     if start is not HOME:
         state = start
-    with pytest.raises((ValueError, IndexError)):
-        NATIVE.linearize(program, e, q, state)
+    for function in (NATIVE.linearize, partial(NATIVE.differentiate, inputs=MAP)):
+        with pytest.raises((ValueError, IndexError)):
+            function(program, e, q, state)
+
+
+MAP = draw_map(PROGRAM, (2, 3), True)
+PATTERN = MAP.pattern
+WRONG_MAPS = {
+    "displacements": replace(MAP, displacements=MAP.displacements[:, 1:]),
+    "trials of displacements": replace(MAP, displacements=np.repeat(MAP.displacements, 2, axis=0)),
+    "joints": replace(MAP, joints=MAP.joints[0]),
+    "functions": replace(MAP, basis=MAP.basis[..., :1]),
+    "axes of the basis": replace(MAP, basis=MAP.basis[0]),
+    "poses of the basis": replace(MAP, basis=MAP.basis[:, :2]),
+    "readings": replace(MAP, readings=MAP.readings[..., :1]),
+    "axes of the readings": replace(MAP, readings=MAP.readings[0, 0]),
+    "parameters": replace(MAP, pattern=replace(PATTERN, parameters=1)),
+    "negative parameters": replace(MAP, pattern=replace(PATTERN, parameters=-1)),
+    "a huge count": replace(MAP, pattern=replace(PATTERN, parameters=2**40)),
+    "places": replace(MAP, pattern=replace(PATTERN, displacements=PATTERN.displacements + 99)),
+    "negative places": replace(MAP, pattern=replace(PATTERN, joints=PATTERN.joints - 1)),
+    "axes of the pattern": replace(MAP, pattern=replace(PATTERN, joints=PATTERN.joints[:, :2])),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_MAPS)
+def test_maps_of_wrong_shape_are_refused(what):
+    state = NATIVE.solve(PROGRAM, E, Q, HOME)
+    with pytest.raises((ValueError, IndexError), match="the native engine expects"):
+        NATIVE.differentiate(PROGRAM, E, Q, state, WRONG_MAPS[what])
 
 
 @pytest.mark.parametrize(
@@ -127,6 +157,11 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     assert set(np.unique(state.status)) <= {0, 1, 2, 3}
     blocks = native.linearize(case.program, e, q, state)
     native.linearize(case.program, e, q, state, free=True)
+    inputs = draw_map(case.program, (rows, 1), True)
+    wrong = [disturb(rng, a, share) for a in (inputs.displacements, inputs.basis)]
+    native.differentiate(
+        case.program, e, q, state, replace(inputs, displacements=wrong[0], basis=wrong[1])
+    )
     matrix = blocks.closure[0].E.reshape(rows, -1, blocks.closure[0].E.shape[-1])
     factor = native.fold(np.zeros((rows, *matrix.shape[2:] * 2)), matrix)
     assert np.isfinite(

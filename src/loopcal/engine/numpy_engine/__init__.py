@@ -4,3 +4,4 @@
 from loopcal.engine.numpy_engine.closure import linearize as linearize
 from loopcal.engine.numpy_engine.householder import fold as fold
 from loopcal.engine.numpy_engine.newton import solve as solve
+from loopcal.engine.numpy_engine.sensitivity import differentiate as differentiate

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Derivatives of the platform in parameters and readings, by the wrenches of the closure rows.
+
+A closure row without passive joints is a wrench on the limb's tip, a moment and a force that the
+passive joints do not feel. Its product with the velocity that a displacement or a joint causes is
+the entry of that column: every link takes the wrench to its own axes once, for all its
+displacements. Shapes as in closure.py, with the r rows of a limb behind the components: (3, r, k,
+N). Formulas: docs/theory/engine.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.engine.numpy_engine.closure import Chain, cross, dot, place_links
+from loopcal.engine.numpy_engine.householder import back_substitute, triangularize
+from loopcal.engine.program import LENGTH, PITCH, Group, ParameterMap, Program, State
+from loopcal.typing import FloatArray, IntArray
+
+CHUNK = 1024
+"""Rows differentiated together."""
+
+
+def differentiate(
+    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+) -> tuple[FloatArray, FloatArray]:
+    """Differentiate the platform; see `loopcal.engine.differentiate`."""
+    t, n = state.T.shape[:2]
+    p, a, m = inputs.pattern.parameters, program.n_joints, len(program.freedoms)
+    T = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0)
+    limbs = [
+        (place_links(g, e), g.insert_driven(values, q), _select_entries(g, inputs))
+        for g, values in zip(program.groups, state.joints, strict=True)
+    ]
+    by_parameter, by_reading = np.zeros((t * n, 6, p)), np.zeros((t * n, 6, a))
+    freedoms = list(program.freedoms)
+    for first in range(0, t * n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, t * n))
+        trial, pose = np.divmod(rows, n)
+        A, sigma, moving, driving = [], [], [], []
+        with np.errstate(all="ignore"):
+            for group, (links, values, entries) in zip(program.groups, limbs, strict=True):
+                theta = values.reshape(t * n, len(group.limbs), -1)[rows].transpose(2, 1, 0)
+                chain = Chain(group, links.select(trial), T[..., rows], theta, program.size)
+                closed = _close(program, chain, entries.driven)
+                A.append(closed.freedoms)
+                columns = closed.columns.transpose(3, 0, 1, 2)
+                moving.append(entries.by_parameter(columns, p, trial, pose))
+                readings = _pick(inputs.readings, trial, pose)
+                driving.append(entries.by_reading(columns, readings, group))
+                sigma.append(_deviations(program, group, closed))
+            weights = 1.0 / np.concatenate(sigma) if program.sigma else None
+            inverse = _invert(np.concatenate(A), weights)
+            steps = np.ascontiguousarray(-inverse.transpose(2, 0, 1))
+            for out, of_groups in ((by_parameter, moving), (by_reading, driving)):
+                right = of_groups[0] if len(of_groups) == 1 else np.concatenate(of_groups, axis=1)
+                part = out[first : first + len(rows)]
+                if m == 6:
+                    np.matmul(steps, right, out=part)
+                else:
+                    part[:, freedoms] = np.matmul(steps, right)
+    return by_parameter.reshape(t, n, 6, p), by_reading.reshape(t, n, 6, a)
+
+
+class _Entries(NamedTuple):
+    """Entries of a map that move the k limbs of a group, sorted by limb and parameter.
+
+    limb, column, parameter : (z,); columns are the slots, then the driven joints. coefficient :
+    (t | 1, z). basis : (t | 1, n | 1, z), one for displacements. driven : the driven joints.
+    """
+
+    limb: IntArray
+    column: IntArray
+    parameter: IntArray
+    coefficient: FloatArray
+    basis: FloatArray
+    driven: tuple[int, ...]
+
+    def by_parameter(
+        self, columns: FloatArray, p: int, trial: IntArray, pose: IntArray
+    ) -> FloatArray:
+        """Return the rows of all limbs by p parameters, (N, r k, p), of columns (N, r, c, k)."""
+        N, r, c, k = columns.shape
+        factor = _pick(self.basis, trial, pose) * _pick(self.coefficient, trial)
+        values = columns.reshape(N, r, c * k)[..., self.column * k + self.limb] * factor[:, None]
+        target = self.limb * p + self.parameter
+        begin = np.flatnonzero(np.diff(target, prepend=-1))
+        if len(begin) < len(target):  # several entries of one parameter in one limb
+            values, target = np.add.reduceat(values, begin, axis=2), target[begin]
+        out = np.zeros((N, r, k * p))
+        out[..., target] = values
+        return out.reshape(N, r * k, p)
+
+    def by_reading(self, columns: FloatArray, readings: FloatArray, group: Group) -> FloatArray:
+        """Return the rows by a readings, (N, r k, a), of columns (N, r, c, k)."""
+        N, r, _, k = columns.shape
+        out = np.zeros((N, r, k, readings.shape[-1]))
+        for i, j in enumerate(self.driven):
+            actuator = group.actuator[j]
+            slopes = columns[:, :, len(group.slots) + i] * readings[:, None, actuator]
+            out[:, :, np.arange(k), actuator] += slopes
+        return out.reshape(N, r * k, -1)
+
+
+def _pick(array: FloatArray, *rows: IntArray) -> FloatArray:
+    """Return the rows of an array whose leading axes may be 1 and then broadcast."""
+    return array[
+        tuple(i if length > 1 else 0 * i[:1] for i, length in zip(rows, array.shape, strict=False))
+    ]
+
+
+def _select_entries(group: Group, inputs: ParameterMap) -> _Entries:
+    """Return the entries of a group."""
+    pattern, slots = inputs.pattern, len(group.slots)
+    place, parameter = pattern.displacements.T
+    own = np.flatnonzero((place >= group.columns.start) & (place < group.columns.stop))
+    limb, column = np.divmod(place[own] - group.columns.start, max(slots, 1))
+    ones = np.ones((*inputs.basis.shape[:2], len(own)))
+    parts = [(limb, column, parameter[own], inputs.displacements[:, own], ones)]
+    driven = tuple(np.flatnonzero(group.actuator[:, 0] >= 0).tolist())
+    joint, function, parameter = pattern.joints.T
+    for i, j in enumerate(driven):
+        limb, own = np.nonzero(group.actuator[j][:, None] == joint)
+        basis = inputs.basis[:, :, joint[own], function[own]]
+        column = np.full(len(own), slots + i)
+        parts.append((limb, column, parameter[own], inputs.joints[:, own], basis))
+    arrays = [np.concatenate(of_all, axis=-1) for of_all in zip(*parts, strict=True)]
+    order = np.lexsort((arrays[2], arrays[0]))
+    return _Entries(*(array[..., order] for array in arrays), driven=driven)
+
+
+class _ClosedRows(NamedTuple):
+    """Closure rows of a group: r of each limb, against the platform's freedoms (r k, m, N) and
+    against its slots and driven joints (r, c, k, N).
+    """
+
+    freedoms: FloatArray
+    columns: FloatArray
+
+
+def _close(program: Program, chain: Chain, driven: tuple[int, ...]) -> _ClosedRows:
+    """Return the rows of a group that no passive joint changes."""
+    group = chain.group
+    shares = _eliminate(chain)
+    moment, force = _list_wrenches(chain, shares)
+    at_center = moment + cross(chain.arm[:, None], force)
+    platform = np.concatenate([at_center, force])[list(program.freedoms)]
+    r, k, N = moment.shape[1:]
+    columns = np.zeros((r, len(group.slots) + len(driven), k, N))
+    # the tip moves with its links, hence the minus signs
+    bending = {
+        j: moment + cross((chain.tip - chain.origins[j])[:, None], force)
+        for j in {s.element for s in group.slots if s.axis < 3 and s.element != chain.last}
+        | {j for j in driven if group.joints[j : j + 1] == "R"}
+    }
+    local: dict[tuple[int, bool], FloatArray] = {}
+    for c, (j, axis) in enumerate((s.element, s.axis) for s in group.slots):
+        if axis == LENGTH:
+            columns[:, c] = -shares[:, 0]
+        elif axis == PITCH:
+            columns[:, c] = -chain.theta[j] * dot(chain.axes[j][:, None], force)
+        else:
+            turns, tip = axis < 3, j != chain.last
+            if (j, turns) not in local:
+                at = (bending[j] if tip else moment) if turns else force
+                local[j, turns] = _take_to_link(chain, j, -at if tip else at)
+            frame = chain.links.slope[j] if turns else chain.links.nominal[j]
+            columns[:, c] = dot(frame[:, axis % 3, None], local[j, turns])
+    for c, j in enumerate(driven, len(group.slots)):
+        if j == len(group.joints):
+            columns[:, c] = -shares[:, 0] if group.ending == "distance" else 0.0
+            continue
+        along = -dot(chain.axes[j][:, None], force)
+        columns[:, c] = along
+        if group.joints[j] == "R":
+            about = -dot(chain.axes[j][:, None], bending[j])
+            columns[:, c] = about + chain.links.pitch[j] * along
+    return _ClosedRows(platform.transpose(1, 2, 0, 3).reshape(r * k, -1, N), columns)
+
+
+def _eliminate(chain: Chain) -> FloatArray:
+    """Return how much of each row of the ending the r closure rows take, (r, rows, k, N)."""
+    unknown, rows = chain.group.unknown_joints(False), len(chain.group.rows)
+    identity = np.eye(rows)[..., None, None]
+    if not unknown:
+        return np.broadcast_to(identity, (rows, rows, *chain.gap.shape[1:]))
+    columns = chain.stack(*(chain.rows_of_joint(j) for j in unknown), *identity.swapaxes(0, 1))
+    return triangularize(columns, len(unknown))[0][len(unknown) :, len(unknown) :]
+
+
+def _list_wrenches(chain: Chain, shares: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return moment [m] and force of each closure row at the tip, (3, r, k, N)."""
+    group = chain.group
+    wrench = np.zeros((6, len(shares), *shares.shape[2:]))
+    if group.ending == "distance":
+        wrench[3:] = shares[:, 0] * chain.direction[:, None]
+    elif group.ending == "ball":
+        wrench[[3 + row for row in group.rows]] = shares.swapaxes(0, 1)
+    else:
+        wrench[list(group.rows)] = shares.swapaxes(0, 1)
+        wrench[:3] *= chain.size
+    return wrench[:3], wrench[3:]
+
+
+def _take_to_link(chain: Chain, j: int, vectors: FloatArray) -> FloatArray:
+    """Return vectors (3, r, k, N) in the axes before link j."""
+    if not j:
+        return vectors
+    axes = chain.before[j]
+    return np.stack([dot(axes[:, i, None], vectors) for i in range(3)])
+
+
+def _deviations(program: Program, group: Group, closed: _ClosedRows) -> FloatArray:
+    """Return the standard deviation (r k, N) that a redundant actuator gives each row."""
+    if program.sigma is None:
+        return np.ones(())[None]
+    drive = closed.columns[:, len(group.slots)]
+    j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
+    sigma = np.array(program.sigma)[group.actuator[j]]
+    return (np.abs(drive) * sigma[:, None]).reshape(-1, drive.shape[-1])
+
+
+def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
+    """Return the inverse (m, c, N) of A (c, m, N), with weights (c, N) the weighted least-squares
+    one.
+
+    Singular matrices give infinities or NaN.
+    """
+    c, m, N = A.shape
+    unit = np.broadcast_to(np.eye(c)[..., None], (c, c, N))
+    if weights is not None:
+        A, unit = A * weights[:, None], unit * weights[:, None]
+    rows = triangularize(np.concatenate([A, unit], axis=1), m)[0]
+    return back_substitute(rows[:m, :m], rows[:m, m:])
