@@ -20,9 +20,9 @@ from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.diagnose.error_frames import fit_unfixed_frames
 from loopcal.engine import State
 from loopcal.errors import EstimationError
-from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.methods.penalties import LeastSquares, Method
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.estimate.trial_posteriors import compute_trial_posterior
 from loopcal.measure import Instrument, Trials, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, Status, forward, forward_trials, inverse

@@ -2,7 +2,6 @@
 """Estimate the parameters of a robot from measurements."""
 
 from loopcal.estimate.identification import identify as identify
-from loopcal.estimate.identification import identify_trials as identify_trials
 from loopcal.estimate.identified_trials import IdentifiedTrials as IdentifiedTrials
 from loopcal.estimate.inference.null_space import Combination as Combination
 from loopcal.estimate.inference.posterior import Posterior as Posterior
@@ -25,4 +24,5 @@ from loopcal.estimate.options import FitOptions as FitOptions
 from loopcal.estimate.recalibration import Change as Change
 from loopcal.estimate.recalibration import recalibrate as recalibrate
 from loopcal.estimate.result import Identification as Identification
+from loopcal.estimate.trial_identification import identify_trials as identify_trials
 from loopcal.numerics.gauss_newton import DescentStatus as DescentStatus

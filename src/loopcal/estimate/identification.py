@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify the free parameters of a robot from measurements: one machine with all diagnostics, or
-many trials at once.
-"""
+"""Identify the free parameters of a robot from measurements, with all diagnostics."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_descent import descend_once, descend_to_prior, get_method, repeat_trials
+from loopcal.estimate.fit_descent import descend_to_prior, get_method
 from loopcal.estimate.fit_findings import (
     report_divergence,
     report_equations,
@@ -27,7 +25,6 @@ from loopcal.estimate.fit_input import (
 )
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import (
@@ -68,12 +65,11 @@ from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of, problem_of_trials
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.residuals import label_residuals
 from loopcal.estimate.result import History, Identification, Spectrum
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
-from loopcal.measure.array_checks import check_type
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, Progress, report_no_progress
@@ -139,56 +135,6 @@ def identify(
     rows = collect_used_rows(robot, data, options.prior)
     posterior = add_data(result.posterior, free, fit.decomposition, result.residual_test, rows)
     return replace(result, posterior=posterior, findings=tuple(findings))
-
-
-def identify_trials(
-    robot: Mechanism,
-    trials: Trials,
-    method: Method | None = None,
-    *,
-    options: FitOptions | None = None,
-) -> IdentifiedTrials:
-    """Identify t simulated machines at once.
-
-    Each trial equals its own `identify`, and no trial stops another.
-
-    Parameters
-    ----------
-    robot : as for `identify`. trials : their measurements.
-    method : in place of that of `options`.
-    options : see `FitOptions`; `start` may be (t, p of the robot). A loss, a prior, excluded poses
-        and nuisance parameters are not supported.
-
-    Raises
-    ------
-    EstimationError : an option that is not supported.
-    """
-    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
-    check_type(trials, Trials, "trials", "as from simulate_trials(...)")
-    options = merge_options(options, method)
-    for name in ("loss", "prior", "nuisance", "excluded_poses"):
-        value = getattr(options, name)
-        if value is not None and value != ():
-            raise EstimationError(
-                f"identify_trials does not support the option {name}; remove it, or call identify "
-                "for every trial"
-            )
-    free = select_free_parameters(robot)
-    problem = problem_of_trials(free, trials)
-    values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
-    z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
-    method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
-    options = replace(options, method=method)
-    fit = repeat_trials(problem, descend_once(problem, z, None, options), options, free)
-    return IdentifiedTrials(
-        free.values(fit.deviation),
-        fit.status,
-        fit.iterations,
-        fit.cost,
-        free,
-        fit.linear_model,
-        method,
-    )
 
 
 def _solve_unweighted(problem: Problem, weighted: Problem, fit: Descent) -> PoseSolution:

@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.linear_model import LinearModel
@@ -23,7 +25,8 @@ class IdentifiedTrials(TableResult):
     ----------
     values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
     cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
-    linear_model : of the last rows. method : with what `adapt_method` entered.
+    linear_models : of the last rows of consecutive trials. method : with what `adapt_method`
+        entered.
     """
 
     values: FloatArray
@@ -31,7 +34,7 @@ class IdentifiedTrials(TableResult):
     iterations: IntArray
     cost: FloatArray
     free_parameters: FreeParameters
-    linear_model: LinearModel
+    linear_models: tuple[LinearModel, ...]
     method: Method
 
     def __repr__(self) -> str:
@@ -41,15 +44,18 @@ class IdentifiedTrials(TableResult):
             f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
         )
 
-    @property
+    @cached_property
     def decomposition(self) -> Decomposition:
         """The decompositions of the rows: variances and leverages are read from them."""
-        return self.linear_model.decomposition
+        parts = [model.decomposition for model in self.linear_models]
+        if any(part.dual is not None for part in parts):
+            parts = [part.with_dual() for part in parts]
+        return Decomposition.join(parts)
 
-    @property
+    @cached_property
     def penalty(self) -> FloatArray:
         """(t, p free) of the directions of the decompositions."""
-        return self.linear_model.penalty
+        return np.concatenate([model.penalty for model in self.linear_models])
 
     @cached_property
     def prior_variance(self) -> FloatArray | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.nuisance.elimination import plan_elimination
-from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.estimate.observation_rows import BLOCK, ObservationRows
 from loopcal.estimate.poses.components import find_components
 from loopcal.estimate.poses.consistent import LOOSE, ConsistentPoses, select_mixing_rows
 from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
@@ -19,6 +19,7 @@ from loopcal.estimate.problem import Problem
 from loopcal.measure import (
     Measurements,
     NuisanceParameters,
+    Sensor,
     Trials,
     collect_nuisance_parameters,
     list_sensed_joints,
@@ -72,17 +73,29 @@ def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
     rows = []
     for i, (sensor, measured) in enumerate(zip(sensors, trials.measured, strict=True)):
         kind, places, factor = sensor.kind, local.indices[i], local.factor(i)
-        present = kind.detect_present(measured)
-        N = kind.linearize_noise(measured)
-        covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
-        t, r, m = present.shape
-        flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
-        white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
+        white = _compute_whiteners(sensor, measured)
         rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places, factor))
     recorded = trials.readings[None] if trials.recorded is None else trials.recorded
     return make_problem(
         free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial
     )
+
+
+def _compute_whiteners(sensor: Sensor, measured: FloatArray) -> FloatArray:
+    """Return the whiteners (t, r, m, m) of the rows of a sensor, computed for some trials at a time
+    so that what they are computed with stays small.
+    """
+    step, parts = max(1, BLOCK // max(1, measured.shape[1])), []
+    for first in range(0, len(measured), step):
+        part = measured[first : first + step]
+        present = sensor.kind.detect_present(part)
+        N = sensor.kind.linearize_noise(part)
+        covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
+        t, r, m = present.shape
+        flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
+        white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r))
+        parts.append(white.reshape(t, r, m, m))
+    return np.concatenate(parts)
 
 
 def make_problem(

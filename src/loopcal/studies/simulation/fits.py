@@ -16,8 +16,8 @@ from loopcal.engine import State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.identified_trials import IdentifiedTrials
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.measure import Measurements, Trials
 from loopcal.mechanism import Status, differentiate_pose, forward, forward_trials
 from loopcal.numerics.gauss_newton import DescentStatus

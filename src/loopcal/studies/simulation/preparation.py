@@ -13,8 +13,8 @@ import numpy as np
 
 from loopcal.diagnose.error_frames import BASE, choose_error_frame, list_unfixed_motions
 from loopcal.estimate import MAP, FitOptions
-from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.published_methods.plane_line_products import Layout
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.estimate.trial_posteriors import compute_trial_posterior
 from loopcal.measure import Instrument, Measurements, Trials, simulate_trials, solve_commanded_poses
 from loopcal.mechanism import Mechanism, Solution, inverse

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identify the free parameters of many simulated machines at once.
+
+Trials are fitted in parts of a fixed size, so that what a part computes with fits the cache and
+memory holds little more than the results, however many trials there are. Parts are independent of
+each other: threads compute them in any order, with the same numbers to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from numbers import Integral
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.errors import EstimationError
+from loopcal.estimate.fit_descent import descend_once, repeat_trials
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.identified_trials import IdentifiedTrials
+from loopcal.estimate.methods.penalties import Method, adapt_method
+from loopcal.estimate.minimization.linear_model import LinearModel
+from loopcal.estimate.observation_rows import BLOCK
+from loopcal.estimate.options import FitOptions, merge_options
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of_trials
+from loopcal.measure import Trials
+from loopcal.measure.array_checks import check_type
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray, IntArray
+
+
+def identify_trials(
+    robot: Mechanism,
+    trials: Trials,
+    method: Method | None = None,
+    *,
+    options: FitOptions | None = None,
+    threads: int = 1,
+) -> IdentifiedTrials:
+    """Identify t simulated machines at once.
+
+    Each trial equals its own `identify`, and no trial stops another.
+
+    Parameters
+    ----------
+    robot : as for `identify`. trials : their measurements.
+    method : in place of that of `options`.
+    options : see `FitOptions`; `start` may be (t, p of the robot). A loss, a prior, excluded poses
+        and nuisance parameters are not supported.
+    threads : that compute, 1 or more; results do not depend on it. Let linear algebra have one
+        thread for each of them (OPENBLAS_NUM_THREADS=1).
+
+    Raises
+    ------
+    EstimationError : an option that is not supported, or no thread.
+    """
+    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
+    check_type(trials, Trials, "trials", "as from simulate_trials(...)")
+    check_threads(threads)
+    options = merge_options(options, method)
+    for name in ("loss", "prior", "nuisance", "excluded_poses"):
+        value = getattr(options, name)
+        if value is not None and value != ():
+            raise EstimationError(
+                f"identify_trials does not support the option {name}; remove it, or call identify "
+                "for every trial"
+            )
+    free = select_free_parameters(robot)
+    problem = problem_of_trials(free, trials)
+    values = np.atleast_2d(robot.values if options.start is None else np.asarray(options.start))
+    z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
+    method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
+    parts = _fit_parts(problem, z, replace(options, method=method), free, threads)
+    return IdentifiedTrials(
+        free.values(np.concatenate([part.deviation for part in parts])),
+        np.concatenate([part.status for part in parts]),
+        np.concatenate([part.iterations for part in parts]),
+        np.concatenate([part.cost for part in parts]),
+        free,
+        tuple(part.linear_model for part in parts),
+        method,
+    )
+
+
+def check_threads(threads: int) -> None:
+    """Raise EstimationError unless `threads` is a whole number of at least 1."""
+    check_type(threads, Integral, "threads", "a whole number, 1 or more")
+    if threads < 1:
+        raise EstimationError(f"threads is {threads}; give 1 or more")
+
+
+class _Part(NamedTuple):
+    """What is kept of the fits of a part, see `Descent`."""
+
+    deviation: FloatArray
+    status: IntArray
+    iterations: IntArray
+    cost: FloatArray
+    linear_model: LinearModel
+
+
+def _fit_parts(
+    problem: Problem, z: FloatArray, options: FitOptions, free: FreeParameters, threads: int
+) -> list[_Part]:
+    """Return the fits of all parts of the trials, which begin at deviations z (t, p)."""
+    # all trials begin with the nuisance parameters of the first one that reaches its poses
+    start = None if problem.nuisance is None else problem.start(z)
+
+    def fit(part: IntArray) -> _Part:
+        own, begin = problem.take(part), None if start is None else start.take(part)
+        fit = repeat_trials(own, descend_once(own, z[part], begin, options), options, free)
+        return _Part(fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
+
+    parts = list(_divide(problem))
+    if threads == 1 or len(parts) == 1:
+        return [fit(part) for part in parts]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(fit, parts))
+
+
+def _divide(problem: Problem) -> Iterator[IntArray]:
+    """Yield the numbers of the trials of each part."""
+    size, total = max(1, BLOCK // problem.poses.block_size), len(problem)
+    for first in range(0, max(total, 1), size):
+        yield np.arange(first, min(first + size, total))

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trials are fitted in parts, by any number of threads, with the same numbers to the last bit."""
+
+import gc
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from loopcal.errors import ArgumentTypeError, EstimationError
+from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify_trials
+from loopcal.estimate.observation_rows import BLOCK
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    Pose,
+    Position,
+    Sensor,
+    Trials,
+    sample_truth,
+    simulate_trials,
+)
+from loopcal.mechanism import sample_workspace
+
+DELTA = load_robot("rotary-delta")
+POSES = BLOCK // 4
+"""Poses of a trial, so that a part has four trials."""
+
+
+def simulate(trials: int, kind=None, poses: int = POSES) -> Trials:
+    """Return measurements of simulated deltas."""
+    kind = Pose() if kind is None else kind
+    sigma = [1e-5] * len(kind.noise_columns)
+    instrument = Instrument((Sensor(kind, Gaussian(tuple(sigma))),))
+    coordinates = sample_workspace(DELTA, poses, 1).coordinates
+    return simulate_trials(DELTA, sample_truth(DELTA, trials, 2), coordinates, instrument, 3)
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP(), MAP(InflatedTolerances())], ids=repr)
+def test_results_depend_neither_on_threads_nor_on_the_number_of_trials(method):
+    trials = simulate(10)
+    one, three = (identify_trials(DELTA, trials, method, threads=n) for n in (1, 3))
+    for name in ("values", "status", "iterations", "cost", "penalty"):
+        assert np.array_equal(getattr(one, name), getattr(three, name)), name
+    assert np.array_equal(one.standard_deviations(), three.standard_deviations())
+    fewer = identify_trials(DELTA, simulate(6), method)
+    assert np.array_equal(fewer.values, one.values[:6])
+
+
+def test_all_parts_begin_with_the_same_unknown_frame():
+    kind = Position(places=np.array([[0.03, -0.02, 0.05]]), unknown=("frame",))
+    instrument = Instrument((Sensor(kind, Gaussian((1e-5,) * 3)),))
+    coordinates = sample_workspace(DELTA, POSES, 1).coordinates
+    station = {"frame.x": -2.5, "frame.y": -1.8, "frame.z": 0.1}
+    truth = sample_truth(DELTA, 9, 2)
+    trials = simulate_trials(DELTA, truth, coordinates, instrument, 3, nuisance_values=station)
+    one, two = (identify_trials(DELTA, trials, MAP(), threads=n) for n in (1, 2))
+    assert one.converged.all()
+    assert np.array_equal(one.values, two.values)
+
+
+def test_a_trial_that_fails_in_a_thread_stops_no_other():
+    trials = simulate(9)
+    start = np.repeat(DELTA.values[None], 9, axis=0)
+    start[5] += 1.0  # [m], [rad]
+    options = FitOptions(method=MAP(), start=start)
+    result = identify_trials(DELTA, trials, options=options, threads=2)
+    assert np.flatnonzero(~result.converged).tolist() == [5]
+
+
+@pytest.mark.parametrize("threads", [0, -1])
+def test_no_thread_is_refused(threads):
+    with pytest.raises(EstimationError, match=f"threads is {threads}; give 1 or more"):
+        identify_trials(DELTA, simulate(1, poses=10), threads=threads)
+    with pytest.raises(ArgumentTypeError, match="threads"):
+        identify_trials(DELTA, simulate(1, poses=10), threads=1.5)  # pyright: ignore
+
+
+def measure_memory(trials: Trials) -> tuple[float, float]:
+    """Return the memory [bytes] during fits and after them, beyond what was there before."""
+    gc.collect()
+    tracemalloc.start()
+    result = identify_trials(DELTA, trials, LeastSquares())
+    kept, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert result.converged.all()
+    return peak, kept
+
+
+def test_memory_of_many_trials_is_that_of_their_whiteners_and_results():
+    few, many = simulate(8), simulate(40)
+    measure_memory(few)  # what is made once
+    (least, kept_few), (most, kept_many) = measure_memory(few), measure_memory(many)
+    whiteners = 8 * 32 * POSES * len(Pose().noise_columns) ** 2
+    # what the trials of one part are computed with is several times the rest: it does not grow
+    assert most - least < 1.2 * (whiteners + kept_many - kept_few)
+    assert least > 4.0 * kept_few
