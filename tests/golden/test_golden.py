@@ -23,6 +23,10 @@ ROBUST_REFERENCE = (
     "a fit that contradicts its noise is no longer the point at which outliers are judged: it is "
     "a robust fit of the same data; the outliers are the same"
 )
+CONDITION = (
+    "all 25 combinations are solved with a condition number of 5.6e8: rounding of 2.2e-16 may "
+    "change the first step by 1.2e-7, and the two engines do change it by 1e-9"
+)
 EXCEPTIONS: dict[str, tuple[float, str, str]] = {
     # shares of 5e-4 of the distances
     "outliers/least-squares": (1e6, "blunders/*", ROBUST_REFERENCE),
@@ -30,6 +34,7 @@ EXCEPTIONS: dict[str, tuple[float, str, str]] = {
     "papers/hexapod-42/exact": (1e3, "*", PER_LEG),  # shares of 5e-10 of errors of 0.05 mm
     "papers/hexapod-42/presumed-noise": (1e3, "*", PER_LEG),
     "papers/hexapod-42/stated-noise": (1e3, "*", PER_LEG),
+    "papers/tsvd-2016/RU-PUS-PRS/6-dof": (120.0, "errors", CONDITION),
 }
 """Case: (factor on tolerances, pattern of the paths that have them, reason)."""
 
@@ -70,7 +75,13 @@ FOUND_NOISE_OF_CHANGE = (
 LOSS_CONTRADICTED = (
     "residuals that exceed the stated noise in spite of the loss make the intervals wider"
 )
+FIRST_OF_EQUALS = (
+    "the leading parameter of an unidentifiable combination is the first of those that are equally "
+    "large, no longer the one that rounding makes largest"
+)
 CORRECTED: dict[str, str] = {
+    "identifiability/3-prs/tilt": FIRST_OF_EQUALS,
+    "identifiability/hexapod-42/tilt": FIRST_OF_EQUALS,
     "kinds/component": INFLATED,
     "losses/huber/constant": f"{FOUND_NOISE}; {LOSS_CONTRADICTED}",
     "losses/huber/ls": FOUND_NOISE,

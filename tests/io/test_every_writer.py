@@ -225,10 +225,14 @@ def halve(content: bytes) -> bytes:
 
 
 def change_digit(content: bytes) -> bytes:
-    """Return the content with another last digit, not in a remark of a table."""
-    *_, last = re.finditer(rb"^(?!##).*[0-9]", content, re.MULTILINE)
-    digit = b"1" if last[0][-1:] != b"1" else b"2"
-    return content[: last.end() - 1] + digit + content[last.end() :]
+    """Return the content with another digit in the last number, not in a remark of a table.
+
+    It is one of the first eight: a number is read back equal to rounding, which is the 17th digit.
+    """
+    *_, last = re.finditer(rb"^(?!##).*?([0-9]+)[^0-9\n]*$", content, re.MULTILINE)
+    place = last.start(1) + min(len(last[1]), 8) - 1
+    digit = b"1" if content[place : place + 1] != b"1" else b"2"
+    return content[:place] + digit + content[place + 1 :]
 
 
 def run(command: str) -> int:

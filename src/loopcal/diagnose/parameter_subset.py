@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.diagnose.identifiable_parameters import Identifiability
 from loopcal.estimate.free_parameters import FreeParameters, free_only
-from loopcal.estimate.inference.null_space import NEGLIGIBLE
+from loopcal.estimate.inference.null_space import NEGLIGIBLE, choose_pivots
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.measure.array_checks import check_type
@@ -28,11 +28,6 @@ from loopcal.typing import FloatArray, IntArray
 SETTABLE, NONZERO = 0.1, 0.3
 """Weights of parameters that a controller can set (those of a transmission), and of dimensions that
 are not zero: they are kept against others of as much as ten and three times their share.
-"""
-
-TIE = 1e-6
-"""Relative difference below which two candidates for the next fixed parameter are equal; then the
-last in the robot's file is fixed. Equal candidates differ by rounding, unlike on every machine.
 """
 
 
@@ -149,16 +144,8 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
 
 def _choose_fixed(free: FreeParameters, null: FloatArray) -> IntArray:
     """Return the places (d,) of the parameters to fix, in the order of the robot's file."""
-    columns = (null * _weights(free)[:, None]).T
-    fixed: list[int] = []
-    for _ in range(len(columns)):
-        size = np.linalg.norm(columns, axis=0)
-        size[fixed] = 0.0
-        place = int(np.flatnonzero(size >= (1.0 - TIE) * size.max())[-1])
-        fixed.append(place)
-        direction = columns[:, place] / size[place]
-        columns = columns - direction[:, None] * (direction @ columns)
-    return np.sort(np.array(fixed, dtype=np.int64))
+    # of equal parameters the last one in the file is fixed
+    return choose_pivots((null * _weights(free)[:, None]).T, first=False)
 
 
 def _weights(free: FreeParameters) -> FloatArray:
@@ -168,12 +155,10 @@ def _weights(free: FreeParameters) -> FloatArray:
         addresses = (link.address,) if isinstance(link, LinearMap) else link.outputs
         if any(address.element == "transmission" for address in addresses):
             settable.update((link.parameter,) if isinstance(link, LinearMap) else link.inputs)
-    return np.array(
-        [
-            SETTABLE if p.name in settable else NONZERO if p.nominal != 0.0 else 1.0
-            for p in free.parameters
-        ]
-    )
+    # nominal values are computed: what is far below its tolerance is zero
+    is_zero = np.abs([p.nominal for p in free.parameters]) <= NEGLIGIBLE * free.tolerance
+    is_settable = np.array([p.name in settable for p in free.parameters], dtype=bool)
+    return np.where(is_settable, SETTABLE, np.where(is_zero, 1.0, NONZERO))
 
 
 def _merge(

@@ -16,7 +16,7 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
 from loopcal.presentation import HtmlResult
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 NEGLIGIBLE = 1e-6
 """Part of a combination, in tolerances and relative to its largest, that is rounding and left out.
@@ -24,6 +24,11 @@ NEGLIGIBLE = 1e-6
 
 MINOR = 0.1
 """The same for a weak direction, which has a small part of nearly every parameter."""
+
+TIE = 1e-6
+"""Relative difference below which two candidates for a pivot are equal. Symmetric parameters differ
+by rounding, 1e-13 in practice, which is another one for every engine and processor.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +115,30 @@ def describe_direction(
 
 
 def sparsify_basis(null_space: FloatArray) -> FloatArray:
-    """Return a basis (d, p) of the space (p, d) in which each vector has a parameter of its own."""
-    d = null_space.shape[1]
-    if d == 0:
-        return np.zeros((0, len(null_space)))
-    from scipy.linalg import lu_factor, lu_solve, qr
+    """Return a basis (d, p) of the space (p, d) in which each vector has a parameter of its own.
 
-    *_, order = qr(null_space.T, mode="r", pivoting=True)
-    # a well-conditioned choice of leading parameters, in the order of the robot's parameters
-    pivots = np.sort(np.asarray(order)[:d])
+    It depends on the space alone, not on the basis that spans it.
+    """
+    if null_space.shape[1] == 0:
+        return np.zeros((0, len(null_space)))
+    from scipy.linalg import lu_factor, lu_solve
+
+    pivots = choose_pivots(null_space.T, first=True)
     return lu_solve(lu_factor(null_space[pivots].T), null_space.T)
+
+
+def choose_pivots(columns: FloatArray, first: bool) -> IntArray:
+    """Return d well-conditioned columns of (d, p), ascending, by elimination with pivoting.
+
+    Of columns that are equally large, the first one is taken, or the last one.
+    """
+    rest, chosen = columns, []
+    for _ in range(len(columns)):
+        size = np.linalg.norm(rest, axis=0)
+        size[chosen] = 0.0
+        equal = np.flatnonzero(size >= (1.0 - TIE) * size.max())
+        pivot = int(equal[0 if first else -1])
+        chosen.append(pivot)
+        direction = rest[:, pivot] / size[pivot]
+        rest = rest - direction[:, None] * (direction @ rest)
+    return np.sort(np.array(chosen, dtype=np.int64))

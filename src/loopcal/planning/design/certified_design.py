@@ -140,7 +140,8 @@ def _perturb(
     -------
     best : (n,) the best groups. scores : those that were better than all before.
     """
-    n, repeats = len(best), candidates.repeats
+    # a design found again has the same score up to rounding: in one order, it is the same design
+    n, repeats, best = len(best), candidates.repeats, np.sort(best)
     scores = [candidates.scoring.score(candidates.factor(best))]
     count = min(n, max(2, round(PERTURBED * n)))
     for done in range(times if len(candidates) > n or repeats else 0):
@@ -153,7 +154,7 @@ def _perturb(
             continue
         trial, history = exchange_groups(candidates, trial, random)
         if history[-1] >= scores[-1]:
-            best = trial
+            best = np.sort(trial)
             scores.append(history[-1])
     return best, scores[1:]
 
