@@ -20,7 +20,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
-from loopcal.cli.hints import find_hint, is_hint_useless
+from loopcal.cli.hints import find_hint, word_hint
 from loopcal.cli.interrupts import repeat_lost_interrupts
 from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from loopcal.cli.time_limit import TimeLimitError
@@ -239,8 +239,10 @@ def _report(
             return _refuse(error.format_message())
         case LoopcalError():
             finding = error.args[0] if error.args else None
-            is_useless = isinstance(finding, Finding) and is_hint_useless(finding)
-            return _refuse(str(error), None if is_useless else find_hint(error.code, command))
+            hint = find_hint(error.code, command)
+            return _refuse(
+                str(error), word_hint(finding, hint) if isinstance(finding, Finding) else hint
+            )
         case KeyboardInterrupt() | click.exceptions.Abort():
             return _refuse(f"stopped before the end{unwritten}.")
         case TimeLimitError():

@@ -135,9 +135,16 @@ def hint_for(finding: Finding) -> str | None:
     """Return the hint for a finding, with the names it contains, for the command that runs."""
     context = click.get_current_context(silent=True)
     command = None if context is None else context.command
-    hint = find_hint(finding.code, command)
+    return word_hint(finding, find_hint(finding.code, command))
+
+
+def word_hint(finding: Finding, hint: str | None) -> str | None:
+    """Return a hint with the names that its finding contains; None where it does not help."""
     if hint is None or is_hint_useless(finding):
         return None
+    links = finding.data.get("links") or finding.data.get("platforms")
+    if "--platform LINK" in hint and links:
+        return hint.replace("--platform LINK", name_options("--platform", links[:1]))
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
         return f"use {name_options('--drop', poses)}, or --loss huber"
@@ -157,6 +164,8 @@ def is_hint_useless(finding: Finding) -> bool:
     """
     from loopcal.findings.catalog.phrases import MACHINE
 
+    if finding.code in ("files.limb-branches", "files.no-limbs"):
+        return not finding.data["platforms"]
     if finding.code == "prior.rows-reused":
         return not finding.data["others"]
     return finding.code == "prior.machine-changed" and finding.data["subject"] != MACHINE

@@ -74,12 +74,14 @@ def make_hexapod(legs: Sequence[str], seed: int = 0) -> list[MachineJoint]:
     return joints
 
 
-def write_machine(joints: Sequence[MachineJoint], seed: int | None = None) -> tuple[str, str]:
+def write_machine(
+    joints: Sequence[MachineJoint], seed: int | None = None, has_constraints: bool = False
+) -> tuple[str, str]:
     """Return a URDF and its closure file.
 
     The tree grows from the base in the order of the joints, or in a random one. Other joints are
     closures: of type 3d at ball joints, else of type 6d between a link that the joint moves and a
-    frame on the other body.
+    frame on the other body. With `has_constraints`, they are <constraint> elements, save slides.
     """
     order = list(joints)
     if seed is not None:
@@ -99,6 +101,9 @@ def write_machine(joints: Sequence[MachineJoint], seed: int | None = None) -> tu
         links.append(child)
         waiting = [j for j in waiting if j is not joint]
     for joint in waiting:
+        if has_constraints and joint.kind != "P":
+            text.append(write_constraint(joint, frames))
+            continue
         near, far = f"{joint.name}_near", f"{joint.name}_far"
         links += [near, far]
         carrier = joint.a
@@ -136,14 +141,31 @@ def _write_joint(
     return write_element(joint.name, kind, parent, child, place, axis)
 
 
+def write_constraint(joint: MachineJoint, frames: dict[str, np.ndarray]) -> str:
+    """Return a joint as a <constraint>."""
+    kind = {"R": "revolute", "S": "spherical", "U": "universal"}[joint.kind]
+    axes = {"R": ("0 0 1", None), "S": (None, None), "U": ("1 0 0", "0 1 0")}[joint.kind]
+    lines = [f'<constraint name="{joint.name}" type="{kind}">\n']
+    for end, body, axis in zip(("parent", "child"), (joint.a, joint.b), axes, strict=True):
+        origin = write_origin(f"{end}_origin", np.linalg.inv(frames[body]) @ joint.T)
+        lines.append(f'  <{end} link="{body}"/>\n  {origin}\n')
+        lines += [] if axis is None else [f'  <{end}_axis xyz="{axis}"/>\n']
+    return "".join([*lines, "</constraint>\n"])
+
+
+def write_origin(element: str, T: np.ndarray) -> str:
+    """Return an origin."""
+    xyz = " ".join(repr(float(v)) for v in T[:3, 3])
+    rpy = " ".join(repr(float(v)) for v in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
+    return f'<{element} xyz="{xyz}" rpy="{rpy}"/>'
+
+
 def write_element(
     name: str, kind: str, parent: str, child: str, T: np.ndarray, axis: str = "0 0 1"
 ) -> str:
     """Return a <joint>."""
-    xyz = " ".join(repr(float(v)) for v in T[:3, 3])
-    rpy = " ".join(repr(float(v)) for v in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
     return (
-        f'<joint name="{name}" type="{kind}">\n  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
+        f'<joint name="{name}" type="{kind}">\n  {write_origin("origin", T)}\n'
         f'  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
         f'  <axis xyz="{axis}"/>\n</joint>\n'
     )

@@ -48,6 +48,9 @@ from loopcal.mechanism.joint_graph import (
 )
 from loopcal.typing import FloatArray
 
+LARGE = 30.0
+"""Largest distance of two joints of a link that is plausible [m]; URDF has no other unit."""
+
 MIMICS = 1e-9
 """Largest difference between a joint and the one that it mimics [rad, m]."""
 
@@ -132,7 +135,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
         expressed |= {*shifts, f"{motor}.offset"}
         if not shift.any() and zero == 0.0:
             continue
-        joint = urdf.joints[name]
+        joint = urdf.places[name]
         turn = zero if joint.kind == "R" else 0.0
         R = geometry.exp_so3(turn * joint.axis)
         moved = joint.origin @ geometry.make_pose(R, shift + (zero - turn) * joint.axis)
@@ -158,8 +161,8 @@ def _check_written(path: Path, urdf: Urdf) -> None:
     """Read a written URDF; raise LoopcalError where its joints have other places."""
     read = urdf_tree.read(path)
     require_same("joints", list(urdf.joints), list(read.joints))
-    for name, joint in urdf.joints.items():
-        require_same_numbers(f"origin of {name}", joint.origin, read.joints[name].origin)
+    for name, place in urdf.places.items():
+        require_same_numbers(f"origin of {name}", place.origin, read.places[name].origin)
     require_same("the text is complete", True, read.text == urdf.text)
 
 
@@ -181,7 +184,7 @@ def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], s
         names = [entry.name or entry.of for entry in limb.errors] + list(motors)
         names += [n.removeprefix(prefix)[:-2] for n in named if n.startswith(prefix)]
         for name in dict.fromkeys(names):
-            if name in urdf.joints:
+            if name in urdf.places:
                 shifts = [f"{limb.name}.{name}.{axis}" for axis in "xyz"]
                 yield name, shifts, motors.get(name) or ""
 
@@ -268,6 +271,8 @@ def _report_structure(mechanism: UrdfMechanism, paths: LimbPaths, frame: str) ->
     yield report_finding(
         "files.urdf-home", residual=f"{residual:.1g} m", frame=frame, freedoms=paths.freedoms
     )
+    if graph.size > LARGE:
+        yield report_finding("files.urdf-large", size=Quantity(graph.size, "m"))
     if motions.idle:
         yield report_finding("files.idle-motions", count=motions.idle, joints=motions.moved)
     if paths.dangling:

@@ -180,6 +180,8 @@ def _check_motors(urdf: Urdf, closures: Closures, motors: Sequence[str]) -> None
     """Refuse motors that are no movable joints of the tree."""
     ends = {name for pair in closures.pairs for name in pair}
     for i, name in enumerate(motors):
+        if name in motors[:i] and closures.file is not None:
+            raise closures.file.error(f"motor {name!r} is named twice; remove one", ("name_mot", i))
         joint = urdf.joints.get(name)
         if joint is not None and joint.kind and name not in ends | {*closures.overrides}:
             continue
@@ -237,22 +239,24 @@ def _build_closure(
 def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | GraphJoint, ...]:
     """Return a `<constraint>` of the URDF; a universal one has a body between its two joints."""
     (a, A), (b, B) = (
-        (urdf.find_body(link), urdf.place_in_body(link) @ origin)
-        for link, origin in zip(constraint.links, constraint.origins, strict=True)
+        (urdf.find_body(end.parent), urdf.place_in_body(end.parent) @ end.origin)
+        for end in constraint.ends
     )
+    near, far = (end.name for end in constraint.ends)
     name, (first, second) = constraint.name, constraint.axes
     if not constraint.kind:
         return (Weld(name, a, b, A, B),)
     if constraint.kind != "U":
         kind: Literal["R", "S"] = "R" if constraint.kind == "R" else "S"
-        return (GraphJoint(name, kind, a, b, A, B, first),)
+        shifts = list_axes_across(first) if kind == "R" else "xyz"
+        return (GraphJoint(name, kind, a, b, A, B, first, near, far, shifts),)
     # the cross: at value zero the second axis is turned across the first
     cross = f"cross of {name}"
     across = _find_perpendicular(first, second)
     turn = geometry.make_pose(_turn_between(second, across), np.zeros(3))
     return (
-        GraphJoint(f"{name}_1", "R", a, cross, A, np.eye(4), first),
-        GraphJoint(f"{name}_2", "R", cross, b, turn, B, second),
+        GraphJoint(f"{name}_1", "R", a, cross, A, np.eye(4), first, near),
+        GraphJoint(f"{name}_2", "R", cross, b, turn, B, second, "", far),
     )
 
 

@@ -60,27 +60,28 @@ class UrdfConstraint:
 
     Attributes
     ----------
-    kind : R, S, U, or "" for a rigid link that was cut. links : parent and child.
-    origins : (4, 4) of each in its link [m]. axes : (3,) unit vector in each of these frames.
+    kind : R, S, U, or "" for a rigid link that was cut. ends : its frames on the parent and on the
+        child link, as fixed joints without a child. axes : (3,) unit vector in each of the frames.
     """
 
     name: str
     kind: str
-    links: tuple[str, str]
-    origins: tuple[FloatArray, FloatArray]
+    ends: tuple[UrdfJoint, UrdfJoint]
     axes: tuple[FloatArray, FloatArray]
     line: int
 
 
 @dataclass
 class OpenElement:
-    """A joint or constraint while it is parsed: attributes of its elements by name."""
+    """A joint or constraint while it is parsed: attributes of its elements by name, and the bytes
+    at which these start.
+    """
 
     name: str
     kind: str
     line: int
     elements: dict[str, dict[str, str]] = field(default_factory=dict)
-    start: int = -1
+    starts: dict[str, int] = field(default_factory=dict)
 
 
 def build_joint(joint: OpenElement, raw: bytes, path: Path) -> UrdfJoint:
@@ -102,7 +103,7 @@ def build_joint(joint: OpenElement, raw: bytes, path: Path) -> UrdfJoint:
             for key in ("lower", "upper")
         )
         limits = (low, high) if low < high else None
-    end = raw.index(b">", joint.start) + 1 if joint.start >= 0 else -1
+    start, end = _find_tag(joint, "origin", raw)
     mimic = elements.get("mimic")
     followed = None
     if mimic is not None:
@@ -111,10 +112,10 @@ def build_joint(joint: OpenElement, raw: bytes, path: Path) -> UrdfJoint:
             for key, default in (("multiplier", "1"), ("offset", "0"))
         )
         followed = mimic.get("joint", ""), factor, offset
-    return UrdfJoint(name, kind, parent, child, T, axis, limits, line, joint.start, end, followed)
+    return UrdfJoint(name, kind, parent, child, T, axis, limits, line, start, end, followed)
 
 
-def build_constraint(constraint: OpenElement, path: Path) -> UrdfConstraint:
+def build_constraint(constraint: OpenElement, raw: bytes, path: Path) -> UrdfConstraint:
     """Return a constraint from its elements."""
     name, elements, line = constraint.name, constraint.elements, constraint.line
     what = f"constraint {name!r}"
@@ -123,8 +124,18 @@ def build_constraint(constraint: OpenElement, path: Path) -> UrdfConstraint:
         raise FileError(sentence, path, line)
     kind, links = CONSTRAINTS[constraint.kind.lower()], _get_links(constraint, "constraint", path)
     first, second = (
-        _parse_origin(elements.get(f"{end}_origin", {}), what, path, line)
-        for end in ("parent", "child")
+        UrdfJoint(
+            f"{name}_{end}",
+            "",
+            link,
+            "",
+            _parse_origin(elements.get(f"{end}_origin", {}), what, path, line),
+            np.eye(3)[0],
+            None,
+            line,
+            *_find_tag(constraint, f"{end}_origin", raw),
+        )
+        for end, link in zip(("parent", "child"), links, strict=True)
     )
     stated = [end for end in ("parent", "child") if f"{end}_axis" in elements]
     needed = {"R": ["parent"], "U": ["parent", "child"]}.get(kind, [])
@@ -143,7 +154,13 @@ def build_constraint(constraint: OpenElement, path: Path) -> UrdfConstraint:
             sentence = f"{what} is {constraint.kind}, but its child_axis is not its parent_axis"
             action = "turn child_origin so that both frames share the axis, or leave child_axis out"
             raise FileError(f"{sentence}; {action}", path, line)
-    return UrdfConstraint(name, kind, links, (first, second), (axes["parent"], axes["child"]), line)
+    return UrdfConstraint(name, kind, (first, second), (axes["parent"], axes["child"]), line)
+
+
+def _find_tag(element: OpenElement, name: str, raw: bytes) -> tuple[int, int]:
+    """Return the bytes of the tag of an element inside, -1 without."""
+    start = element.starts.get(name, -1)
+    return start, raw.index(b">", start) + 1 if start >= 0 else -1
 
 
 def _get_links(joint: OpenElement, what: str, path: Path) -> tuple[str, str]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -60,9 +61,15 @@ class Urdf:
     constraints: tuple[UrdfConstraint, ...] = ()
     motors: Mapping[str, int] = field(default_factory=dict)
 
+    @cached_property
+    def places(self) -> Mapping[str, UrdfJoint]:
+        """Joints and the ends of constraints, by name."""
+        ends = {end.name: end for constraint in self.constraints for end in constraint.ends}
+        return {**ends, **self.joints}
+
     def error(self, sentence: Any, joint: str) -> FileError:
         """Return an error at the line of a joint."""
-        line = self.joints[joint].line if joint in self.joints else None
+        line = self.places[joint].line if joint in self.places else None
         return FileError(sentence, self.path, line)
 
     def find_body(self, link: str) -> str:
@@ -88,15 +95,15 @@ class Urdf:
         return replace(self, joints=joints, carrier=carrier)
 
     def with_origin(self, joint: str, origin: FloatArray, turned: bool) -> Urdf:
-        """Return the file with another origin of a joint; its rpy changes only where it `turned`.
+        """Return the file with another origin of a place; its rpy changes only where it `turned`.
 
         Raises
         ------
         FileError : the joint has no origin in the text, or the attribute is missing.
         """
-        old = self.joints[joint]
+        old = self.places[joint]
         if old.start < 0:
-            sentence = f"joint {joint!r} has no <origin>; add one with xyz and rpy"
+            sentence = f"{joint!r} has no origin element; add one with xyz and rpy"
             raise self.error(sentence, joint)
         raw = self.text.encode()
         tag = raw[old.start : old.end].decode()
@@ -109,7 +116,7 @@ class Urdf:
     def _replace_attribute(self, tag: str, name: str, values: FloatArray, joint: str) -> str:
         match = re.search(rf"""\s{name}\s*=\s*(["'])(.*?)\1""", tag, re.DOTALL)
         if match is None:
-            raise self.error(f"the origin of joint {joint!r} has no {name}; add it", joint)
+            raise self.error(f"the origin of {joint!r} has no {name}; add it", joint)
         text = " ".join(repr(float(v)) for v in values)
         return tag[: match.start(2)] + text + tag[match.end(2) :]
 
@@ -160,8 +167,7 @@ class _Parser:
             self._joint = OpenElement(text, attributes.get("type", ""), line)
         elif self._joint is not None and len(self._stack) == 3:
             self._joint.elements[name] = attributes
-            if name == "origin":
-                self._joint.start = self._expat.CurrentByteIndex
+            self._joint.starts[name] = self._expat.CurrentByteIndex
         elif self._stack == ["robot", "transmission", "joint"]:
             self.motors[text] = line
         elif self._stack == ["robot", "ros2_control", "joint"]:
@@ -183,7 +189,7 @@ class _Parser:
             if what == "joint":
                 self.joints[joint.name] = build_joint(joint, self.raw, self.path)
             else:
-                self.constraints[joint.name] = build_constraint(joint, self.path)
+                self.constraints[joint.name] = build_constraint(joint, self.raw, self.path)
         self._stack.pop()
 
     def _refuse_element(self, name: str, attributes: Mapping[str, str], line: int) -> None:
@@ -212,7 +218,7 @@ def parse(text: str, path: Path) -> Urdf:
     tree = _build_tree(text, path, parser.links, parser.joints)
     constraints = tuple(parser.constraints.values())
     for constraint in constraints:
-        for link in constraint.links:
+        for link in (end.parent for end in constraint.ends):
             if link not in parser.links:
                 what = f"constraint {constraint.name!r} names the link {link!r}"
                 sentence = f"{what}, which does not exist{suggest_names(link, parser.links)}"

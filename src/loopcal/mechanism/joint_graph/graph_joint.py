@@ -47,7 +47,7 @@ class GraphJoint:
         """Return the joint from the other body; its value stays the same.
 
         T_a J(q) = T_b means T_b J(-q) = T_a, and J(-q) about an axis is J(q) about its opposite. A
-        pin has the name of the place on its first body.
+        pin that has the name of its place on the first body gets that of the other.
         """
         swapped = replace(
             self,
@@ -59,7 +59,8 @@ class GraphJoint:
             origin_a=self.origin_b,
             origin_b=self.origin_a,
         )
-        return replace(swapped, name=self.origin_b) if self.is_pin else swapped
+        is_named_after_end = self.is_pin and self.name == self.origin_a
+        return replace(swapped, name=self.origin_b) if is_named_after_end else swapped
 
     def orient(self, body: str) -> GraphJoint:
         """Return the joint from one of its bodies."""

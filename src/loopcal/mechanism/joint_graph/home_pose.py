@@ -135,7 +135,7 @@ def measure_rotation(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> Flo
 def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
     """Return the value of a rotary joint or slide [rad, m], also of one that closes a loop."""
     for i, other in enumerate(graph.tree):
-        if {other.origin_a, other.origin_b, other.name} & {joint.name}:
+        if joint.name in (other.name, other.origin_a, other.origin_b):
             return float(q[i])
     if joint.kind == "R":
         return float(geometry.log_so3(measure_rotation(graph, q, joint)) @ joint.axis)
@@ -173,7 +173,8 @@ def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
     for _ in range(STARTS):
         residual, rows = graph.linearize(q)
         step = -(np.linalg.pinv(rows, rcond=1e-3) @ residual[:, :, None])[:, :, 0]
-        q = q + step * np.minimum(1.0, 0.3 / np.abs(step).max(axis=1, keepdims=True)) * sizes
+        largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
+        q = q + step * np.minimum(1.0, 0.3 / largest) * sizes
     best = q[[int(np.argmin((graph.linearize(q)[0] ** 2).sum(axis=1)))]]
     placement = graph.place(best)
     gaps = []

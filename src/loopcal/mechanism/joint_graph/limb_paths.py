@@ -94,7 +94,7 @@ def find_limb_paths(graph: JointGraph, platform: str) -> LimbPaths:
     freedoms = _list_freedoms(graph, home, platform)
     limbs = _sort_limbs(limbs, graph.motors)
     used = {joint.name for limb in limbs for joint in limb}
-    used |= {joint.origin_b for limb in limbs for joint in limb if joint.is_pin}
+    used |= {joint.origin_b for limb in limbs for joint in limb}
     replaced = tuple(joint.name for joint in graph.joints if joint.name not in used)
     return LimbPaths(graph, home, platform, limbs, freedoms, motion, replaced, dangling)
 
@@ -117,13 +117,17 @@ def remove_dangling(graph: JointGraph, platform: str) -> JointGraph:
 def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
     """Return the bodies that limbs join to the base without branches, those with most limbs first.
 
-    Bodies in the middle of an unbranched chain are left out where another body has more limbs.
+    Bodies in the middle of an unbranched chain are left out where another body has more limbs, and
+    bodies that fewer joints than motors carry, where others have more.
     """
-    counts = {}
+    counts, carried = {}, {}
     for body in graph.bodies[1:]:
         limbs = _find_complete_limbs(remove_dangling(graph, body), body)
         if limbs is not None:
+            carried[body] = min(len(limb) for limb in limbs)
             counts[body] = len(limbs)
+    needed = min(max(carried.values(), default=0), len(graph.motors))
+    counts = {body: count for body, count in counts.items() if carried[body] >= needed}
     most = max(counts.values(), default=0)
     return tuple(body for body, count in counts.items() if count == most)
 
