@@ -10,8 +10,8 @@ import enum
 import inspect
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import loopcal
@@ -67,7 +67,7 @@ def list_names(package: str) -> list[str]:
 def describe_name(name: str) -> str:
     """Return the first sentence of a public name's docstring."""
     value: Any = getattr(loopcal, name)
-    if isinstance(value, dict | MappingProxyType):
+    if isinstance(value, Mapping):
         return f"Mapping: {', '.join(f'`{key}`' for key in value)}."
     text = inspect.getdoc(value) or ""
     if not text or (isinstance(value, type) and text.startswith(f"{name}(")):

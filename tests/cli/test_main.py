@@ -3,6 +3,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
@@ -51,6 +52,37 @@ def test_large_packages_are_not_imported_before_a_command_runs() -> None:
     code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"  # noqa: E501
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+UNUSED = {
+    *(
+        "matplotlib",
+        "jinja2",
+        "rich",
+        "pandas",
+        "xarray",
+        "unittest",
+        "numpy.f2py",
+        "numpy.testing",
+    ),
+    *("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.sparse", "scipy.linalg"),
+    *("loopcal.planning", "loopcal.sampling", "loopcal.studies", "loopcal.documents"),
+    *("loopcal.report.figures", "loopcal.mechanism.families.limbs", "loopcal.apply.compensation"),
+    *("loopcal.diagnose.model_choice", "loopcal.apply.run_comparison.comparison"),
+}
+"""Packages that an ordinary calibration does not need, each of which takes time to import."""
+
+
+def test_ordinary_calibration_imports_only_what_it_needs(tmp_path) -> None:
+    example = Path("examples/hexapod-42/measurements.csv").resolve()
+    words = ["calibrate", "hexapod-42", str(example), "-o", str(tmp_path / "run")]
+    code = (
+        "import sys; from loopcal.cli import main; "
+        f"code = main({[*words, '--hold-out', '0.25']}); "
+        f"print(code, sorted({UNUSED} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0 []"
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from loopcal.estimate.poses.source_rows import fold_sources
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements, Observations
+from loopcal.numerics.back_substitution import substitute_backward
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -252,17 +253,16 @@ def _propagate(
 
     With [A; P^(1/2)] = Q R, b A_k' is R^-1 Q_k'. A'A is never formed.
     """
-    from scipy.linalg import solve_triangular
-
     own = [factor[:, U:] @ assumed.to_z * assumed.is_estimated for factor in factors]
     penalty = np.diag(np.sqrt(assumed.penalty))
     Q, R = np.linalg.qr(np.concatenate([*own, penalty]))
     parts = np.split(Q, np.cumsum([len(rows) for rows in own]))
     size = [assumed.noise] * len(own)
     errors = [
-        assumed.to_z @ solve_triangular(R, s * q.T) for s, q in zip(size, parts[:-1], strict=True)
+        assumed.to_z @ substitute_backward(R, s * q.T)
+        for s, q in zip(size, parts[:-1], strict=True)
     ]
-    errors.append(assumed.to_z @ solve_triangular(R, (parts[-1] * assumed.spread[:, None]).T))
+    errors.append(assumed.to_z @ substitute_backward(R, (parts[-1] * assumed.spread[:, None]).T))
     moved = [assumed.noise * factor[:, :U].T for factor in factors]
     return errors, [*moved, np.zeros((U, len(penalty)))]
 

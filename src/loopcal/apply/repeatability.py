@@ -214,7 +214,7 @@ def _estimate_accuracy(attained: FloatArray) -> Estimate:
     chi-square of trace over this variance degrees of freedom, which is exact for equal variances.
     That the variance is estimated widens the interval as Student's t does.
     """
-    from scipy.special import chndtr, chndtrinc
+    from loopcal.numerics.special_functions import chndtr, chndtrinc
 
     n, mean = len(attained), attained.mean(axis=0)
     size = float(np.linalg.norm(mean))
@@ -257,7 +257,7 @@ def _estimate_repeatability(attained: FloatArray) -> Estimate:
 
 def _student_quantile(degrees: int) -> float:
     """Return the quantile of Student's t for intervals of 95 %."""
-    from scipy.special import stdtrit
+    from loopcal.numerics.special_functions import stdtrit
 
     return float(stdtrit(degrees, 1.0 - TAIL))
 

@@ -232,7 +232,7 @@ class KindErrors:
         ----------
         values : measured values that are left to check the geometry.
         """
-        from scipy.special import stdtr
+        from loopcal.numerics.special_functions import stdtr
 
         degrees = min(self.count, values) - 1
         if degrees < 1 or not np.isfinite(self.change):

@@ -73,7 +73,7 @@ def find_agreeing(rows: ComparedRows, fitted: FloatArray, is_same_form: bool) ->
 
 def _is_no_chance(rows: ComparedRows, fitted: FloatArray, count: int, chance: float) -> bool:
     """Return whether more rows agree than repeats by chance would, each with this probability."""
-    from scipy.special import bdtrc
+    from loopcal.numerics.special_functions import bdtrc
 
     repeats = sum(len(near) > 0 for near in _find_repeats(rows, fitted))
     return bool(bdtrc(count - 1, max(repeats, count), chance) < CHANCE)

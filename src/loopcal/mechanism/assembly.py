@@ -28,6 +28,9 @@ ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
 MOST_LIMBS, MOST_JOINTS, MOST_ACTUATORS, MOST_PARAMETERS = 100, 50, 200, 2000
 """Largest numbers of limbs, joints of one limb, actuators and parameters."""
 
+MOST_COPIES = 100
+"""Largest number of copies of one limb."""
+
 
 @dataclass(frozen=True)
 class Link:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The chi-square and F distributions: tail probabilities and quantiles.
 
-scipy.special is imported when a function is called, so that `import loopcal` does not pay for it.
+The functions of scipy are imported when a function is called, so that `import loopcal` does not
+pay for them.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatAr
     ----------
     degrees : degrees of freedom. statistic : sum of squares [1]. Both broadcast.
     """
-    from scipy.special import chdtrc
+    from loopcal.numerics.special_functions import chdtrc
 
     degrees = np.asarray(degrees, dtype=float)
     tail = chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic)
@@ -39,7 +40,7 @@ def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) ->
     degrees : degrees of freedom of the statistic; without one the probability is 1.
     left : of the residuals; infinite for known noise. All broadcast.
     """
-    from scipy.special import fdtrc
+    from loopcal.numerics.special_functions import fdtrc
 
     degrees, left = np.asarray(degrees, dtype=float), np.asarray(left, dtype=float)
     tested = np.where(degrees > 0.0, degrees, 1.0)
@@ -59,7 +60,7 @@ def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> F
     ----------
     degrees : degrees of freedom, above 0. probability : of a larger value [1]. Both broadcast.
     """
-    from scipy.special import chdtri
+    from loopcal.numerics.special_functions import chdtri
 
     return np.asarray(chdtri(degrees, probability), dtype=float)
 
@@ -73,7 +74,7 @@ def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLi
     left : of the estimated noise, above 0; infinite for a known one: chi-square over `degrees`.
     probability : of a larger value [1]. All broadcast.
     """
-    from scipy.special import fdtri
+    from loopcal.numerics.special_functions import fdtri
 
     left = np.asarray(left, dtype=float)
     is_known = np.isinf(left)
@@ -95,7 +96,7 @@ def compute_averaged_tail(
     sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
         of freedom nu of its variance.
     """
-    from scipy.special import chdtri
+    from loopcal.numerics.special_functions import chdtri
 
     total = sum(part for part, _ in sources)
     probability = (np.arange(NODES) + 0.5) / NODES

@@ -90,7 +90,7 @@ def _tail(values: FloatArray) -> float:
     K(t) = -1/2 sum log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
     v = t sqrt(K''(t)), tail = 1 - Phi(w + log(v / w) / w).
     """
-    from scipy.special import ndtr
+    from loopcal.numerics.special_functions import ndtr
 
     if not (values.max() > 0.0 > values.min()):
         return 1.0 if values.min() >= 0.0 else 0.0

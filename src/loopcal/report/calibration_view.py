@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from loopcal.diagnose import ModelChoice, ReadingError
-from loopcal.estimate import Identification, PriorConflict
+from loopcal.estimate import Identification
 from loopcal.estimate.result import LAST_DIGITS
 from loopcal.findings import Finding
 from loopcal.findings.wording import list_names
@@ -32,6 +31,10 @@ from loopcal.report.validation_view import (
     view_errors,
 )
 from loopcal.workflow import CalibrationReport
+
+if TYPE_CHECKING:
+    from loopcal.diagnose import ModelChoice, ReadingError
+    from loopcal.estimate import PriorConflict
 
 WHOLE, MANY = 100.0, 10_000.0
 """Degrees of freedom from which they are shown without decimals, and from which they no longer

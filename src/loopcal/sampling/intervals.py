@@ -141,7 +141,7 @@ def compare_ends(
 
 def half_widths(level: float, degrees: FloatArray | float = np.inf) -> FloatArray:
     """Return half-widths in standard deviations of two-sided intervals, by Student's t."""
-    from scipy.special import ndtri, stdtrit
+    from loopcal.numerics.special_functions import ndtri, stdtrit
 
     quantile = 0.5 + 0.5 * level
     nu = np.asarray(degrees, dtype=np.float64)

@@ -5,30 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
     ConventionCheck,
-    MeasurementSuggestion,
-    ModelChoice,
     adjust_uncertainty,
     check_conventions,
     check_start_values,
-    choose_model,
-    compare_with_values,
     compute_reading_errors,
-    describe_missing_equations,
     examine_fit,
     find_frame_motions,
-    identifiability,
     interpret_fit,
-    suggest_measurements,
 )
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
 from loopcal.errors import DataError
-from loopcal.estimate import Change, Identification, identify, recalibrate
+from loopcal.estimate import Identification, identify
 from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.frame_freedoms import list_instrument_frames
 from loopcal.estimate.inference.prior import refuse_reused_rows
@@ -43,6 +37,10 @@ from loopcal.units import Dimension
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import DataSplit, split_data
+
+if TYPE_CHECKING:
+    from loopcal.diagnose import MeasurementSuggestion, ModelChoice, ValueComparison
+    from loopcal.estimate import Change
 
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
 """Codes of data that a geometry cannot reach."""
@@ -164,6 +162,8 @@ def _fit(
     fit_options = replace(options.fit, excluded_poses=excluded)
     count.begin("choosing the parameters" if options.choose_model else "preparing")
     if options.prior is not None:
+        from loopcal.estimate import recalibrate
+
         count.begin("fitting")
         fit, change = recalibrate(
             robot,
@@ -176,6 +176,8 @@ def _fit(
         return _FitResult(fit, change=change)
     choice = None
     if options.choose_model:
+        from loopcal.diagnose import choose_model
+
         choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
             left_out = choice.finding.data["not_compared"]
@@ -183,6 +185,8 @@ def _fit(
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
     if fit_options.method is None and available < free:
+        from loopcal.diagnose import describe_missing_equations
+
         raise DataError(
             report_finding(
                 "workflow.too-few-equations",
@@ -215,8 +219,7 @@ def _report(
     count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
-    stored = options.compare_with
-    comparison = None if stored is None else compare_with_values(fit, stored)
+    comparison = _compare_with_stored(fit, options)
     examined = () if examination is None else examination.findings
     findings = [
         *_report_conventions(conventions),
@@ -275,10 +278,23 @@ def _validate(
         raise
 
 
+def _compare_with_stored(
+    fit: Identification, options: CalibrationOptions
+) -> ValueComparison | None:
+    """Return the comparison with stored values; None where none are given."""
+    if options.compare_with is None:
+        return None
+    from loopcal.diagnose import compare_with_values
+
+    return compare_with_values(fit, options.compare_with)
+
+
 def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSuggestion, ...] | None:
     """Return further measurements that determine open combinations; None where none is open."""
     if not fit.converged or not fit.unidentifiable:
         return None
+    from loopcal.diagnose import identifiability, suggest_measurements
+
     return suggest_measurements(identifiability(fit.robot, data, fit.options.rank_tolerance))
 
 

@@ -6,24 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.apply import ErrorBudget, HeightErrors, Validation
 from loopcal.apply.height_errors import store_heights
 from loopcal.apply.stored_validation import store_differences
-from loopcal.diagnose import (
-    ConventionCheck,
-    FitExamination,
-    MeasurementSuggestion,
-    ModelChoice,
-    ReadingError,
-    StartCheck,
-    ValueComparison,
-)
 from loopcal.engine import collect_versions
-from loopcal.estimate import Change, Identification
+from loopcal.estimate import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import InstrumentRecord, Measurements, list_instruments
 from loopcal.mechanism import Mechanism
@@ -33,6 +23,19 @@ from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
 from loopcal.workflow.recommendation import recommend_values
 from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
+
+if TYPE_CHECKING:
+    from loopcal.apply import ErrorBudget, HeightErrors, Validation
+    from loopcal.diagnose import (
+        ConventionCheck,
+        FitExamination,
+        MeasurementSuggestion,
+        ModelChoice,
+        ReadingError,
+        StartCheck,
+        ValueComparison,
+    )
+    from loopcal.estimate import Change
 
 TOP = 3
 """Findings that a summary shows."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -103,17 +103,7 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     DataError
         A number that belongs to another method.
     """
-    from loopcal.estimate import (
-        GCV,
-        MAP,
-        FitOptions,
-        Huber,
-        LeastSquares,
-        Ridge,
-        TruncatedSVD,
-        TruncationGCV,
-        Tukey,
-    )
+    from loopcal import estimate
     from loopcal.estimate.inference.residual_test import SIGMA_UNCERTAINTY
     from loopcal.numerics.decomposition import RANK_TOLERANCE
 
@@ -131,17 +121,20 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
             f"--inflation belongs to --method auto, not to {name}; leave it out, or change the "
             "method"
         )
-    methods: dict[str, Callable[[], Any]] = {
-        "auto": lambda: _make_default(inflation),
-        "map": MAP,
-        "ls": LeastSquares,
-        "ridge": lambda: Ridge(GCV() if lam is None else lam),
-        "tsvd": lambda: TruncatedSVD(TruncationGCV() if keep is None else keep),
-    }
-    losses: dict[str, Callable[[], Any]] = {"none": lambda: None, "huber": Huber, "tukey": Tukey}
-    return FitOptions(
-        method=methods[name](),
-        loss=losses[options["loss"]](),
+    if name == "auto":
+        method = _make_default(inflation)
+    elif name == "ridge":
+        method = estimate.Ridge(estimate.GCV() if lam is None else lam)
+    elif name == "tsvd":
+        method = estimate.TruncatedSVD(estimate.TruncationGCV() if keep is None else keep)
+    else:
+        method = estimate.MAP() if name == "map" else estimate.LeastSquares()
+    loss = None
+    if options["loss"] != "none":
+        loss = estimate.Huber() if options["loss"] == "huber" else estimate.Tukey()
+    return estimate.FitOptions(
+        method=method,
+        loss=loss,
         noise=options["noise"],
         sigma_uncertainty=SIGMA_UNCERTAINTY if stated is None else stated,
         excluded_poses=options["drop"],

@@ -32,6 +32,7 @@ from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.back_substitution import substitute_transposed
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -254,12 +255,10 @@ def compare_blocks(
     """Return the influence of blocks H (b, m, k) for the factor and solution of `inside` (b,) and
     other blocks.
     """
-    from scipy.linalg import solve_triangular
-
     b, m, k = H.shape
     half = H
     if H.size:  # one system for all blocks
-        half = solve_triangular(triangle, H.reshape(b * m, k).T, trans=1).T.reshape(H.shape)
+        half = substitute_transposed(triangle, H.reshape(b * m, k).T).T.reshape(H.shape)
     return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
 
 

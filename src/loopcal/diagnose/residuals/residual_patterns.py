@@ -194,7 +194,7 @@ def _shift(columns: FloatArray, pairs: np.ndarray) -> FloatArray:
 
 def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:
     """Return the probability of a larger value of a beta variable on (-1, 1)."""
-    from scipy.special import betainc
+    from loopcal.numerics.special_functions import betainc
 
     center, spread = 0.5 * (1.0 + mean), 0.25 * variance
     total = center * (1.0 - center) / spread - 1.0

@@ -93,15 +93,17 @@ class ResidualRows:
 
 def span_columns(columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one."""
-    from scipy.linalg import svd
-
     length = np.linalg.norm(columns, axis=0)
     scaled = columns[:, length > 0.0] / length[length > 0.0]
     if not scaled.size:
         return scaled
-    # the triangle first: the divide-and-conquer driver may fail on many rows, this one does not
-    Q, R = np.linalg.qr(scaled)
-    inner, s, _ = svd(R, full_matrices=False, lapack_driver="gesvd")
+    Q, R = np.linalg.qr(scaled)  # the triangle first: LAPACK divides and conquers many rows
+    try:
+        inner, s, _ = np.linalg.svd(R, full_matrices=False)
+    except np.linalg.LinAlgError:  # divide and conquer may fail; the slower driver does not
+        from scipy.linalg import svd
+
+        inner, s, _ = svd(R, full_matrices=False, lapack_driver="gesvd")
     u = Q @ inner
     return np.asarray(u[:, s > EXPLAINED])
 

@@ -122,7 +122,7 @@ def block_limit(single: float, degrees: FloatArray) -> FloatArray:
     single : limit of one normal residual, in standard deviations. degrees : (u,) residuals of each
         block.
     """
-    from scipy.special import ndtr
+    from loopcal.numerics.special_functions import ndtr
 
     exceedance = 2.0 * float(ndtr(-single))
     return np.sqrt(compute_chi_square_quantile(np.maximum(degrees, 1.0), exceedance))

@@ -14,8 +14,13 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.mechanism.assembly import MOST_ACTUATORS, MOST_JOINTS, MOST_LIMBS, MOST_PARAMETERS
-from loopcal.mechanism.families.limb_records import MOST_COPIES
+from loopcal.mechanism.assembly import (
+    MOST_ACTUATORS,
+    MOST_COPIES,
+    MOST_JOINTS,
+    MOST_LIMBS,
+    MOST_PARAMETERS,
+)
 
 MEGABYTE = 10**6
 

@@ -4,16 +4,22 @@
 To add a family, write its file and add its name here; no other package knows the families.
 """
 
-from collections.abc import Mapping
+from __future__ import annotations
 
-from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.families.records import RobotRecord
-from loopcal.mechanism.families.ru_pus_prs import RuPusPrs
-from loopcal.mechanism.families.three_prs import ThreePrs
+from typing import TYPE_CHECKING
 
-FAMILIES: Mapping[str, type[RobotRecord]] = {
-    record.family: record for record in (ThreePrs, Gough, Limbs, LinearDelta, RuPusPrs)
-}
-"""Records by the name of their family."""
+from loopcal.lazy_names import LazyRegistry
+
+if TYPE_CHECKING:
+    from loopcal.mechanism.families.records import RobotRecord
+
+FAMILIES: LazyRegistry[type[RobotRecord]] = LazyRegistry(
+    {
+        "3-prs": "loopcal.mechanism.families.three_prs:ThreePrs",
+        "gough": "loopcal.mechanism.families.gough:Gough",
+        "limbs": "loopcal.mechanism.families.limbs:Limbs",
+        "linear-delta": "loopcal.mechanism.families.linear_delta:LinearDelta",
+        "ru-pus-prs": "loopcal.mechanism.families.ru_pus_prs:RuPusPrs",
+    }
+)
+"""Records by the name of their family, imported when a robot file names it."""

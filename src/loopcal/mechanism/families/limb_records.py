@@ -121,10 +121,6 @@ class Spherical:
 JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
 
 
-MOST_COPIES = 100
-"""Largest number of copies of one limb."""
-
-
 @dataclass(frozen=True)
 class Copies:
     """Copies of a limb, rotated about an axis of base and platform.

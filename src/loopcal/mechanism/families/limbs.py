@@ -16,6 +16,7 @@ import numpy as np
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import (
     AXES,
+    MOST_COPIES,
     MOST_LIMBS,
     Address,
     Assembly,
@@ -54,7 +55,6 @@ from loopcal.mechanism.families.limb_placement import (
     rotate_about,
 )
 from loopcal.mechanism.families.limb_records import (
-    MOST_COPIES,
     AngleDrive,
     Cylindrical,
     Drive,

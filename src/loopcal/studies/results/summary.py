@@ -147,7 +147,7 @@ def estimate_quantile(ordered: FloatArray, share: float) -> Interval:
     l and h contains it with the probability of l <= number < h, at least `LEVEL`. Where the values
     are too few, an end is infinite.
     """
-    from scipy.special import bdtr
+    from loopcal.numerics.special_functions import bdtr
 
     n = len(ordered)
     below = bdtr(np.arange(n + 1), n, share)  # P(number <= k)
@@ -166,7 +166,7 @@ def estimate_mean(values: FloatArray) -> Interval:
 
     The interval of a single value is infinite.
     """
-    from scipy.special import stdtrit
+    from loopcal.numerics.special_functions import stdtrit
 
     n, mean = len(values), float(np.mean(values))
     if n < 2:
@@ -194,7 +194,7 @@ def compute_binomial_interval(count: float, number: float, confidence: float = L
 
     Numbers that are not whole are effective ones.
     """
-    from scipy.special import betaincinv
+    from loopcal.numerics.special_functions import betaincinv
 
     if number <= 0.0:
         return Interval(np.nan, 0.0, 1.0)

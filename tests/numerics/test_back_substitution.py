@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangular systems agree with LAPACK's routine for triangles, also ill-conditioned ones."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_triangular
+
+from loopcal.numerics.back_substitution import substitute_backward, substitute_transposed
+
+
+@pytest.fixture(params=[1.0, 1e-4, 1e-9])
+def system(request):
+    """A triangle whose diagonal falls by the factor from its first to its last entry."""
+    rng = np.random.default_rng(5)
+    R = np.linalg.qr(rng.normal(size=(60, 40)), mode="r")
+    return R * np.geomspace(1.0, request.param, 40)[:, None], rng.normal(size=(40, 7))
+
+
+def test_upper_triangle(system) -> None:
+    R, b = system
+    expected = solve_triangular(R, b)
+    error = np.abs(substitute_backward(R, b) - expected).max(axis=0)
+    assert (error <= 1e-12 * np.abs(expected).max(axis=0)).all()  # 40 rounded sums, condition 50
+
+
+def test_transposed_triangle(system) -> None:
+    R, b = system
+    expected = solve_triangular(R, b, trans=1)
+    error = np.abs(substitute_transposed(R, b) - expected).max(axis=0)
+    assert (error <= 1e-12 * np.abs(expected).max(axis=0)).all()
+
+
+def test_a_zero_on_the_diagonal_is_refused() -> None:
+    R = np.triu(np.ones((3, 3)))
+    R[1, 1] = 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        substitute_backward(R, np.ones((3, 1)))
+    with pytest.raises(np.linalg.LinAlgError):
+        substitute_transposed(R, np.ones((3, 1)))
