@@ -11,7 +11,8 @@ from loopcal.cli import main
 from loopcal.io import load_measurements, load_run
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.derived_robots import format_reduced_robot
-from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
+from loopcal.io.robot.identified_table import add_table, format_table
+from loopcal.io.robot.robot_file import find_robot_file, get_source, load_robot, save_robot
 
 FIVE_BAR = find_robot_file("five-bar").read_text()
 CONTENT = parse_yaml(FIVE_BAR, "five-bar.yaml", "robot file").content
@@ -55,6 +56,24 @@ def test_robot_file_of_any_style_takes_the_identified_table(tmp_path, text: str)
     reduced = format_reduced_robot(again, {robot.parameters.names[0]: "why # it is fixed"})
     (tmp_path / "reduced.yaml").write_text(reduced)
     assert not load_robot(tmp_path / "reduced.yaml").parameters.free[0]
+
+
+@pytest.mark.parametrize("name", ["hexapod-42", "five-bar", "linear-delta"])
+def test_the_identified_table_is_added_as_it_was_formatted(name: str) -> None:
+    """The content that is stated beside the text is what YAML reads from the text: a candidate
+    counts only where both agree, and otherwise the whole file is written anew.
+    """
+    robot = load_robot(name)
+    n = len(robot.values)
+    values = robot.values * (1 + 1e-3 * np.random.default_rng(7).uniform(size=n))
+    values[0] = 0.0
+    plus_minus = np.geomspace(1e-9, 1e3, n)
+    plus_minus[-1] = np.inf
+    changed = robot.with_values(values)
+    text = get_source(robot).nominal_file.text
+    added = add_table(get_source(robot).nominal_file, changed, plus_minus)
+    assert added.text == text + format_table(changed, plus_minus)
+    assert len(added.content["identified"]) >= robot.parameters.free.sum()
 
 
 def test_windows_line_ends_are_kept(tmp_path) -> None:

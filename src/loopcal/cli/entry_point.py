@@ -95,6 +95,11 @@ MODULES = {
 """Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
 
 
+NO_PLUGINS = ("PYDANTIC_DISABLE_PLUGINS", "__all__")
+"""The records of loopcal need no plugins of pydantic, which are searched in all installed packages.
+"""
+
+
 class SectionedGroup(CommandGroup):
     """A group whose help lists its commands below headings, in the order of the work."""
 
@@ -186,6 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments : words after `loopcal`; default: those of the process.
     """
     os.environ.update(dict.fromkeys(THREADS, "1"))
+    os.environ.setdefault(*NO_PLUGINS)
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,12 @@ Location = tuple[str | int, ...]
 
 LONGEST_PROBLEM = 100
 """Characters of a parser's sentence that a message repeats."""
+
+KEPT_TEXTS, KEPT_LENGTH = 8, 100_000
+"""Texts whose trees are kept, and their largest length. A command reads the same text several times
+(it is looked at before it is used, and read back after it was written), which takes as long as a
+fit.
+"""
 
 _KNOWN_KEY = re.compile(
     r"""^[\s{]*["']?(format|units|family|identified|kinds?|noise|controller|instrument|robot|poses"""
@@ -136,7 +143,7 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     from loopcal.io.core.bounded_yaml import KeyTypeError, LimitError
 
     try:
-        return make_round_trip_yaml().load(text)
+        return _parse_text(text) if len(text) <= KEPT_LENGTH else _parse_text.__wrapped__(text)
     except DuplicateKeyError as error:
         key = str(error.problem).split('"')[1] if '"' in str(error.problem) else "?"
         line = error.problem_mark.line + first_line if error.problem_mark else None
@@ -155,6 +162,12 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
             raise FileError("a number has thousands of digits; write a shorter one", path) from None
         sentence = f"not valid YAML ({_shorten(error)}); correct the syntax"
         raise FileError(sentence, path) from None
+
+
+@lru_cache(KEPT_TEXTS)
+def _parse_text(text: str) -> Any:
+    """Return ruamel.yaml's tree of a text, which nothing changes: it is only asked for lines."""
+    return make_round_trip_yaml().load(text)
 
 
 def make_round_trip_yaml() -> Any:

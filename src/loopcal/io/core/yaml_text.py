@@ -30,16 +30,17 @@ def format_flow_mapping(texts: Mapping[str, str]) -> str:
     return f"{{{', '.join(f'{quote_scalar(name)}: {text}' for name, text in texts.items())}}}"
 
 
-def add_key(file: YamlFile, entry: str) -> YamlFile:
+def add_key(file: YamlFile, entry: str, content: Mapping[str, Any] | None = None) -> YamlFile:
     """Return a file with one more key.
 
     Parameters
     ----------
     file : without the key. entry : the key and its value in block style at the left margin, in
         complete lines; a comment in them is lost where the file is in flow style.
+    content : what the entry says, as far as the caller knows; otherwise it is parsed.
     """
-    wanted = file.content | _parse(entry, file).content
-    return _choose(file, _list_additions(file, entry), wanted)
+    added = _parse(entry, file).content if content is None else dict(content)
+    return _choose(file, _list_additions(file, entry, added), file.content | added)
 
 
 def remove_key(file: YamlFile, key: str) -> YamlFile:
@@ -69,7 +70,7 @@ def _parse(text: str, file: YamlFile) -> YamlFile:
     return parse_yaml(text, file.path, "changed file", has_names=False)
 
 
-def _list_additions(file: YamlFile, entry: str) -> Iterator[str]:
+def _list_additions(file: YamlFile, entry: str, added: dict[str, Any]) -> Iterator[str]:
     """Yield texts with a further key, first those that are quick to make."""
     text = file.text
     end = "\r\n" if "\r\n" in text else "\n"
@@ -78,7 +79,7 @@ def _list_additions(file: YamlFile, entry: str) -> Iterator[str]:
     root = make_round_trip_yaml().compose(text)
     start, stop = root.start_mark.index, root.end_mark.index
     if root.flow_style:
-        inside = _format_inside(_parse(entry, file).content)
+        inside = _format_inside(added)
         for comma in (",", ""):
             yield f"{text[: stop - 1]}{comma}{end}{inside}{text[stop - 1 :]}"
         return

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.numbers import format_scaled
@@ -33,24 +35,53 @@ def format_table(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
     -------
     Lines with a final break; nothing where all values are nominal and no uncertainty is given.
     """
+    return _format_rows(_list_rows(robot, plus_minus))
+
+
+def _list_rows(robot: Mechanism, plus_minus: FloatArray | None) -> list[dict[str, str]]:
+    """Return the rows of the table with the keys KEYS; numbers as their texts."""
     if plus_minus is None and (robot.values == robot.parameters.nominal).all():
-        return ""
-    rows = [f"{TABLE}:  # delete this table to restore the nominal robot\n"]
+        return []
+    rows = []
     for i, parameter in enumerate(robot.parameters.entries):
         if parameter.free or robot.values[i] != parameter.nominal:
             shown = find_unit(robot.units[parameter.dimension])
             value = format_scaled(float(robot.values[i]), shown.factor_to_si)
             half = math.nan if plus_minus is None else float(plus_minus[i]) / shown.factor_to_si
             text = f"{half:.2g}" if math.isfinite(half) else "null"
-            head = f"  - {{name: {quote_scalar(parameter.name)}, value: {value}"
-            rows.append(f"{head}, {PLUS_MINUS}: {text}, unit: {quote_scalar(shown.symbol)}}}\n")
-    return "".join(rows)
+            cells = (parameter.name, value, text, shown.symbol)
+            rows.append(dict(zip(KEYS, cells, strict=True)))
+    return rows
+
+
+def _format_rows(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return rows as YAML; nothing without rows."""
+    lines = [f"{TABLE}:  # delete this table to restore the nominal robot\n"] if rows else []
+    for row in rows:
+        name, unit = quote_scalar(row["name"]), quote_scalar(row["unit"])
+        numbers = f"value: {row['value']}, {PLUS_MINUS}: {row[PLUS_MINUS]}"
+        lines.append(f"  - {{name: {name}, {numbers}, unit: {unit}}}\n")
+    return "".join(lines)
+
+
+def _read_number(text: str) -> float | None:
+    """Return what YAML reads from the text of a number, or from `null`."""
+    if text == "null":
+        return None
+    return int(text) if text.lstrip("-").isdigit() else float(text)
 
 
 def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
     """Return a robot file without a table with that of `format_table`."""
-    table = format_table(robot, plus_minus)
-    return add_key(file, table) if table else file
+    rows = _list_rows(robot, plus_minus)
+    if not rows:
+        return file
+    numbers = ("value", PLUS_MINUS)
+    content: list[dict[str, Any]] = [
+        {key: _read_number(text) if key in numbers else text for key, text in row.items()}
+        for row in rows
+    ]
+    return add_key(file, _format_rows(rows), {TABLE: content})
 
 
 def remove_mark(text: str) -> str:
