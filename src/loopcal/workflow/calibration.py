@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
-from loopcal.apply.height_errors import measures_only_heights
-from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
     ConventionCheck,
     adjust_uncertainty,
@@ -17,7 +14,6 @@ from loopcal.diagnose import (
     check_start_values,
     compute_reading_errors,
     examine_fit,
-    find_frame_motions,
     interpret_fit,
 )
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
@@ -27,13 +23,22 @@ from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.frame_freedoms import list_instrument_frames
 from loopcal.estimate.inference.prior import refuse_reused_rows
 from loopcal.estimate.information import count_equations
-from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.findings.importance import sort_by_importance
-from loopcal.measure import Measurements, check_instruments, fill_in_reading_sigma
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
-from loopcal.units import Dimension
+from loopcal.workflow.calibration_findings import (
+    check_split_instruments,
+    report_conventions,
+    report_fit,
+    report_freedoms,
+    report_repeats,
+    report_scale,
+    report_unexplained,
+    report_validation,
+)
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import DataSplit, split_data
@@ -52,12 +57,6 @@ NOTHING_TO_COMPARE = (
 )
 """Codes of data that leave nothing to compare: all values locate the poses, or the initial geometry
 reaches none of these."""
-
-NO_GAIN = "model.no-expected-gain"
-"""Finding that a calibration is not expected to improve on the tolerances."""
-
-UNUSUAL_NOISE = 10.0
-"""Factor on sigma from which an estimated noise is no property of an instrument."""
 
 STEPS = 8
 """Steps that the progress callback counts: conventions, model, fit, what the residuals add to the
@@ -222,15 +221,15 @@ def _report(
     comparison = _compare_with_stored(fit, options)
     examined = () if examination is None else examination.findings
     findings = [
-        *_report_conventions(conventions),
-        *_report_fit(fit),
-        *_report_unexplained(fit, examined),
+        *report_conventions(conventions),
+        *report_fit(fit),
+        *report_unexplained(fit, examined),
         *impossible,
-        *(_report_validation(errors, held_out is not None) if fit.converged else ()),
-        *_report_repeats(split),
-        *_check_instruments(split),
-        *_report_freedoms(fit),
-        *_report_scale(fit, fitted),
+        *(report_validation(errors, held_out is not None) if fit.converged else ()),
+        *report_repeats(split),
+        *check_split_instruments(split),
+        *report_freedoms(fit),
+        *report_scale(fit, fitted),
         start.finding,
         *examined,
         *(() if result.choice is None else (result.choice.finding,)),
@@ -296,114 +295,3 @@ def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSugges
     from loopcal.diagnose import identifiability, suggest_measurements
 
     return suggest_measurements(identifiability(fit.robot, data, fit.options.rank_tolerance))
-
-
-def _report_conventions(check: ConventionCheck) -> list[Finding]:
-    """Return doubts about conventions, which fit and validation answer: worth knowing."""
-    return [] if check.finding is None else [replace(check.finding, severity=Severity.INFO)]
-
-
-def _report_fit(fit: Identification) -> list[Finding]:
-    """Return the findings of the fit, with the severity that they have for a calibration.
-
-    A contradiction with the stated noise is a failure. Single open combinations are worth knowing;
-    whether they affect accuracy is reported once for all of them, see `_report_freedoms`.
-    """
-    severities = {
-        "noise.residuals-too-large": Severity.FAILURE,
-        "fit.unidentifiable": Severity.INFO,
-    }
-    return [replace(f, severity=severities.get(f.code, f.severity)) for f in fit.findings]
-
-
-def _report_unexplained(fit: Identification, examined: Iterable[Finding]) -> list[Finding]:
-    """Return whether an estimated noise takes in the whole of measurements that do not fit.
-
-    Residuals contradict no noise that they determine themselves.
-    """
-    test = fit.residual_test
-    is_unusual = test.noise != "given" and test.sigma_scale >= UNUSUAL_NOISE
-    if not is_unusual or all(finding.code != NO_GAIN for finding in examined):
-        return []
-    return [report_finding("fit.explains-nothing", scale=test.sigma_scale)]
-
-
-def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Finding]:
-    """Return the findings of the validation, and whether it supports a verdict.
-
-    Errors on fitted poses prove nothing; of these only the poses that are out of reach are listed.
-    """
-    if not is_held_out:
-        missed = () if errors is None else errors.findings
-        unreachable = [f for f in missed if f.code == "validation.unreachable-poses"]
-        return [report_finding("workflow.no-held-out-poses"), *unreachable]
-    if errors is None:
-        return []
-    checked = errors.without_blunders or errors  # a wrong measurement says nothing of the geometry
-    if checked.judged < FEW_ROWS:
-        few = report_finding("workflow.few-held-out-poses", count=checked.judged, needed=FEW_ROWS)
-        return [*errors.findings, few]
-    if checked.values_left < FEW_ROWS:
-        values, setup = checked.kinds[-1].count, checked.setup_count
-        held_out_setup = report_finding("workflow.held-out-setup", values=values, setup=setup)
-        return [*errors.findings, held_out_setup]
-    return [
-        *errors.findings,
-        *(
-            report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
-            for quantity, change in checked.changes().items()
-            if change.has_grown
-        ),
-    ]
-
-
-def _report_repeats(split: DataSplit) -> list[Finding]:
-    """Return which held-out poses repeat fitted ones, where poses were chosen by name."""
-    names = tuple(f"pose {label}" for label in split.list_repeats())
-    return [report_finding("workflow.held-out-repeats", names=names)] if names else []
-
-
-def _check_instruments(split: DataSplit) -> list[Finding]:
-    """Return the instruments that were not validly calibrated when they measured."""
-    held_out = () if split.held_out is None else split.held_out.observations
-    return check_instruments((*split.fitted.observations, *held_out))
-
-
-def _report_scale(fit: Identification, data: Measurements) -> list[Finding]:
-    """Return that heights do not test the fixed lengths from which x and y have their scale."""
-    if not fit.converged or not measures_only_heights(data):
-        return []
-    names = tuple(
-        parameter.name
-        for parameter, is_free in zip(
-            fit.robot.parameters.entries, fit.robot.parameters.free, strict=True
-        )
-        if not is_free and parameter.dimension is Dimension.LENGTH
-    )
-    return [report_finding("workflow.undetermined-scale", names=names)] if names else []
-
-
-def _report_freedoms(fit: Identification) -> list[Finding]:
-    """Return whether open combinations only move frames, or change poses."""
-    if not fit.converged or not fit.unidentifiable:
-        return []
-    motions = find_frame_motions(fit.posterior)
-    count = len(fit.names) - fit.rank
-    findings = []
-    if motions.count:
-        findings.append(
-            report_finding(
-                "workflow.frame-freedoms", count=motions.count, frames=tuple(motions.frames)
-            )
-        )
-    if count > motions.count:
-        changing = [c for c in fit.unidentifiable if not c.meaning] or fit.unidentifiable
-        names = dict.fromkeys(name for c in changing for name in c.names)
-        findings.append(
-            report_finding(
-                "workflow.undetermined-combinations",
-                count=count - motions.count,
-                names=tuple(names),
-            )
-        )
-    return findings
