@@ -307,6 +307,7 @@ def _build_sources() -> Iterator[Machine]:
             3 import hexapod.hal --unit mm --home-z 200mm -o new.yaml
             3 import samples.json --format hangprinter -o new.yaml --data new.csv
             3 import robot.urdf --closures loops.yaml -o new.yaml
+            3 import constrained.urdf -o new.yaml
             1 export five-bar -o out.csv
             1 export linear-delta --format klipper --into printer.cfg -o corrected.cfg
             1 export linear-delta --format reprap --into robot.g -o corrected.g

@@ -118,6 +118,15 @@ URDF = (
     + "</robot>\n"
 )
 
+CONSTRAINED = URDF.replace(
+    "</robot>",
+    '  <constraint name="brace" type="spherical">\n    <parent link="rod1"/>\n'
+    '    <parent_origin xyz="0.3 0 0"/>\n    <child link="rod2"/>\n'
+    '    <child_origin xyz="0.3 0 0"/>\n  </constraint>\n'
+    '  <transmission name="t1"><joint name="mot1"/></transmission>\n'
+    '  <transmission name="t2"><joint name="mot2"/></transmission>\n</robot>\n',
+)
+
 CLOSURES = "closed_loop: [[closedloop1_A, closedloop1_B]]\ntype: ['6d']\nname_mot: [mot1, mot2]\n"
 
 SOURCES = {
@@ -126,6 +135,7 @@ SOURCES = {
     "marlin.g": MARLIN,
     "hexapod.hal": GENHEX,
     "robot.urdf": URDF,
+    "constrained.urdf": CONSTRAINED,
     "loops.yaml": CLOSURES,
 }
 """Files by name."""
