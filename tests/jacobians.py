@@ -209,31 +209,58 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
     at the end.
 
     What does not depend on the traced unknowns stays with numpy: it needs no derivative and no
-    compiling. `stack_matrix` writes into an array, which jax does not allow, so it is replaced too.
+    compiling. `stack_matrix` and `stack_blocks` write into an array, which jax does not allow, so they are
+    replaced too.
     """
     import jax.numpy
 
-    from loopcal.geometry.rotations import stack_matrix
+    from loopcal.geometry import rotations
 
     def stack(rows: tuple[tuple[Any, ...], ...]) -> Any:
         entries = jax.numpy.broadcast_arrays(*(entry for row in rows for entry in row))
         shape = (*entries[0].shape, len(rows), len(rows[0]))
         return jax.numpy.stack(entries, axis=-1).reshape(shape)
 
+    def join(rows: tuple[tuple[Any, ...], ...]) -> Any:
+        blocks = [block for row in rows for block in row if block is not None]
+        leading = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
+        heights = [next(b.shape[-2] for b in row if b is not None) for row in rows]
+        widths = [next(b.shape[-1] for b in c if b is not None) for c in zip(*rows, strict=True)]
+        return jax.numpy.concatenate(
+            [
+                jax.numpy.concatenate(
+                    [
+                        jax.numpy.broadcast_to(0.0 if b is None else b, (*leading, height, width))
+                        for b, width in zip(row, widths, strict=True)
+                    ],
+                    axis=-1,
+                )
+                for row, height in zip(rows, heights, strict=True)
+            ],
+            axis=-2,
+        )
+
+    replaced = {"stack_matrix": stack, "stack_blocks": join}
+
     modules = [
         module
         for name, module in list(sys.modules.items())
         if (name == package or name.startswith(package + ".")) and getattr(module, "np", None) is np
     ]
-    stacking = [module for module in modules if hasattr(module, "stack_matrix")]
+    stacking = [
+        (vars(module), name, getattr(rotations, name))
+        for module in modules
+        for name in replaced
+        if hasattr(module, name)
+    ]
     for module in modules:
         vars(module)["np"] = _Either(np, jax.numpy)
-    for module in stacking:
-        vars(module)["stack_matrix"] = stack
+    for names, name, _ in stacking:
+        names[name] = replaced[name]
     try:
         yield
     finally:
         for module in modules:
             vars(module)["np"] = np
-        for module in stacking:
-            vars(module)["stack_matrix"] = stack_matrix
+        for names, name, own in stacking:
+            names[name] = own

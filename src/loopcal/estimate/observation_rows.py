@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.measure import Kind, Measurements
+from loopcal.measure.kinds.rows import MeasuredColumns
 from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -78,10 +80,18 @@ class ObservationRows:
         offset = None if self.offset is None else self.offset[:, rows]
         return ObservationRows(self.kind, place[self.poses[rows]], *parts, factor, offset)
 
-    def take_trials(self, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return measured values and whiteners of some trials; one set stands for all of them."""
-        measured = self.measured if len(self.measured) == 1 else self.measured[trials]
-        return measured, self.whitener if len(self.whitener) == 1 else self.whitener[trials]
+    def take_trials(self, trials: IntArray) -> tuple[MeasuredColumns, FloatArray]:
+        """Return measured columns and whiteners of some trials; one set stands for all of them."""
+        if len(self.measured) == 1:
+            columns = self._columns
+        else:
+            columns = self.kind.prepare_columns(self.measured[trials])
+        return columns, self.whitener if len(self.whitener) == 1 else self.whitener[trials]
+
+    @cached_property
+    def _columns(self) -> MeasuredColumns:
+        """The measured columns of the only trial; they stay the same in all evaluations."""
+        return self.kind.prepare_columns(self.measured)
 
     def whiten(self, whitener: FloatArray, residual: FloatArray, trials: IntArray) -> FloatArray:
         """Return whitened residuals (a, r, m) of some trials (a,), with their offset."""

@@ -8,8 +8,11 @@ base axes. An update is `R <- exp(omega) R, t <- t + v`; `pose_difference` is it
 
 import numpy as np
 
-from loopcal.geometry.rotations import exp_so3, hat, log_so3, stack_matrix
+from loopcal.geometry.rotations import exp_so3, hat, log_so3, stack_blocks
 from loopcal.typing import FloatArray
+
+_LAST = np.ones((1, 1))
+"""The last number of the last row of a pose."""
 
 
 def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
@@ -17,11 +20,7 @@ def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
 
     Leading axes broadcast against each other.
     """
-    rows = tuple(
-        (rotation[..., i, 0], rotation[..., i, 1], rotation[..., i, 2], translation[..., i])
-        for i in range(3)
-    )
-    return stack_matrix((*rows, (0.0, 0.0, 0.0, 1.0)))
+    return stack_blocks(((rotation, translation[..., None]), (None, _LAST)))
 
 
 def invert_pose(T: FloatArray) -> FloatArray:
@@ -55,11 +54,7 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
     rotation : (..., 3, 3) Q, from base axes to the new axes (default: base axes).
     """
     turned = np.eye(3) if rotation is None else rotation
-    lever = -(turned @ hat(arm))
-    turned = np.broadcast_to(turned, lever.shape)
-    # joined, not assigned: automatic derivatives put jax in the place of numpy
-    top = np.concatenate([turned, np.zeros_like(lever)], axis=-1)
-    return np.concatenate([top, np.concatenate([lever, turned], axis=-1)], axis=-2)
+    return stack_blocks(((turned, None), (-(turned @ hat(arm)), turned)))
 
 
 def differentiate_by_frames(T: FloatArray) -> FloatArray:
@@ -73,6 +68,5 @@ def differentiate_by_frames(T: FloatArray) -> FloatArray:
     T : (..., 4, 4) T_base_platform [m].
     """
     R, t = T[..., :3, :3], T[..., :3, 3]
-    zero, eye = np.zeros_like(R), np.broadcast_to(np.eye(3), R.shape)
-    top = np.concatenate([eye, zero, R, zero], axis=-1)
-    return np.concatenate([top, np.concatenate([-hat(t), eye, zero, R], axis=-1)], axis=-2)
+    eye = np.eye(3)
+    return stack_blocks(((eye, None, R, None), (-hat(t), eye, None, R)))

@@ -15,6 +15,10 @@ from loopcal.typing import FloatArray
 # smallest float.
 _TINY = 1e-200
 
+_HAT = np.zeros((3, 9))
+"""Entries of `hat(w)`, row by row, by those of w."""
+_HAT[0, [5, 7]], _HAT[1, [2, 6]], _HAT[2, [1, 3]] = (-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)
+
 
 def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray:
     """Stack a rows of b entries, which broadcast against each other, into matrices (..., a, b)."""
@@ -27,10 +31,31 @@ def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray
     return stacked
 
 
+def stack_blocks(rows: tuple[tuple[FloatArray | None, ...], ...]) -> FloatArray:
+    """Stack blocks (..., a, b), which broadcast against each other, into matrices; None is zero.
+
+    The first block of each row and of each column must not be None in all of them.
+    """
+    blocks = [block for row in rows for block in row if block is not None]
+    leading = {block.shape[:-2] for block in blocks}
+    shape = leading.pop() if len(leading) == 1 else np.broadcast_shapes(*leading)
+    heights = [next(b.shape[-2] for b in row if b is not None) for row in rows]
+    widths = [next(b.shape[-1] for b in c if b is not None) for c in zip(*rows, strict=True)]
+    stacked = np.zeros((*shape, sum(heights), sum(widths)))
+    top = 0
+    for height, row in zip(heights, rows, strict=True):
+        left = 0
+        for width, block in zip(widths, row, strict=True):
+            if block is not None:
+                stacked[..., top : top + height, left : left + width] = block
+            left += width
+        top += height
+    return stacked
+
+
 def hat(vector: FloatArray) -> FloatArray:
     """Return the skew matrices (..., 3, 3) of vectors: `hat(a) @ b = a x b`."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    return stack_matrix(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return np.reshape(np.matmul(vector, _HAT), (*vector.shape, 3))
 
 
 def _polynomial(vector: FloatArray, first: FloatArray | float, second: FloatArray) -> FloatArray:

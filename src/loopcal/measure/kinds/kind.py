@@ -28,7 +28,13 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
-from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, drop_rounding
+from loopcal.measure.kinds.rows import (
+    Column,
+    Evaluation,
+    InvalidRows,
+    MeasuredColumns,
+    drop_rounding,
+)
 from loopcal.measure.kinds.settings_text import list_changed_settings
 from loopcal.measure.kinds.setup_parameters import SetupItem
 from loopcal.measure.kinds.shared_errors import (
@@ -245,10 +251,18 @@ class Kind(ABC):
         """Values (c,), or one for all columns (1,), in place of those that were not measured."""
         return np.zeros(1)
 
+    def prepare_columns(self, measured: FloatArray) -> MeasuredColumns:
+        """Return columns (.., r, c) as `evaluate` needs them, to evaluate the same rows often."""
+        missing = np.isnan(measured)
+        columns = np.where(missing, self.placeholder, measured) if np.any(missing) else measured
+        present = self.detect_present(measured)
+        reference = self._compute_reference(columns)
+        return MeasuredColumns(columns, reference, present, bool(np.all(present)))
+
     def evaluate(
         self,
         T: FloatArray,
-        measured: FloatArray,
+        measured: FloatArray | MeasuredColumns,
         nuisance: FloatArray | None = None,
         joints: FloatArray | None = None,
     ) -> Evaluation:
@@ -259,7 +273,7 @@ class Kind(ABC):
         T : (t or 1, r, 4, 4)
             T_base_platform of each row (with an axis of poses where a row compares several).
         measured : (t or 1, r, c) [SI]
-            NaN where not measured.
+            NaN where not measured. Or the same prepared by `prepare_columns`.
         nuisance : (t or 1, r or 1, u), optional
             Values of the nuisance parameters of each row; default: nominal.
         joints : (t, r, j), optional
@@ -277,16 +291,17 @@ class Kind(ABC):
         if joints is None:
             self.stack_joints({}, np.zeros(0, dtype=np.intp))  # refuses where it senses any
             joints = np.empty((1, 1, 0))
-        filled = np.where(np.isnan(measured), self.placeholder, measured)
+        if not isinstance(measured, MeasuredColumns):
+            measured = self.prepare_columns(measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = drop_rounding(self._evaluate(T, filled, values, joints))
+        result = drop_rounding(self._evaluate(T, measured.reference, values, joints))
         if self.shared_errors:
-            result = add_shared_errors(self, result, filled, values)
-        present = self.detect_present(measured)
-        if np.all(present):
+            result = add_shared_errors(self, result, measured.columns, values)
+        if measured.is_complete:
             return result
+        present = measured.present
         by_row = present[..., None]
         by_pose = present[..., None, :, None] if self.poses_per_row > 1 else by_row
         by_nuisance, by_joints = (
@@ -344,11 +359,17 @@ class Kind(ABC):
         """Return columns without noise in place of residuals, and their derivatives."""
         raise NotImplementedError
 
+    def _compute_reference(self, measured: FloatArray) -> FloatArray:
+        """Return what `_evaluate` receives in place of complete columns (.., r, c): numbers
+        (.., r, k) that follow from them alone.
+        """
+        return measured
+
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
-        """Return `evaluate` for complete arrays; components that were not measured may have any
-        finite value.
+        """Return `evaluate` for complete arrays, `measured` from `_compute_reference`; components
+        that were not measured may have any finite value.
         """
         predicted = self._predict(T, values, joints)
         return predicted._replace(residual=self._subtract(predicted.residual, measured))
@@ -385,12 +406,15 @@ class Kind(ABC):
         -------
         rows : (*shape, 6 + u)
         """
+        if not self.own_items:
+            twist = blocks["twist"] if "twist" in blocks else np.zeros(6)
+            return twist if twist.shape[:-1] == shape else np.broadcast_to(twist, (*shape, 6))
         widths = {"twist": 6} | {k: len(item.parameters) for k, item in self.own_items.items()}
         columns = [
             np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
             for name, w in widths.items()
         ]
-        return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=-1)
+        return np.concatenate(columns, axis=-1)
 
     def split_columns(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
         """Return the evaluation of residuals (t, r, m) with derivatives (t, r, m, 6 + u) from

@@ -50,6 +50,22 @@ class Evaluation(NamedTuple):
     joints: FloatArray | None = None
 
 
+class MeasuredColumns(NamedTuple):
+    """Columns of rows as a kind compares its predictions with them, see `Kind.prepare_columns`.
+
+    Attributes
+    ----------
+    columns : (t, r, c) [SI], with a placeholder where nothing was measured.
+    reference : (t, r, k) the columns, or what a kind computes from them alone.
+    present : (t, r, m) residuals that exist. is_complete : whether all do.
+    """
+
+    columns: FloatArray
+    reference: FloatArray
+    present: BoolArray
+    is_complete: bool
+
+
 def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
     """Return the rows of a mask (r,), each with its description."""
     return tuple((int(i), describe(int(i))) for i in np.flatnonzero(wrong))

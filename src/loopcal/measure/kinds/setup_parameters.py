@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from loopcal import geometry
+from loopcal.geometry.rotations import stack_blocks
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -112,14 +113,12 @@ def linearize_frame(values: FloatArray) -> FloatArray:
     It is the left Jacobian for the rotation and the identity for x y z.
     """
     rotation = geometry.left_jacobian_so3(values[..., :3])
-    return stack_diagonally(rotation, np.broadcast_to(np.eye(3), rotation.shape))
+    return stack_diagonally(rotation, np.eye(3))
 
 
 def stack_diagonally(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return matrices (.., 6, 6) with two blocks (.., 3, 3) on their diagonal."""
-    zero = np.zeros_like(first)
-    top, bottom = (np.concatenate(row, axis=-1) for row in ((first, zero), (zero, second)))
-    return np.concatenate([top, bottom], axis=-2)
+    """Return matrices (.., 6, 6) with two blocks (.., 3, 3), which broadcast, on their diagonal."""
+    return stack_blocks(((first, None), (None, second)))
 
 
 # --- directions

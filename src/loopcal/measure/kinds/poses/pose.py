@@ -125,11 +125,16 @@ class Pose(ToolKind):
         """The identity, where no orientation was measured."""
         return np.array([1.0, *[0.0] * 6] if self.orientation == "quaternion" else [0.0] * 6)
 
+    def _compute_reference(self, measured: FloatArray) -> FloatArray:
+        """Return the nine entries of the measured rotation, then x y z."""
+        R = self.form.to_matrix(self._fill_orientation(measured))
+        return np.concatenate([R.reshape(*R.shape[:-2], 9), measured[..., -3:]], axis=-1)
+
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
         tool, rows = self.locate_tool(T, values)
-        R_measured = self.form.to_matrix(self._fill_orientation(measured))
+        R_measured = measured[..., :9].reshape(*measured.shape[:-1], 3, 3)
         rotation = geometry.log_so3(tool[..., :3, :3] @ np.swapaxes(R_measured, -1, -2))
         residual = np.concatenate([rotation, tool[..., :3, 3] - measured[..., -3:]], axis=-1)
         by_rotation = geometry.left_jacobian_inverse_so3(rotation) @ rows[..., :3, :]
@@ -177,7 +182,7 @@ class Pose(ToolKind):
         """
         rates = self.form.rates(self._fill_orientation(measured))
         rates = np.where(_is_singular(rates), np.eye(3), rates)
-        return setup.stack_diagonally(rates, np.broadcast_to(np.eye(3), rates.shape))
+        return setup.stack_diagonally(rates, np.eye(3))
 
     def _fill_orientation(self, measured: FloatArray) -> FloatArray:
         """Return the orientation columns, with the identity where any of them is missing."""

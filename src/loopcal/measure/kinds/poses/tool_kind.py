@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -79,8 +80,9 @@ class ToolKind(Kind):
         of_frame, of_tool = (self.item_values(values, name) for name in ("frame", "tool"))
         frame = setup.place_frame(self.T_base_frame, of_frame)
         tool = setup.place_frame(self.stated_tool, of_tool)
-        Q = np.swapaxes(frame[..., :3, :3], -1, -2)
-        arm = (T[..., :3, :3] @ tool[..., :3, 3:])[..., 0]
+        inverse = self._stated_inverse if of_frame is None else geometry.invert_pose(frame)
+        Q, R = inverse[..., :3, :3], T[..., :3, :3]
+        arm = (R @ tool[..., :3, 3:])[..., 0]
         blocks = {"twist": geometry.transport_matrix(arm, Q)}
         if of_frame is not None:
             # a motion of the frame is the opposite motion of the tool in that frame
@@ -88,10 +90,14 @@ class ToolKind(Kind):
             by_twist = -geometry.transport_matrix(lever, Q)
             blocks["frame"] = by_twist @ setup.linearize_frame(of_frame)
         if of_tool is not None:
-            by_twist = geometry.transport_matrix(np.zeros(3), Q @ T[..., :3, :3])
+            by_twist = geometry.transport_matrix(np.zeros(3), Q @ R)
             blocks["tool"] = by_twist @ setup.linearize_frame(of_tool)
-        rows = self.join_columns(blocks, (*T.shape[:-2], 6))
-        return geometry.invert_pose(frame) @ (T @ tool), rows
+        return inverse @ (T @ tool), self.join_columns(blocks, (*T.shape[:-2], 6))
+
+    @cached_property
+    def _stated_inverse(self) -> FloatArray:
+        """The pose (4, 4) of the base in the stated frame."""
+        return geometry.invert_pose(self.T_base_frame)
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return 24 evenly spread orientations of the frame, with its origin where it is stated."""
