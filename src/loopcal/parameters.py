@@ -142,6 +142,11 @@ class ParameterTable:
         """Parameters (p,) to be identified."""
         return _freeze(np.array([p.free for p in self.entries], dtype=bool))
 
+    @cached_property
+    def positive(self) -> BoolArray:
+        """Parameters (p,) whose values must be above zero."""
+        return _freeze(np.array([p.positive for p in self.entries], dtype=bool))
+
     def index(self, name: str) -> int:
         """Return the position of a parameter; raises MechanismError with similar names."""
         if name in self._places:

@@ -10,7 +10,7 @@ tolerance adds its row; tolerances of the machine do not. See docs/theory/gauge.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import cast
 
 import numpy as np
@@ -30,10 +30,10 @@ from loopcal.estimate.nuisance.elimination import (
     fold_node_rows,
     list_members,
 )
+from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_rows
-from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
-from loopcal.measure import Measurements, NuisanceParameters
+from loopcal.measure import Evaluation, Measurements, NuisanceParameters
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.tree_elimination import NodeFactors
@@ -61,30 +61,76 @@ def frame_twists(T: FloatArray, size: float) -> FloatArray:
     return geometry.differentiate_by_frames(T) * np.r_[unit, unit]
 
 
-def find_unfixed_motions(
-    problem: Problem, T: FloatArray, joints: Mapping[str, FloatArray], nuisance: FloatArray | None
-) -> FloatArray:
-    """Return an orthonormal basis (12, k) of the motions of frames that change no measured value.
+class FrameRows:
+    """The rows of one machine by motions of frames, collected block by block.
 
     Parameters
     ----------
-    problem : of one machine. T : (n, 4, 4) its poses. joints : name -> (1, n) values [SI].
-    nuisance : (1, U) values of the setup parameters; None without any.
+    problem : of one machine. nuisance : (1, U) values of the setup parameters; None without any.
     """
-    by_frames = frame_twists(T, problem.free.robot.size)[None]
-    poses = LinearizedPoses(T[None], np.ones((1, len(T)), dtype=bool), by_frames, joints)
-    elimination, parts, effect = problem.nuisance, [], 0.0
-    tree = None if elimination is None else elimination.tree
-    for rows in problem.rows:
-        if len(rows.poses):
-            kind = linearize_rows(rows, poses, np.zeros(1, dtype=np.int64), nuisance)
-            effect = float(np.hypot(effect, np.linalg.norm(kind.by_parameters)))
-            parts += divide_among_nodes(kind, list_members(elimination, rows), tree)
-    factors = None if tree is None else NodeFactors(tree, 1, MOTIONS)
-    factor = fold_node_rows(empty_factor(1, MOTIONS), factors, parts)
-    if elimination is not None and factors is not None and nuisance is not None:
-        factor = engine.fold(factor, elimination.eliminate(factors, nuisance)[1])
-    return unfixed_motions(factor, effect)
+
+    def __init__(self, problem: Problem, nuisance: FloatArray | None) -> None:
+        self._problem, self._nuisance, self._effect = problem, nuisance, 0.0
+        tree = None if problem.nuisance is None else problem.nuisance.tree
+        self._factor = empty_factor(1, MOTIONS)
+        self._factors = None if tree is None else NodeFactors(tree, 1, MOTIONS)
+        self._is_lost = False
+
+    def add(
+        self, number: int, poses: LinearizedPoses, evaluations: Sequence[Evaluation | None]
+    ) -> None:
+        """Add the rows of a block, at its poses and evaluated there; see `Problem.residuals`."""
+        block = self._problem.poses.blocks[number]
+        self._is_lost |= bool(poses.is_lost(block.is_needed)[0])
+        self.add_rows(block.rows, poses.T, poses.joints, evaluations)
+
+    def add_rows(
+        self,
+        kinds: Sequence[ObservationRows],
+        T: FloatArray,
+        joints: Mapping[str, FloatArray],
+        evaluations: Sequence[Evaluation | None],
+    ) -> None:
+        """Add the rows of every kind at poses T (1, n, 4, 4) and joints name -> (1, n)."""
+        elimination, parts, trial = self._problem.nuisance, [], np.zeros(1, dtype=np.int64)
+        by_frames = frame_twists(T, self._problem.free.robot.size)
+        poses = LinearizedPoses(T, np.ones(T.shape[:2], dtype=bool), by_frames, joints)
+        tree = None if elimination is None else elimination.tree
+        for rows, evaluated in zip(kinds, evaluations, strict=True):
+            if len(rows.poses):
+                kind = linearize_rows(rows, poses, trial, self._nuisance, evaluated=evaluated)
+                length = float(np.linalg.norm(kind.by_parameters))
+                self._effect = float(np.hypot(self._effect, length))
+                parts += divide_among_nodes(kind, list_members(elimination, rows), tree)
+        self._factor = fold_node_rows(self._factor, self._factors, parts)
+
+    def find_unfixed(self) -> FloatArray | None:
+        """Return an orthonormal basis (12, k) of the motions of frames that change no measured
+        value; None where a pose that a row needs was not reached.
+        """
+        if self._is_lost:
+            return None
+        factor, elimination = self._factor, self._problem.nuisance
+        if elimination is not None and self._factors is not None and self._nuisance is not None:
+            factor = engine.fold(factor, elimination.eliminate(self._factors, self._nuisance)[1])
+        return unfixed_motions(factor, self._effect)
+
+
+def find_unfixed_motions(
+    problem: Problem, deviation: FloatArray, start: Start
+) -> FloatArray | None:
+    """Return the result of `FrameRows` at deviation (1, p).
+
+    Parameters
+    ----------
+    problem : of one machine. start : near the poses and setup parameters.
+    """
+    located = problem.poses.locate(deviation, start)
+    if located is None:
+        return None
+    rows = FrameRows(problem, None if problem.nuisance is None else start.nuisance)
+    rows.add_rows(problem.rows, located[0][None], located[1], [None] * len(problem.rows))
+    return rows.find_unfixed()
 
 
 def unfixed_motions(factor: FloatArray, effect: float) -> FloatArray:
@@ -105,27 +151,41 @@ def find_measured_frames(
     prior: Prior | None = None,
     linearization: Linearization | None = None,
     noise: float = 1.0,
-    solution: PoseSolution | None = None,
 ) -> MeasuredFrames:
     """Return how the measurements of one machine determine frames, at deviation (1, p).
 
     Parameters
     ----------
-    problem, data : measurements. start : near the poses and setup parameters.
+    problem, data : measurements. start : near the poses and setup parameters. The others as of
+        `describe_frames`.
+    """
+    unfixed = find_unfixed_motions(problem, deviation, start)
+    return describe_frames(problem, data, unfixed, prior, linearization, noise)
+
+
+def describe_frames(
+    problem: Problem,
+    data: Measurements,
+    unfixed: FloatArray | None,
+    prior: Prior | None = None,
+    linearization: Linearization | None = None,
+    noise: float = 1.0,
+) -> MeasuredFrames:
+    """Return how the measurements of one machine determine frames.
+
+    Parameters
+    ----------
+    problem, data : measurements. unfixed : from `FrameRows.find_unfixed`.
     prior : an earlier calibration, which may determine frames that these measurements do not.
     linearization : there; without it the unknown frames of instruments are not described.
     noise : variance of the whitened rows; where it is not finite, they are not described either.
-    solution : poses there, where they are solved already.
     """
     readings = data.readings
     if len(readings) > MOST_READINGS:
         readings = readings[np.linspace(0, len(readings) - 1, MOST_READINGS).astype(int)]
     readings = readings[np.isfinite(readings).all(axis=1)]
-    located = problem.poses.locate(deviation, start, solution)
-    if located is None:
+    if unfixed is None:
         return MeasuredFrames(np.zeros((MOTIONS, 0)), readings)
-    nuisance = None if problem.nuisance is None else start.nuisance
-    unfixed = find_unfixed_motions(problem, *located, nuisance)
     if prior is not None and prior.unfixed is not None:
         unfixed = intersect_motions(unfixed, prior.unfixed)
     is_known = np.isfinite(noise)  # not that of a fit that did not converge

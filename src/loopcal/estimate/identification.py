@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from loopcal.estimate.fit_input import (
     count_spare_equations,
     exclude_poses,
 )
-from loopcal.estimate.frame_freedoms import find_measured_frames
+from loopcal.estimate.frame_freedoms import FrameRows, describe_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
 from loopcal.estimate.inference.null_space import describe_null_space
@@ -53,7 +53,7 @@ from loopcal.estimate.nuisance.estimate import (
     empty_nuisance_estimate,
     estimate_nuisance,
 )
-from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.poses.estimate import (
     EstimatedPoses,
@@ -62,7 +62,7 @@ from loopcal.estimate.poses.estimate import (
     report_uneven_sigmas,
 )
 from loopcal.estimate.poses.open_poses import find_open_poses
-from loopcal.estimate.poses.states import PoseSolution
+from loopcal.estimate.poses.states import PoseEstimates
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of
@@ -137,10 +137,38 @@ def identify(
     return replace(result, posterior=posterior, findings=tuple(findings))
 
 
-def _solve_unweighted(problem: Problem, weighted: Problem, fit: Descent) -> PoseSolution:
-    """Solve for the poses of unweighted rows at the nuisance parameters of the weighted fit."""
-    nuisance = None if weighted is problem else weighted.solve(fit.deviation, fit.start).nuisance
-    return problem.solve(fit.deviation, fit.start, nuisance)
+@dataclass(frozen=True, eq=False)
+class _Estimate:
+    """The rows of a fit at its estimate.
+
+    Attributes
+    ----------
+    poses : estimates of the poses without weights of a loss; None where readings are exact.
+    residuals : without these weights. linearization : with them; None without setup parameters.
+    unfixed : from `FrameRows.find_unfixed`.
+    """
+
+    poses: PoseEstimates | None
+    residuals: tuple[Residuals, ...]
+    linearization: Linearization | None
+    unfixed: FloatArray | None
+
+
+def _examine_estimate(problem: Problem, weighted: Problem, fit: Descent) -> _Estimate:
+    """Solve and evaluate the rows of a fit once more, where its last step ended.
+
+    Poses are those of the rows without weights, at the setup parameters of the weighted ones.
+    """
+    z, start = fit.deviation, fit.start
+    solution, linearization, nuisance = None, None, None
+    if weighted.nuisance is not None:
+        solution = weighted.solve(z, start, derivatives=True)
+        linearization, nuisance = weighted.linearize_at(z, start, solution), solution.nuisance
+    if solution is None or weighted is not problem:
+        solution = problem.solve(z, start, nuisance)
+    rows = FrameRows(weighted, nuisance)
+    residuals = problem.residuals(z, solution, rows.add)
+    return _Estimate(solution.estimates, residuals, linearization, rows.find_unfixed())
 
 
 def _assemble(
@@ -157,21 +185,20 @@ def _assemble(
     converged = bool(fit.status[0] == DescentStatus.CONVERGED)
     d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
     test, sources = _test_noise(free, fit, options, data)
-    solution = _solve_unweighted(problem, weighted, fit)
+    estimate = _examine_estimate(problem, weighted, fit)
     conflict, on_prior = run_prior_tests(free, fit, method)
     plain, values = d.plain(), free.values(fit.deviation)[0]
     corrected = robot.with_values(values)
-    linearization = _linearize_nuisance(weighted, fit)
+    linearization = estimate.linearization
     baseline = fit_setup_before(problem, robot, options, data, weights, fit)
     nuisance = _estimate_nuisance(weighted, linearization, robot, fit, sources, baseline)
-    noise = sources.noise
-    frames = find_measured_frames(
-        weighted, data, fit.deviation, fit.start, options.prior, linearization, noise, solution
+    frames = describe_frames(
+        weighted, data, estimate.unfixed, options.prior, linearization, sources.noise
     )
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
-    excluded, estimates = tuple(options.excluded_poses), solution.estimates
-    poses = None if estimates is None else estimate_poses(estimates, data, excluded)
+    excluded = tuple(options.excluded_poses)
+    poses = None if estimate.poses is None else estimate_poses(estimate.poses, data, excluded)
     history = _record_history(free, fit)
     regularization = describe_regularization(method, d, penalty)
     findings = [
@@ -206,7 +233,7 @@ def _assemble(
         unidentifiable=unidentifiable,
         residual_test=test,
         prior_conflict=conflict,
-        residuals=label_residuals(problem.residuals(fit.deviation, solution), data, problem),
+        residuals=label_residuals(estimate.residuals, data, problem),
         pose_weights=weights,
         history=history,
         nuisance=nuisance,
@@ -232,11 +259,6 @@ def _record_history(free: FreeParameters, fit: Descent) -> History:
     status, steps = DescentStatus(int(fit.status[0])), int(fit.iterations[0])
     values = free.nominal + free.tolerance * fit.deviation_history[:, 0]
     return History(status, steps, fit.cost_history[:, 0], values)
-
-
-def _linearize_nuisance(weighted: Problem, fit: Descent) -> Linearization | None:
-    """Return the rows linearized once more at the estimate; None without nuisance parameters."""
-    return None if weighted.nuisance is None else weighted.linearize(fit.deviation, fit.start)
 
 
 def _estimate_nuisance(

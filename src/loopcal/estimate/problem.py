@@ -33,10 +33,10 @@ from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
 from loopcal.estimate.poses.leverage import spread_rows
-from loopcal.estimate.poses.linearization import evaluate_rows
+from loopcal.estimate.poses.linearization import LinearizedPoses, evaluate_rows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
-from loopcal.measure import Measurements, list_sensed_joints
+from loopcal.measure import Evaluation, Measurements, list_sensed_joints
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
@@ -215,20 +215,34 @@ class Problem:
             deviation, self.trials, start, self.control, nuisance, derivatives=derivatives
         )
 
-    def residuals(self, deviation: FloatArray, solution: PoseSolution) -> tuple[Residuals, ...]:
-        """Return the residuals of every kind at a solution; NaN where a pose is not reached."""
+    def residuals(
+        self,
+        deviation: FloatArray,
+        solution: PoseSolution,
+        observe: Callable[[int, LinearizedPoses, Sequence[Evaluation | None]], None] | None = None,
+    ) -> tuple[Residuals, ...]:
+        """Return the residuals of every kind at a solution; NaN where a pose is not reached.
+
+        `observe` receives the number of each block, its poses, and what its rows of each kind
+        evaluate to; None for a kind without rows there.
+        """
         t = len(self)
         shapes = [(t, *r.whitener.shape[1:3]) for r in self.rows]
         kinds = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
-        for block, poses in self.poses.iterate_poses(solution, deviation):
+        for i, (block, poses) in enumerate(self.poses.iterate_poses(solution, deviation)):
+            evaluations: list[Evaluation | None] = []
             for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
                 if not len(numbers):
+                    evaluations.append(None)
                     continue
                 evaluated, white = evaluate_rows(rows, poses, self.trials, solution.nuisance)
                 ok = np.all(poses.is_reached[:, rows.poses_by_link], axis=2, keepdims=True)
                 raw = np.where(ok, evaluated.residual, np.nan)
                 kind.raw[:, numbers] = raw
                 kind.whitened[:, numbers] = rows.whiten(white, raw, self.trials)
+                evaluations.append(evaluated)
+            if observe is not None:
+                observe(i, poses, evaluations)
         return tuple(kinds)
 
     def leverage_rows(

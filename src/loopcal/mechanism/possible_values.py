@@ -15,10 +15,11 @@ import numpy as np
 from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.batch_kinematics import forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
-from loopcal.mechanism.states import is_closed
+from loopcal.mechanism.states import driven_values, is_closed
+from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray
 from loopcal.units import LARGEST, SI_SYMBOLS
@@ -61,7 +62,9 @@ def _close_at_home(robot: Mechanism, values: FloatArray) -> State:
     if robot.program.sigma is not None:
         target = read_coordinates(robot.home_state.T, robot.controlled)
         return inverse_trials(robot, values, target)
-    q = compute_readings(robot, robot.parameters.nominal[None], robot.home_state)
+    # nominal values displace nothing
+    joints, slots = driven_values(robot.program, robot.home_state), robot.slots
+    q = readings_from_joints(joints, slots.terms[None], slots.frequency)
     return forward_trials(robot, values, q)
 
 
@@ -78,16 +81,18 @@ def check_nominal_values(table: ParameterTable) -> None:
 
 def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[str, Finding]]:
     """Yield parameters whose own value is impossible."""
-    for p, value in zip(robot.parameters.entries, values.tolist(), strict=True):
-        shown = robot.get_unit(p.dimension)
-        number = Quantity(value / shown.factor_to_si, shown.symbol)
-        if not abs(value) <= LARGEST:
-            limit = Quantity(LARGEST / shown.factor_to_si, shown.symbol)
+    table = robot.parameters
+    is_large = ~(np.abs(values) <= LARGEST)
+    for i in np.flatnonzero(is_large | (table.positive & ~(values > 0.0))):
+        p, value = table.entries[i], float(values[i])
+        number = robot.to_quantity(value, p.dimension)
+        if is_large[i]:
+            limit = robot.to_quantity(LARGEST, p.dimension)
             yield (
                 p.name,
                 report_finding("mechanism.value-too-large", name=p.name, value=number, limit=limit),
             )
-        elif p.positive and not value > 0.0:
+        else:
             nominal = robot.to_quantity(p.nominal, p.dimension)
             yield (
                 p.name,

@@ -270,9 +270,16 @@ def linearize_rows(
     trials: IntArray,
     nuisance: FloatArray | None,
     by_parameters: bool = True,
+    evaluated: Evaluation | None = None,
 ) -> KindRows:
-    """Return the whitened rows of a kind at linearized poses; arguments as of `evaluate_rows`."""
-    evaluated, white = evaluate_rows(rows, poses, trials, nuisance)
+    """Return the whitened rows of a kind at linearized poses; arguments as of `evaluate_rows`.
+
+    `evaluated` are its residuals and derivatives, where they are known already.
+    """
+    if evaluated is None:
+        evaluated, white = evaluate_rows(rows, poses, trials, nuisance)
+    else:
+        _, white = rows.take_trials(trials)
     residual = evaluated.residual
     if poses.closure_step is not None:
         step = poses.closure_step[:, rows.poses, :, None]
