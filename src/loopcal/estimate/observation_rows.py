@@ -202,6 +202,27 @@ def make_block(
     return PoseBlock(poses, readings[None, poses], chosen, inside, is_needed[poses])
 
 
+def find_needed_poses(rows: Sequence[ObservationRows], n: int) -> BoolArray:
+    """Return the poses (n,) that a row with a present residual needs."""
+    needed = np.zeros(n, dtype=bool)
+    for r in rows:
+        needed[r.poses[r.is_present.any(axis=(0, 2))]] = True
+    return needed
+
+
+def count_by_component(rows: Sequence[ObservationRows], member: IntArray) -> IntArray:
+    """Return the residuals (T | 1, components) that are present; member (n,) of each pose."""
+    components = int(member.max(initial=0)) + 1
+    total = np.zeros((1, components), dtype=np.int64)
+    for r in rows:
+        present = r.is_present.sum(axis=2)
+        of = member[r.first_poses]
+        total = total + np.stack([np.bincount(of, row, components) for row in present]).astype(
+            np.int64
+        )
+    return total
+
+
 def _chunks(rows: IntArray, size: int) -> Iterator[IntArray]:
     for first in range(0, len(rows), size):
         yield rows[first : first + size]

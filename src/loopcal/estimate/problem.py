@@ -26,7 +26,14 @@ from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.nuisance.elimination import NuisanceElimination, fold_node_rows, list_members
-from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
+from loopcal.estimate.observation_rows import (
+    BLOCK,
+    ObservationRows,
+    Residuals,
+    count_by_component,
+    divide_poses,
+    find_needed_poses,
+)
 from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
 from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
 from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
@@ -89,7 +96,7 @@ class Problem:
         """(T | 1, components) residuals that are present."""
         n = self.readings.shape[1]
         member = np.zeros(n, dtype=np.int64) if self.member is None else self.member
-        return _count_by_component(self.rows, member)
+        return count_by_component(self.rows, member)
 
     def __len__(self) -> int:
         return len(self.trials)
@@ -362,7 +369,7 @@ class Problem:
     def _exact_poses(self) -> ExactPoses:
         """Return the rows at poses of exact readings, in blocks of poses."""
         readings = self.readings[0]
-        is_needed = _needed_poses(self.rows, len(readings))
+        is_needed = find_needed_poses(self.rows, len(readings))
         blocks = divide_poses(readings, self.rows, is_needed, BLOCK)
         members = tuple(
             tuple(list_members(self.nuisance, rows) for rows in block.rows) for block in blocks
@@ -378,7 +385,7 @@ class Problem:
         assert member is not None
         assert coordinates is not None
         redundant = isinstance(coordinates, TwistCoordinates)
-        is_needed = _needed_poses(self.rows if redundant else self.rows[:-1], len(member))
+        is_needed = find_needed_poses(self.rows if redundant else self.rows[:-1], len(member))
         blocks = divide_components(self.readings[0], self.rows, member, is_needed, BLOCK)
         nodes, structures = groups_of_nodes(self.rows, member, self.nuisance)
         groups = tuple(group_components(block, member, nodes, structures) for block in blocks)
@@ -386,27 +393,6 @@ class Problem:
         return UncertainPoses(
             self.free, names, coordinates, member, blocks, groups, self.nuisance, is_needed
         )
-
-
-def _needed_poses(rows: Sequence[ObservationRows], n: int) -> np.ndarray:
-    """Return the poses (n,) that a row with a present residual needs."""
-    needed = np.zeros(n, dtype=bool)
-    for r in rows:
-        needed[r.poses[r.is_present.any(axis=(0, 2))]] = True
-    return needed
-
-
-def _count_by_component(rows: Sequence[ObservationRows], member: IntArray) -> IntArray:
-    """Return the residuals (T | 1, components) that are present; member (n,) of each pose."""
-    components = int(member.max(initial=0)) + 1
-    total = np.zeros((1, components), dtype=np.int64)
-    for r in rows:
-        present = r.is_present.sum(axis=2)
-        of = member[r.first_poses]
-        total = total + np.stack([np.bincount(of, row, components) for row in present]).astype(
-            np.int64
-        )
-    return total
 
 
 def _of_trials(count: IntArray, trials: IntArray) -> IntArray:

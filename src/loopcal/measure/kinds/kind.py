@@ -34,6 +34,7 @@ from loopcal.measure.kinds.rows import (
     InvalidRows,
     MeasuredColumns,
     drop_rounding,
+    zero_absent,
 )
 from loopcal.measure.kinds.settings_text import list_changed_settings
 from loopcal.measure.kinds.setup_parameters import SetupItem
@@ -255,8 +256,7 @@ class Kind(ABC):
         """Return columns (.., r, c) as `evaluate` needs them, to evaluate the same rows often."""
         missing = np.isnan(measured)
         columns = np.where(missing, self.placeholder, measured) if np.any(missing) else measured
-        present = self.detect_present(measured)
-        reference = self._compute_reference(columns)
+        present, reference = self.detect_present(measured), self._compute_reference(columns)
         return MeasuredColumns(columns, reference, present, bool(np.all(present)))
 
     def evaluate(
@@ -279,10 +279,6 @@ class Kind(ABC):
         joints : (t, r, j), optional
             Values of the joints in `sensed_joints`.
 
-        Returns
-        -------
-        Evaluation
-
         Raises
         ------
         DataError
@@ -299,21 +295,7 @@ class Kind(ABC):
         result = drop_rounding(self._evaluate(T, measured.reference, values, joints))
         if self.shared_errors:
             result = add_shared_errors(self, result, measured.columns, values)
-        if measured.is_complete:
-            return result
-        present = measured.present
-        by_row = present[..., None]
-        by_pose = present[..., None, :, None] if self.poses_per_row > 1 else by_row
-        by_nuisance, by_joints = (
-            None if derivative is None else np.where(by_row, derivative, 0.0)
-            for derivative in (result.nuisance, result.joints)
-        )
-        return Evaluation(
-            np.where(present, result.residual, 0.0),
-            np.where(by_pose, result.jacobian, 0.0),
-            by_nuisance,
-            by_joints,
-        )
+        return result if measured.is_complete else zero_absent(result, measured.present)
 
     def measure(
         self,
@@ -360,16 +342,14 @@ class Kind(ABC):
         raise NotImplementedError
 
     def _compute_reference(self, measured: FloatArray) -> FloatArray:
-        """Return what `_evaluate` receives in place of complete columns (.., r, c): numbers
-        (.., r, k) that follow from them alone.
-        """
+        """Return what `_evaluate` receives in place of complete columns (.., r, c): (.., r, k)."""
         return measured
 
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
-        """Return `evaluate` for complete arrays, `measured` from `_compute_reference`; components
-        that were not measured may have any finite value.
+        """Return `evaluate` for complete arrays, `measured` from `_compute_reference`; it may have
+        any finite value where nothing was measured.
         """
         predicted = self._predict(T, values, joints)
         return predicted._replace(residual=self._subtract(predicted.residual, measured))
@@ -383,14 +363,15 @@ class Kind(ABC):
     def _subtract(self, predicted: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the difference of columns (.., c), angles wrapped."""
         difference = predicted - measured
-        if not self.wraps_angles or not any(self._angle_columns):
+        if not self._is_wrapped.any():
             return difference
-        return np.where(np.array(self._angle_columns), geometry.wrap_angle(difference), difference)
+        return np.where(self._is_wrapped, geometry.wrap_angle(difference), difference)
 
     @cached_property
-    def _angle_columns(self) -> tuple[bool, ...]:
-        """Which columns are angles."""
-        return tuple(column.dimension is Dimension.ANGLE for column in self.columns)
+    def _is_wrapped(self) -> BoolArray:
+        """(c,) columns whose differences are wrapped."""
+        is_angle = [column.dimension is Dimension.ANGLE for column in self.columns]
+        return np.array(is_angle, dtype=bool) & self.wraps_angles
 
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
         """Return derivatives side by side: by the twist, then by each unknown setup item.
@@ -406,15 +387,11 @@ class Kind(ABC):
         -------
         rows : (*shape, 6 + u)
         """
-        if not self.own_items:
-            twist = blocks["twist"] if "twist" in blocks else np.zeros(6)
-            return twist if twist.shape[:-1] == shape else np.broadcast_to(twist, (*shape, 6))
+        if not self.own_items and "twist" in blocks and blocks["twist"].shape[:-1] == shape:
+            return blocks["twist"]
         widths = {"twist": 6} | {k: len(item.parameters) for k, item in self.own_items.items()}
-        columns = [
-            np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
-            for name, w in widths.items()
-        ]
-        return np.concatenate(columns, axis=-1)
+        given = ((blocks.get(name, np.zeros(w)), w) for name, w in widths.items())
+        return np.concatenate([np.broadcast_to(b, (*shape, w)) for b, w in given], axis=-1)
 
     def split_columns(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
         """Return the evaluation of residuals (t, r, m) with derivatives (t, r, m, 6 + u) from

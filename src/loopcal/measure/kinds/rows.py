@@ -89,3 +89,19 @@ def drop_rounding(evaluation: Evaluation) -> Evaluation:
     by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
     by_twist = by_twist.sum(axis=-2) if evaluation.jacobian.ndim > 4 else by_twist
     return evaluation._replace(nuisance=without_rounding(evaluation.nuisance, by_twist[..., None]))
+
+
+def zero_absent(evaluation: Evaluation, present: BoolArray) -> Evaluation:
+    """Return the evaluation with zeros for components that are not `present` (t, r, m)."""
+    by_row = present[..., None]
+    has_links = evaluation.jacobian.ndim > present.ndim + 1
+    by_nuisance, by_joints = (
+        None if derivative is None else np.where(by_row, derivative, 0.0)
+        for derivative in (evaluation.nuisance, evaluation.joints)
+    )
+    return Evaluation(
+        np.where(present, evaluation.residual, 0.0),
+        np.where(present[..., None, :, None] if has_links else by_row, evaluation.jacobian, 0.0),
+        by_nuisance,
+        by_joints,
+    )
