@@ -228,8 +228,9 @@ def list_instrument_frames(data: Measurements) -> Iterable[tuple[str, FloatArray
     listed: dict[str, tuple[FloatArray, bool]] = {}
     for rows in data.observations:
         name, stated = getattr(rows.kind, "frame", None), getattr(rows.kind, "T_base_frame", None)
-        item = rows.kind.possible_setup.get("frame")
-        if name is None or stated is None or item is None or len(item.parameters) != 6:
+        if name is None or stated is None or "frame" not in rows.kind.allowed_unknown:
+            continue
+        if len(rows.kind.possible_setup["frame"].parameters) != 6:
             continue
         is_unknown = "frame" in rows.kind.unknown
         for session in np.unique(rows.session).tolist():

@@ -122,11 +122,14 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     """Return the free parameters of a robot with their tolerances, stated or default."""
     table = robot.parameters
     places = np.flatnonzero(table.free)
-    default = {Dimension.LENGTH: DEFAULT_TOLERANCE * robot.size}
-    assumed = np.isnan(table.tolerance[places])
-    dimensions = table.dimensions
-    fallback = np.array([default.get(dimensions[i], DEFAULT_TOLERANCE) for i in places])
-    tolerance = np.where(assumed, fallback, table.tolerance[places])
+    stated = table.tolerance[places]
+    assumed = np.isnan(stated)
+    tolerance = stated
+    if assumed.any():
+        default = {Dimension.LENGTH: DEFAULT_TOLERANCE * robot.size}
+        dimensions = table.dimensions
+        fallback = np.array([default.get(dimensions[i], DEFAULT_TOLERANCE) for i in places])
+        tolerance = np.where(assumed, fallback, stated)
     correlation = table.correlation()[np.ix_(places, places)] if table.common else None
     return FreeParameters(robot, places, table.nominal[places], tolerance, assumed, correlation)
 

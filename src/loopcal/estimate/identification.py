@@ -128,7 +128,8 @@ def identify(
         raise EstimationError(open_poses.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
     result = add_factor_uncertainty(result, fit)
-    result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
+    if options.loss is not None:
+        result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
     findings = [*result.findings, *report_unknown_rows(options.prior)]
     if open_poses.poses:
         findings.append(open_poses.report("fit.poses-open-at-start"))

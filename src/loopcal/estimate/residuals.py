@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def label_residuals(
         KindResiduals(
             kind=s.kind.name,
             components=tuple(column.name for column in s.kind.noise_columns),
-            poses=tuple("/".join(data.labels[i] for i in members) for members in s.poses_by_link),
+            poses=_label_rows(s.poses_by_link, data.labels),
             raw=np.where(measured, r.raw[0], np.nan),
             whitened=r.whitened[0],
             context=columns,
@@ -116,3 +116,10 @@ def label_residuals(
         )
         for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
     )
+
+
+def _label_rows(poses: IntArray, labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a label for each row: those of the poses (r, links) that it observed."""
+    if poses.shape[1] == 1:
+        return tuple(map(labels.__getitem__, poses[:, 0].tolist()))
+    return tuple("/".join(labels[i] for i in members) for members in poses.tolist())

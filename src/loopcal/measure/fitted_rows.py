@@ -19,7 +19,7 @@ from loopcal.measure.kinds import ActuatorReadings
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.row_agreement import ComparedRows, find_agreeing
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 PREFIX = "fitted"
 """First word of the names of the stored arrays."""
@@ -120,8 +120,14 @@ def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -
     data : the fitted measurements.
     are_readings_fitted : whether readings alone are fitted, as where actuators are redundant.
     """
-    kept = (r for r in _list_rows(data) if are_readings_fitted or r.kind != ActuatorReadings.name)
-    return FittedRows(tuple((rows.kind, rows.content) for rows in kept))
+    groups = [
+        (o.kind.name, _take_content(o, data.readings)[1])
+        for o in data.observations
+        if are_readings_fitted or o.kind.name != ActuatorReadings.name
+    ]
+    if are_readings_fitted:
+        groups.append((ActuatorReadings.name, data.readings[_find_lonely_readings(data)]))
+    return FittedRows(tuple(groups))
 
 
 def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | None:
@@ -134,21 +140,38 @@ def fitted_rows_from_arrays(arrays: Mapping[str, np.ndarray]) -> FittedRows | No
 
 def _list_rows(data: Measurements) -> list[ComparedRows]:
     """Return the rows of each kind that count, then the readings of poses without such rows."""
-    result, is_alone = [], np.ones(data.n_poses, dtype=bool)
+    result = []
     for o in data.observations:
-        counts = (o.weight > 0.0) & np.isfinite(o.measured).any(axis=1)
-        counts |= (o.weight > 0.0) & (o.measured.shape[1] == 0)
+        counts, content, poses = _take_content(o, data.readings)
+        width = content.shape[1] - o.measured.shape[1]
+        noise = np.concatenate([np.zeros((len(content), width)), _state_noise(o)[counts]], axis=1)
+        result.append(ComparedRows(o.kind.name, width, content, noise, poses))
+    is_alone = _find_lonely_readings(data)
+    alone, poses = data.readings[is_alone], np.flatnonzero(is_alone)[:, None]
+    return [*result, ComparedRows(ActuatorReadings.name, 0, alone, np.zeros(alone.shape), poses)]
+
+
+def _take_content(
+    rows: Observations, readings: FloatArray
+) -> tuple[BoolArray, FloatArray, IntArray]:
+    """Return which rows (r,) count, and of these the readings with the measured values, and the
+    poses.
+    """
+    counts = np.isfinite(rows.measured).any(axis=1) | (rows.measured.shape[1] == 0)
+    counts &= rows.weight > 0.0
+    poses = rows.rows.reshape(len(rows), rows.rows[0].size if len(rows) else 1)[counts]
+    read = readings[poses].reshape(len(poses), poses.shape[1] * readings.shape[1])
+    return counts, np.concatenate([read, rows.measured[counts]], axis=1), poses
+
+
+def _find_lonely_readings(data: Measurements) -> BoolArray:
+    """Return the poses (n,) without a row whose readings count."""
+    is_alone = np.ones(data.n_poses, dtype=bool)
+    for o in data.observations:
         is_alone[o.rows] = False
-        poses = o.rows.reshape(len(o), o.rows[0].size if len(o) else 1)[counts]
-        readings = data.readings[poses].reshape(len(poses), poses.shape[1] * data.readings.shape[1])
-        content = np.concatenate([readings, o.measured[counts]], axis=1)
-        noise = np.concatenate([np.zeros(readings.shape), _state_noise(o)[counts]], axis=1)
-        result.append(ComparedRows(o.kind.name, readings.shape[1], content, noise, poses))
     if data.reading_sigma is not None:
         is_alone &= np.isfinite(data.reading_sigma).any(axis=1)
-    alone = data.readings[is_alone]
-    poses = np.flatnonzero(is_alone)[:, None]
-    return [*result, ComparedRows(ActuatorReadings.name, 0, alone, np.zeros(alone.shape), poses)]
+    return is_alone
 
 
 def _state_noise(rows: Observations) -> FloatArray:

@@ -114,7 +114,7 @@ class Kind(ABC):
         """The m numbers for which a noise or sigma is stated, one for each residual."""
         return self.columns
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, SetupItem]:
         """The frames, targets, surfaces and offsets that may be unknown, by name."""
         return {}
@@ -363,15 +363,14 @@ class Kind(ABC):
     def _subtract(self, predicted: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the difference of columns (.., c), angles wrapped."""
         difference = predicted - measured
-        if not self._is_wrapped.any():
+        if not any(self._is_wrapped):
             return difference
-        return np.where(self._is_wrapped, geometry.wrap_angle(difference), difference)
+        return np.where(np.array(self._is_wrapped), geometry.wrap_angle(difference), difference)
 
     @cached_property
-    def _is_wrapped(self) -> BoolArray:
-        """(c,) columns whose differences are wrapped."""
-        is_angle = [column.dimension is Dimension.ANGLE for column in self.columns]
-        return np.array(is_angle, dtype=bool) & self.wraps_angles
+    def _is_wrapped(self) -> tuple[bool, ...]:
+        """Columns whose differences are wrapped."""
+        return tuple(self.wraps_angles and c.dimension is Dimension.ANGLE for c in self.columns)
 
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
         """Return derivatives side by side: by the twist, then by each unknown setup item.

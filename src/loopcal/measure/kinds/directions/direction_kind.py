@@ -6,6 +6,7 @@ the platform.
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -46,7 +47,7 @@ class DirectionKind(Kind):
     def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
         """Name and rotation (3, 3) of the orientation; name and unit vector of the direction."""
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Orientation and direction."""
         orientation, S, direction, a = self.stated

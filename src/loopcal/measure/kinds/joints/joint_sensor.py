@@ -9,6 +9,7 @@ value that the encoder showed.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -90,7 +91,7 @@ class JointSensor(Kind):
         """The joints."""
         return self.joints
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """One offset for each joint."""
         offsets = (

@@ -5,6 +5,7 @@ ball bar.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -69,7 +70,7 @@ class Distance(LengthKind):
             cls(targets=("a", "b"), places=pair, anchor=far, unknown=("targets", "anchor")),
         )
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Also the fixed point."""
         anchor = setup.make_points_item((self.anchor_name,), self.anchor[None])

@@ -4,6 +4,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -106,7 +107,7 @@ class TargetKind(Kind):
         g = len(self.per_target)
         return {target: tuple(range(i * g, (i + 1) * g)) for i, target in enumerate(self.targets)}
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Frame and targets; a kind adds the items that only it has."""
         places = np.zeros((len(self.targets), 3)) if self.places is None else self.places
@@ -188,7 +189,7 @@ class TargetKind(Kind):
 class LengthKind(TargetKind):
     """A kind that measures one length above 0 for each target, with a common offset."""
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Also the offset of all readings."""
         return {**super().possible_setup, "offset": setup.make_offset_item(f"{self.name}.offset")}

@@ -64,7 +64,7 @@ class ToolKind(Kind):
         """Whether the tool is stated; if the tool is unknown, its nominal value."""
         return self.T_platform_tool is not None
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Frame and tool, with six parameters each."""
         tool = np.eye(4) if self.T_platform_tool is None else self.T_platform_tool

@@ -8,6 +8,7 @@ correction for its ball and its deflection. Rows of one group share the paramete
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -63,7 +64,7 @@ class SurfaceKind(TargetKind):
     def surface_parameters(self) -> tuple[Parameter, ...]:
         """The parameters of the surface; rows of one group share them."""
 
-    @property
+    @cached_property
     def possible_setup(self) -> Mapping[str, setup.SetupItem]:
         """Also the surface."""
         stated = {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
