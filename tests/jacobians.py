@@ -209,8 +209,8 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
     at the end.
 
     What does not depend on the traced unknowns stays with numpy: it needs no derivative and no
-    compiling. `stack_matrix` and `stack_blocks` write into an array, which jax does not allow, so they are
-    replaced too.
+    compiling. `stack_matrix` and `stack_blocks` write into an array, which jax does not allow, so
+    they are replaced too.
     """
     import jax.numpy
 
