@@ -4,11 +4,13 @@ against numpy on the same amount of work and against a fit that a user writes by
 """
 
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,26 @@ import numpy as np
 from benchmarks.bench_identify import _measured, _poses, _tracker
 from benchmarks.bench_kinematics import _problem
 from benchmarks.bench_sensitivity import _first_answer, _record
+from benchmarks.bench_start import _import_numpy, _python
 from benchmarks.harness import Metric, measure_ratio
 from loopcal.engine import get_current_engine
 from loopcal.engine.selection import VARIABLE
 from loopcal.estimate import LeastSquares, identify, identify_trials
 from loopcal.io import load_robot
-from loopcal.measure import sample_truth, simulate_trials
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Sensor,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
 from loopcal.mechanism import differentiate_pose, forward, forward_trials, inverse
 
 ENGINES = ("numpy", "native") if find_spec("loopcal_native") else ("numpy",)
 POSES, TRIALS = 10_000, 200
+ROOT = Path(__file__).resolve().parents[1]
 
 measure = partial(measure_ratio, clock=time.process_time, tolerance=0.3)
 
@@ -112,6 +124,66 @@ def bench_single_fit() -> list[Metric]:
         ),
         15,
     )
+
+
+def bench_many_poses() -> list[Metric]:
+    """One fit of 42 parameters to 100,000 poses, against np.linalg.qr of its 600,000 x 43 rows."""
+    robot = load_robot("hexapod-42")
+    data = _measured(robot, 100_000)
+    rows = np.random.default_rng(0).normal(size=(100, 6000, 43))
+
+    def factorize() -> None:
+        np.linalg.qr(np.linalg.qr(rows, mode="r").reshape(-1, 43), mode="r")
+
+    return _of_each(
+        "many_poses", lambda: (partial(identify, robot, data, LeastSquares()), factorize), 2
+    )
+
+
+def bench_delta() -> list[Metric]:
+    """One fit of a delta with 9 parameters to positions of one session, against a thousand calls of
+    np.linalg.solve for one small system.
+    """
+    robot = load_robot("linear-delta")
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    sensor = Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, 1e-5)))
+    data = simulate(truth, _poses(robot, 30), Instrument((sensor,)), 0)
+    rng = np.random.default_rng(0)
+    A, b = rng.normal(size=(6, 6)), rng.normal(size=6)
+
+    def solve_often() -> None:
+        for _ in range(1000):
+            np.linalg.solve(A, b)
+
+    return _of_each(
+        "delta", lambda: (partial(identify, robot, data, LeastSquares()), solve_often), 15
+    )
+
+
+def bench_command() -> list[Metric]:
+    """A calibration by the command line from the start of the process to its end, against a Python
+    that imports numpy and ends; in processor time of the processes.
+    """
+    data = ROOT / "examples" / "hexapod-42" / "measurements.csv"
+    code = "import sys; from loopcal.cli import main; sys.argv[0] = 'loopcal'; main()"
+    words = ("-c", code, "calibrate", "hexapod-42", str(data), "--hold-out", "0.25", "-o")
+
+    def calibrate() -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            _python(*words, str(Path(folder) / "run"))
+
+    metrics = []
+    for engine in ENGINES:
+        with use_engine(engine):
+            name, clock = f"engine.{engine}.command", _time_of_processes
+            metrics.append(measure(name, calibrate, _import_numpy, repeats=5, clock=clock))
+    return metrics
+
+
+def _time_of_processes() -> float:
+    """Return the processor time [s] of all processes that ended."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _fit_by_hand(nominal: np.ndarray) -> Callable[[], object]:

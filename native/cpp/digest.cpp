@@ -213,6 +213,7 @@ int main() {
             for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 13, n, digest);
         add_kinematics(set, false, 1, 50, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
+        add_factors(set, 3, 1000, 7, digest);
         std::printf("%016llx %s\n", (unsigned long long)digest.value, name);
     }
 }

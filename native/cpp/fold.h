@@ -6,6 +6,8 @@
 // Two layouts compute the same operations in the same order, so that they give the same bits:
 //   by trials  : a lane for each trial; the entries of a block are columns of ROWS vectors,
 //   by columns : one trial, a lane for each column.
+// Many rows of one trial are divided into PARTS, a lane for each part, whose factors are folded in
+// the end. The number of rows alone decides, not the trials of the call nor the lanes.
 #pragma once
 
 #include "lanes.h"
@@ -13,6 +15,9 @@
 namespace INSTRUCTION_SET {
 
 constexpr int ROWS = 12;  // of a block: their entries of one column fit the registers
+
+constexpr int PARTS = 8;
+constexpr int64_t MANY = 32;  // rows for each column: below, the factors of the parts cost too much
 
 // Columns whose squares sum to less are zero: products of still smaller numbers lose all digits.
 constexpr double FLOOR = 1e-200;
@@ -69,15 +74,18 @@ inline size_t need_by_trials(int64_t p) {
     return Arena::need<Lanes>(packed(p, p)) + Arena::need<Lanes>(p * ROWS);
 }
 
-// Fold `count` <= W trials. rows : m x p of each trial, `stride` apart.
+// Fold `count` <= W trials. rows : m x p of each trial, `stride` apart. left : rows from the first
+// one of the first trial to the end of the memory; those beyond are zero.
 inline void fold_trials(const double *factor, const double *rows, double *out, int64_t count,
-                        int64_t m, int64_t p, int64_t stride, Arena &arena) {
+                        int64_t m, int64_t p, int64_t stride, int64_t left, Arena &arena) {
     Lanes *R = arena.take<Lanes>(packed(p, p)), *block = arena.take<Lanes>(p * ROWS);
     const double *factors[W], *rows_of[W];
+    int64_t rows_left[W];
     for (int lane = 0; lane < W; lane++) {  // lanes without a trial repeat the last one
         int64_t trial = lane < count ? lane : count - 1;
         factors[lane] = factor + trial * p * p;
         rows_of[lane] = rows + trial * stride;
+        rows_left[lane] = p && trial ? left - trial * (stride / p) : left;
     }
     for (int64_t i = 0; i < p; i++) {
         Lanes *row = R + packed(i, p) - i;
@@ -93,6 +101,17 @@ inline void fold_trials(const double *factor, const double *rows, double *out, i
             for (int64_t i = height; i < ROWS; i++) block[j * ROWS + i] = Lanes{};
         for (int64_t i = 0; i < height; i++) {
             int64_t offset = (first + i) * p;
+            bool is_whole = true;
+            for (int lane = 0; lane < W; lane++) is_whole &= first + i < rows_left[lane];
+            if (!is_whole) {
+                for (int64_t j = 0; j < p; j++) {
+                    Lanes value{};
+                    for (int lane = 0; lane < W; lane++)
+                        if (first + i < rows_left[lane]) value[lane] = rows_of[lane][offset + j];
+                    block[j * ROWS + i] = value;
+                }
+                continue;
+            }
             for (int64_t j = 0; j < p; j++) {
                 Lanes value;
                 for (int lane = 0; lane < W; lane++) value[lane] = rows_of[lane][offset + j];
@@ -158,10 +177,40 @@ inline void fold_trial(const double *factor, const double *rows, double *out, in
         for (int64_t j = 0; j < p; j++) out[i * p + j] = j < i ? 0.0 : R[i * width + j];
 }
 
+// --- by parts ---------------------------------------------------------------------------------
+
+inline size_t need_by_parts(int64_t p) { return Arena::need<double>(PARTS * p * p); }
+
+// Fold many rows of one trial; false without memory.
+inline bool fold_parts(const double *factor, const double *rows, double *out, int64_t m, int64_t p) {
+    Arena memory(need_by_parts(p));
+    if (!memory.ok()) return false;
+    double *factors = memory.take<double>(PARTS * p * p);
+    std::memset(factors, 0, sizeof(double) * (size_t)(PARTS * p * p));
+    int64_t height = (m + PARTS * ROWS - 1) / (PARTS * ROWS) * ROWS;  // whole blocks
+    for (int64_t first = 0; first < PARTS; first += W) {
+        int64_t count = PARTS - first < W ? PARTS - first : W, begin = first * height;
+        if (begin >= m) break;
+        Arena arena(need_by_trials(p));
+        if (!arena.ok()) return false;
+        double *of_parts = factors + first * p * p;
+        fold_trials(of_parts, rows + begin * p, of_parts, count, height, p, height * p, m - begin, arena);
+    }
+    Arena arena(need_by_columns(p));
+    if (!arena.ok()) return false;
+    fold_trial(factor, factors, out, PARTS * p, p, arena);
+    return true;
+}
+
 // --- the call ---------------------------------------------------------------------------------
 
 inline int fold(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
                 int64_t p, int64_t stride) {
+    if (m >= MANY * p && p > 0) {
+        for (int64_t i = 0; i < t; i++)
+            if (!fold_parts(factor + i * p * p, rows + i * stride, out + i * p * p, m, p)) return 1;
+        return 0;
+    }
     size_t trials = need_by_trials(p), columns = need_by_columns(p);
     for (int64_t first = 0; first < t; first += W) {
         int64_t count = t - first < W ? t - first : W;
@@ -170,7 +219,7 @@ inline int fold(const double *factor, const double *rows, double *out, int64_t t
         if (count * 2 > W) {
             Arena arena(trials);
             if (!arena.ok()) return 1;
-            fold_trials(from, given, to, count, m, p, stride, arena);
+            fold_trials(from, given, to, count, m, p, stride, m * count, arena);
             continue;
         }
         for (int64_t i = 0; i < count; i++) {

@@ -15,7 +15,7 @@ import numpy as np
 
 from loopcal.estimate.poses.smooth_errors import SmoothErrors
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, ParameterUnits
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -67,6 +67,11 @@ class FreeParameters:
     def names(self) -> tuple[str, ...]:
         """Names in order."""
         return tuple(parameter.name for parameter in self.parameters)
+
+    @cached_property
+    def columns(self) -> ParameterUnits:
+        """The free parameters in units of their tolerance, as columns of derivatives."""
+        return ParameterUnits(self.robot.slots, self.places, self.tolerance)
 
     def values(self, deviation: FloatArray) -> FloatArray:
         """Return all values (t, p of the robot) [SI] at deviations z (t, p)."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of linearizing a problem at a deviation, and the warm start of the next linearization.
 
-A start belongs to the deviations at which it was made. It predicts poses and nuisance parameters at
-other deviations to first order. It only chooses where iterations begin: their results do not depend
-on it beyond rounding, as long as it is near.
+A start belongs to the deviations at which it was made. It predicts nuisance parameters at other
+deviations to first order; poses begin where they were, which costs one Newton step more than their
+prediction and none of the products with all parameters. It only chooses where iterations begin:
+their results do not depend on it beyond rounding, as long as it is near.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine, geometry
+from loopcal import engine
 from loopcal.estimate.nuisance.elimination import EliminatedNuisance
 from loopcal.estimate.poses.states import PoseEstimates, PoseStates
 from loopcal.numerics.trial_batch import TrialBatch
@@ -30,8 +31,8 @@ class Start(TrialBatch):
     nuisance : (t, U) values of the nuisance parameters [SI]. slope : (t, U, p) their change.
     first_nuisance : (t, U) values with which the first linearization began.
     poses : states (t, n) of all poses; None where every solution begins at home.
-    motion : (t, n, 6, p) change of the poses by the scaled parameters, in single precision because
-        it only chooses a start; None where poses are not predicted.
+    is_near : whether a linearization solved these poses, so that those at the next deviations are
+        near and Newton's method need not follow a path to them.
     """
 
     deviation: FloatArray
@@ -39,7 +40,7 @@ class Start(TrialBatch):
     slope: FloatArray
     first_nuisance: FloatArray
     poses: PoseStates | None = None
-    motion: np.ndarray | None = None
+    is_near: bool = False
 
     def __len__(self) -> int:
         return len(self.deviation)
@@ -49,13 +50,10 @@ class Start(TrialBatch):
         change = deviation - self.deviation
         return self.nuisance + np.matmul(self.slope, change[..., None])[..., 0]
 
-    def predict_states(self, deviation: FloatArray) -> engine.State | None:
-        """Return the states (t, n) at deviations (t, p), to first order; None to begin at home."""
-        if self.poses is None or self.motion is None:
-            return self.poses and self.poses.state
-        change = (deviation - self.deviation).astype(np.float32)
-        twist = np.matmul(self.motion, change[:, None, :, None])[..., 0].astype(np.float64)
-        return replace(self.poses.state, T=geometry.apply_twist(self.poses.state.T, twist))
+    @property
+    def states(self) -> engine.State | None:
+        """States (t, n) with which poses begin; None to begin at home."""
+        return self.poses and self.poses.state
 
     def with_nuisance(self, values: FloatArray) -> Start:
         """Return this start with other nuisance parameters (t, U), which do not move."""

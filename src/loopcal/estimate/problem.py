@@ -328,8 +328,8 @@ class Problem:
         equations = _of_trials(self.component_count.sum(axis=1), trials)
         if solution.estimates is not None:
             equations = equations - solution.estimates.rank.sum(axis=1)
-        states, motion = self.poses.next_start(solution, start)
-        next_start = replace(start, deviation=z, poses=states, motion=motion)
+        states, is_near = self.poses.next_start(solution, start)
+        next_start = replace(start, deviation=z, poses=states, is_near=is_near)
         estimate = None
         if nuisance is not None and factors is not None and solution.nuisance is not None:
             estimate, rest = nuisance.eliminate(factors, solution.nuisance)

@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism.kinematics import jacobian as jacobian
     from loopcal.mechanism.kinematics import make_solution as make_solution
     from loopcal.mechanism.model import Mechanism as Mechanism
+    from loopcal.mechanism.parameter_units import ParameterUnits as ParameterUnits
     from loopcal.mechanism.platform_coordinates import POSITION as POSITION
     from loopcal.mechanism.platform_coordinates import TILT as TILT
     from loopcal.mechanism.platform_coordinates import check_coordinates as check_coordinates
@@ -128,6 +129,7 @@ else:
                 make_solution
             """,
             "loopcal.mechanism.model": "Mechanism",
+            "loopcal.mechanism.parameter_units": "ParameterUnits",
             "loopcal.mechanism.platform_coordinates": """
                 POSITION TILT check_coordinates compare_coordinates pose_from_coordinates
                 read_coordinates

@@ -129,6 +129,19 @@ def test_factors_agree_with_numpy_and_between_instruction_sets(columns, trials):
         assert_array_equal(folded[0], np.array(alone))
 
 
+@pytest.mark.parametrize("rows", [32 * 7, 32 * 7 + 5, 1000])
+def test_many_rows_are_folded_by_parts_with_the_same_bits(rows):
+    rng = np.random.default_rng(rows)
+    matrix, start = rng.normal(size=(9, rows, 7)), np.triu(rng.normal(size=(9, 7, 7)))
+    folded = [e.fold(start, matrix) for e in ENGINES.values()]
+    expected = start.swapaxes(1, 2) @ start + matrix.swapaxes(1, 2) @ matrix
+    assert_allclose(folded[0].swapaxes(1, 2) @ folded[0], expected, atol=1e-13 * expected.max())
+    assert_array_equal(folded[0], np.triu(folded[0]))
+    assert_same_bits(folded)
+    alone = [NATIVE.fold(start[[i]], matrix[[i]])[0] for i in range(9)]
+    assert_array_equal(folded[0], np.array(alone))
+
+
 def test_bits_do_not_depend_on_which_rows_share_lanes():
     case = make_robot_case("ru-pus-prs", 11, 9)
     together = NATIVE.solve(case.program, case.e, case.q, case.home)

@@ -252,7 +252,7 @@ def divide_among_nodes(
     kind: KindRows, members: Iterable[NodeMembers], tree: EliminationTree | None
 ) -> list[NodeRows]:
     """Return the rows of a kind by nodes, [nuisance | machine | residual]."""
-    rows = np.concatenate([kind.by_parameters, kind.residual[..., None]], axis=-1)
+    rows = kind.machine
     divided = []
     for structure, numbers, nodes, columns in members:
         chosen = rows if len(numbers) == rows.shape[1] else rows[:, numbers]

@@ -80,13 +80,11 @@ class ExactPoses:
         state = spread_states(self.free.robot.home_state, trials, self.count)
         return PoseStates(state, np.zeros((trials, self.count, 0)))
 
-    def next_start(
-        self, solution: PoseSolution, start: Start
-    ) -> tuple[PoseStates | None, np.ndarray | None]:
-        """Return the states and their predicted motion for the next start."""
+    def next_start(self, solution: PoseSolution, start: Start) -> tuple[PoseStates | None, bool]:
+        """Return the states for the next start, and whether they were solved."""
         linearized, states, old = solution.linearized, solution.states, start.poses
         if linearized is None or states is None or old is None:
-            return start.poses, start.motion
+            return start.poses, start.is_near
         a, ok = len(start), linearized.is_reached
 
         def kept(new: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -94,10 +92,9 @@ class ExactPoses:
                 return np.broadcast_to(new, (a, *new.shape[1:]))
             return np.where(ok.reshape(*ok.shape, *[1] * (new.ndim - 2)), new, before)
 
-        motion = linearized.by_parameters.astype(np.float32)
         is_new = ok.all() and len(ok) == a
         state = states.state if is_new else map_arrays(kept, states.state, old.state)
-        return PoseStates(state, old.q), np.broadcast_to(motion, (a, *motion.shape[1:]))
+        return PoseStates(state, old.q), True
 
     def solve(
         self,
@@ -123,7 +120,7 @@ class ExactPoses:
             if derivatives:
                 single = self.solve_single_block(z, trials, start)
             else:
-                begin = start.predict_states(z)
+                begin = start.states
                 single = PoseSolution(None, self._locate(self.blocks[0], z, begin))
         linearized = None if single is None else single.linearized
         nuisance = fixed
@@ -139,8 +136,8 @@ class ExactPoses:
     def solve_single_block(self, z: FloatArray, trials: IntArray, start: Start) -> PoseSolution:
         """Solve and linearize the poses of the only block at deviations z (a | 1, p)."""
         first = start.take(np.arange(len(z))) if len(z) < len(start) else start
-        begin, is_near = first.predict_states(z), first.motion is not None
-        linearized, state = self._linearize(self.blocks[0], z, trials, begin, not is_near)
+        begin, follow = first.states, not first.is_near
+        linearized, state = self._linearize(self.blocks[0], z, trials, begin, follow)
         return PoseSolution(None, linearized, PoseStates(state, np.zeros(0)))
 
     def iterate_rows(
@@ -194,7 +191,7 @@ class ExactPoses:
         if solution is not None and solution.linearized is not None:
             located = [solution.linearized]
         else:
-            located = [self._locate(block, z, start.predict_states(z)) for block in self.blocks]
+            located = [self._locate(block, z, start.states) for block in self.blocks]
         pairs = zip(self.blocks, located, strict=True)
         if any(poses.is_lost(block.is_needed)[0] for block, poses in pairs):
             return None
@@ -233,8 +230,8 @@ class ExactPoses:
         """Solve and linearize the poses of a block.
 
         Without `follow`, a pose that Newton's method does not reach from `begin` counts as not
-        reached. States that a step of the fit predicts have nearly the same readings, and no path
-        to follow: where a step is too long for Newton's method, a shorter one is tried.
+        reached. The states of the last step of the fit have the same readings, and no path to
+        follow: where a step is too long for Newton's method, a shorter one is tried.
         """
         values = self.free.values(z)
         if self.located is not None:

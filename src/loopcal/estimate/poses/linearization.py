@@ -111,8 +111,7 @@ def linearize_poses(
         readings in these units.
     """
     robot = free.robot
-    solved = differentiate_pose(robot, values, q, state)
-    D = scale_parameters(free, solved.parameters)
+    solved = differentiate_pose(robot, values, q, state, free.columns)
     actuators = [actuator.name for actuator in robot.actuators]
     passive = [name for name in names if name not in actuators]
     slopes, turns, Y = {}, {}, None
@@ -130,7 +129,7 @@ def linearize_poses(
     poses = LinearizedPoses(
         state.T,
         np.zeros(0, dtype=bool),
-        D,
+        solved.parameters,
         joints_by_parameters=slopes,
         by_coordinates=Y,
         joints_by_coordinates=turns,
@@ -158,10 +157,10 @@ def linearize_closure(
     state = engine.solve(robot.program, e, joints, begin, max_iterations=1)
     step = geometry.pose_difference(state.T, T)
     given_state = replace(state, T=T, status=np.zeros_like(state.status))
-    D = differentiate_pose(robot, values, readings, given_state).parameters
+    D = differentiate_pose(robot, values, readings, given_state, free.columns).parameters
     ok = np.asarray(np.isfinite(step).all(axis=2) & np.isfinite(D).all(axis=(2, 3)))
     step, D = np.where(ok[..., None], step, 0.0), np.where(ok[..., None, None], D, 0.0)
-    return LinearizedPoses(T, ok, scale_parameters(free, D), closure_step=step)
+    return LinearizedPoses(T, ok, D, closure_step=step)
 
 
 def mask_unreached(
@@ -178,7 +177,8 @@ def mask_unreached(
     derivatives += [] if Y is None else [Y, q]
     ok = np.asarray(state.status == Status.CONVERGED)
     for array in derivatives:
-        ok = ok & np.isfinite(array).all(axis=tuple(range(2, array.ndim)))
+        if not np.isfinite(array.sum()):  # else no entry is infinite or NaN
+            ok = ok & np.isfinite(array).all(axis=tuple(range(2, array.ndim)))
     values = select_joint_values(free.robot, tuple(names), q, state)
 
     def masked(array: np.ndarray) -> FloatArray:
@@ -225,17 +225,26 @@ class KindRows(NamedTuple):
 
     Attributes
     ----------
-    residual : (a, r, m).
-    by_parameters : (a, r, m, p); p = 0 where not asked for.
+    machine : (a, r, m, p + 1) by the scaled parameters, and the residual behind them; p = 0 where
+        derivatives were not asked for.
     by_nuisance : (a, r, m, u) by the nuisance parameters that each row uses; None without any.
     by_coordinates : (a, r, links, m, k) by the coordinates of each linked pose; None where poses
         have none.
     """
 
-    residual: FloatArray
-    by_parameters: FloatArray
+    machine: FloatArray
     by_nuisance: FloatArray | None
     by_coordinates: FloatArray | None
+
+    @property
+    def residual(self) -> FloatArray:
+        """(a, r, m)."""
+        return self.machine[..., -1]
+
+    @property
+    def by_parameters(self) -> FloatArray:
+        """(a, r, m, p)."""
+        return self.machine[..., :-1]
 
 
 def evaluate_rows(
@@ -290,11 +299,12 @@ def linearize_rows(
         by_nuisance = np.matmul(
             white, np.broadcast_to(evaluated.nuisance, (a, r, m, evaluated.nuisance.shape[-1]))
         )
+    machine = np.empty((a, r, m, 1 + (poses.by_parameters.shape[-1] if by_parameters else 0)))
+    machine[..., -1] = rows.whiten(white, residual, trials)
+    if by_parameters:
+        _write_parameter_columns(rows, evaluated, white, poses, machine[..., :-1])
     return KindRows(
-        residual=rows.whiten(white, residual, trials),
-        by_parameters=_parameter_columns(rows, evaluated, white, poses)
-        if by_parameters
-        else np.zeros((a, r, m, 0)),
+        machine,
         by_nuisance=by_nuisance,
         by_coordinates=None
         if poses.by_coordinates is None
@@ -310,26 +320,30 @@ def coordinate_derivative(jacobian: FloatArray, Y: FloatArray) -> FloatArray:
     return without_rounding(np.matmul(jacobian, Y), np.matmul(np.abs(jacobian), np.abs(Y)))
 
 
-def _parameter_columns(
-    rows: ObservationRows, evaluated: Evaluation, white: FloatArray, poses: LinearizedPoses
-) -> FloatArray:
-    """Return whitened derivatives (a, r, m, p) of a kind by the scaled parameters."""
+def _write_parameter_columns(
+    rows: ObservationRows,
+    evaluated: Evaluation,
+    white: FloatArray,
+    poses: LinearizedPoses,
+    out: FloatArray,
+) -> None:
+    """Write whitened derivatives (a, r, m, p) of a kind by the scaled parameters."""
     D = poses.by_parameters
     if rows.kind.poses_per_row > 1:
         linked = (
             evaluated.jacobian[:, :, i] @ D[:, rows.poses[:, i]]
             for i in range(rows.kind.poses_per_row)
         )
-        return np.matmul(white, sum(linked, start=np.zeros(1)))
+        np.matmul(white, sum(linked, start=np.zeros(1)), out=out)
+        return
     if not _is_every_pose(rows, D.shape[1]):
         D = D[:, rows.poses]
     # one order of the products for any number of trials: each trial equals its own fit bit for bit
-    columns = np.matmul(white, np.matmul(evaluated.jacobian, D))
+    np.matmul(np.matmul(white, evaluated.jacobian), D, out=out)
     for j, name in enumerate(rows.kind.sensed_joints):
         if name in poses.joints_by_parameters and evaluated.joints is not None:
             slope = poses.joints_by_parameters[name][:, rows.poses, None, :]
-            columns = columns + np.matmul(white, evaluated.joints[..., j, None] * slope)
-    return columns
+            out += np.matmul(white, evaluated.joints[..., j, None] * slope)
 
 
 def _coordinate_columns(

@@ -130,8 +130,7 @@ def _mask(kind: KindRows, kept: BoolArray) -> KindRows:
         return array * kept.reshape(-1, *[1] * (array.ndim - 2))
 
     return KindRows(
-        mask(kind.residual),
-        mask(kind.by_parameters),
+        mask(kind.machine),
         None if kind.by_nuisance is None else mask(kind.by_nuisance),
         None if kind.by_coordinates is None else mask(kind.by_coordinates),
     )

@@ -114,12 +114,10 @@ class UncertainPoses:
         """Number of components."""
         return len(self.first_pose)
 
-    def next_start(
-        self, solution: PoseSolution, start: Start
-    ) -> tuple[PoseStates | None, np.ndarray | None]:
-        """Return the pose estimates for the next start; they are not predicted."""
+    def next_start(self, solution: PoseSolution, start: Start) -> tuple[PoseStates | None, bool]:
+        """Return the pose estimates for the next start."""
         del start
-        return solution.states, None
+        return solution.states, False
 
     def solve(
         self,

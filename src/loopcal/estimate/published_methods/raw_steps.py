@@ -136,7 +136,7 @@ def make_raw_problem(robot: Mechanism, trials: Trials) -> RawProblem:
     problem = problem_of_trials(free, replace(trials, instrument=Instrument(sensors)))
     z = np.repeat(free.deviation(robot.values[None]), len(trials), axis=0)
     start = problem.linearize(z, problem.start(z)).next_start
-    return RawProblem(problem, replace(start, motion=None))
+    return RawProblem(problem, replace(start, is_near=False))
 
 
 def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = None) -> RawSteps:
