@@ -26,6 +26,8 @@ def environment(monkeypatch):
 
 def make_counting_engine(variant: str) -> Engine:
     """Return the NumPy engine under another name, as an entry point would."""
+    if variant == "old":
+        return Engine("counting:old", "0.9", lambda: None)  # pyright: ignore
     if variant not in ("", "fast"):
         raise ValueError(f"no variant {variant!r}")
     own = numpy_engine
@@ -70,6 +72,7 @@ def test_the_environment_names_the_engine_of_all_callers(environment, installed)
         (":v2", "engine.unknown"),
         ("broken", "engine.not-usable"),
         ("counting:slow", "engine.not-usable"),
+        ("counting:old", "engine.not-usable"),
     ],
 )
 def test_engines_that_cannot_compute_are_refused_in_a_sentence(installed, choice, code):

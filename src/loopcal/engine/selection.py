@@ -70,6 +70,10 @@ def select_engine(choice: str = "") -> Engine:
         raise MissingPackageError(report_finding("engine.unknown", engine=choice, known=known))
     try:
         return installed[name].load()(variant)
+    except TypeError as cause:  # its record of functions is that of another version
+        reason = "it belongs to another version of loopcal; install both anew"
+        finding = report_finding("engine.not-usable", engine=choice, reason=reason)
+        raise MissingPackageError(finding) from cause
     except (ImportError, OSError, ValueError) as cause:
         finding = report_finding("engine.not-usable", engine=choice, reason=str(cause))
         raise MissingPackageError(finding) from cause
