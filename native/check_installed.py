@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check an installed loopcal-native: every instruction set of this processor has the same bits, they
-agree with NumPy, and a calibration by `loopcal` states the engine. Run it outside the repository.
+"""Check an installed loopcal-native, outside the repository.
+
+Every instruction set of this processor has the same bits, they agree with NumPy, and a calibration
+by `loopcal` states the engine.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ def check_calibration() -> None:
                 stdout=subprocess.DEVNULL,
             )
         result = json.loads(Path(folder, "run", "result.json").read_text("utf-8"))
-    engine = result["made_by"]["engine"]
+    engine = result["made_by"]["versions"]["engine"]
     assert engine.startswith("native:"), f"the run folder states the engine {engine}"
     print(f"the run folder states the engine {engine}")
 
