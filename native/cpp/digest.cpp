@@ -59,6 +59,7 @@ struct GroupShape {
 };
 
 const GroupShape SHAPES[] = {{"RRPRRR", 0, 6, 2}, {"RRP", 1, 3, 2}, {"", 2, 1, 0}};
+const GroupShape RODS[] = {{"P", 2, 1, 0}, {"", 2, 1, 0}, {"", 2, 1, 0}};  // with a closed form each
 constexpr int GROUPS = 3, LIMBS = 2, DRIVES = GROUPS * LIMBS;
 
 void add_rotation(Random &random, Reals &to) {  // of a quaternion, by operations of IEEE 754 alone
@@ -77,11 +78,12 @@ struct Machine {
     int64_t displacements = 0;
     std::vector<size_t> values, rows;  // of each group: joint values, numbers of its rows
 
-    explicit Machine(Random &random, bool free) {
-        structure = {GROUPS, 6, 0, DRIVES, 0, free, 0, 1, 2, 3, 4, 5};
+    Machine(Random &random, bool free, int freedoms, const GroupShape *shapes) {
+        structure = {GROUPS, freedoms, 0, DRIVES, 0, free, 0, 1, 2, 3, 4, 5};
         numbers = {0.4};
         int drive = 0;
-        for (const GroupShape &shape : SHAPES) {
+        for (int g = 0; g < GROUPS; g++) {
+            const GroupShape &shape = shapes[g];
             int64_t joints = 0;
             while (shape.joints[joints]) joints++;
             std::vector<int64_t> solved, slots, body;
@@ -113,7 +115,7 @@ struct Machine {
             for (int i = 0; i < LIMBS * joints; i++) numbers.push_back(i % joints ? 0.0 : 0.01);
             for (int i = 0; i < LIMBS; i++) numbers.push_back(0.5 + 0.1 * random());
             values.push_back((size_t)(LIMBS * (joints + 1)));
-            rows.push_back((size_t)(LIMBS * shape.rows * ((int64_t)solved.size() + 6 + count + joints + 1)));
+            rows.push_back((size_t)(LIMBS * shape.rows * ((int64_t)solved.size() + freedoms + count + joints + 1)));
         }
         structure[2] = displacements;
     }
@@ -141,9 +143,10 @@ std::vector<int64_t> list_entries(int64_t *parameters) {
     return out;
 }
 
-void add_kinematics(int set, bool free, int64_t t, int64_t n, Digest &digest) {
+void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Digest &digest,
+                    const GroupShape *shapes = SHAPES) {
     Random random;
-    Machine machine(random, free);
+    Machine machine(random, free, freedoms, shapes);
     Reals e = random.reals((size_t)(t * machine.displacements), 1e-3);
     Reals q = random.reals((size_t)(t * n * DRIVES), 0.1), T;
     q[1] = INFINITY, q[q.size() - 1] = 1e4;
@@ -175,19 +178,21 @@ void add_kinematics(int set, bool free, int64_t t, int64_t n, Digest &digest) {
     arrays[2] = {poses.data(), 16 * n, 16};
     loopcal_linearize(set, machine.structure.data(), machine.numbers.data(), arrays, solved.data(),
                       rows_out.data(), t, n);
-    int64_t parameters = 0;
-    std::vector<int64_t> entries = list_entries(&parameters);
-    Reals scales = random.reals((size_t)(t * machine.displacements), 1.0);
-    Reals terms = random.reals((size_t)(t * 2 * DRIVES), 1.0);
-    Reals basis = random.reals((size_t)(n * 2 * DRIVES), 1.0), gains = random.reals(DRIVES, 1.0);
-    Reals twists((size_t)(6 * t * n * parameters)), driven((size_t)(6 * t * n * DRIVES));
-    loopcal::Strided mapped[] = {arrays[0], arrays[1], arrays[2],
-                                 {scales.data(), machine.displacements, 0},
-                                 {terms.data(), 2 * DRIVES, 0}, {basis.data(), 0, 2 * DRIVES},
-                                 {gains.data(), 0, 0}};
-    loopcal_differentiate(set, machine.structure.data(), machine.numbers.data(), entries.data(),
-                          mapped, solved.data(), twists.data(), driven.data(), t, n);
-    if (!free) digest.add(twists), digest.add(driven);
+    if (!free) {
+        int64_t parameters = 0;
+        std::vector<int64_t> entries = list_entries(&parameters);
+        Reals scales = random.reals((size_t)(t * machine.displacements), 1.0);
+        Reals terms = random.reals((size_t)(t * 2 * DRIVES), 1.0);
+        Reals basis = random.reals((size_t)(n * 2 * DRIVES), 1.0), gains = random.reals(DRIVES, 1.0);
+        Reals twists((size_t)(6 * t * n * parameters)), driven((size_t)(6 * t * n * DRIVES));
+        loopcal::Strided mapped[] = {arrays[0], arrays[1], arrays[2],
+                                     {scales.data(), machine.displacements, 0},
+                                     {terms.data(), 2 * DRIVES, 0}, {basis.data(), 0, 2 * DRIVES},
+                                     {gains.data(), 0, 0}};
+        loopcal_differentiate(set, machine.structure.data(), machine.numbers.data(), entries.data(),
+                              mapped, solved.data(), twists.data(), driven.data(), t, n);
+        digest.add(twists), digest.add(driven);
+    }
     digest.add(poses), digest.add(residual), digest.add(iterations);
     digest.add(status), digest.add(sign);
     for (size_t g = 0; g < GROUPS; g++) digest.add(joints[g]), digest.add(rows[g]);
@@ -210,8 +215,9 @@ int main() {
         if (!works) continue;
         Digest digest;
         for (bool free : {false, true})
-            for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 13, n, digest);
-        add_kinematics(set, false, 1, 50, digest);
+            for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 6, 13, n, digest);
+        add_kinematics(set, false, 6, 1, 50, digest);
+        for (const GroupShape *shapes : {SHAPES, RODS}) add_kinematics(set, true, 0, 5, 21, digest, shapes);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
         add_factors(set, 3, 1000, 7, digest);
         std::printf("%016llx %s\n", (unsigned long long)digest.value, name);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 2;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 3;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -64,6 +64,11 @@ EXPORT const char *loopcal_instruction_set(int i, int *works) {
 EXPORT int loopcal_fold(int set, const double *factor, const double *rows, double *out, int64_t t,
                         int64_t m, int64_t p, int64_t stride) {
     return list_sets()[set].kernels->fold(factor, rows, out, t, m, p, stride);
+}
+
+EXPORT int loopcal_certify(int set, const double *begin, int64_t stride, const double *goal,
+                           double size, int64_t t, int64_t n, int8_t *sign) {
+    return list_sets()[set].kernels->certify(begin, stride, goal, size, t, n, sign);
 }
 
 EXPORT int loopcal_linearize(int set, const int64_t *structure, const double *numbers,

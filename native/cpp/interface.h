@@ -29,6 +29,9 @@ struct Strided {
 struct Kernels {
     int (*fold)(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
                 int64_t p, int64_t stride);
+    // see certify.h
+    int (*certify)(const double *begin, int64_t stride, const double *goal, double size, int64_t t,
+                   int64_t n, int8_t *sign);
     // structure, numbers : see library.py. joints, out : one for each group.
     int (*linearize)(const int64_t *structure, const double *numbers, const Strided *arrays,
                      const Strided *joints, double *const *out, int64_t t, int64_t n);

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The kernels of one instruction set. The build compiles this file once for each set, with
 // INSTRUCTION_SET (a namespace) and LANES (doubles of a vector).
+#include "certify.h"
 #include "fold.h"
 #include "interface.h"
 #include "linearize.h"
@@ -29,6 +30,6 @@ static int call_solve(const int64_t *structure, const double *numbers,
 }
 
 extern const loopcal::Kernels kernels;
-const loopcal::Kernels kernels = {fold, call_linearize, differentiate, call_solve};
+const loopcal::Kernels kernels = {fold, certify, call_linearize, differentiate, call_solve};
 
 }  // namespace INSTRUCTION_SET

@@ -31,7 +31,13 @@ def make_counting_engine(variant: str) -> Engine:
     if variant not in ("", "fast"):
         raise ValueError(f"no variant {variant!r}")
     own = numpy_engine
-    functions = own.solve, own.linearize, lambda factor, rows: factor + len(rows), own.differentiate
+    functions = (
+        own.solve,
+        own.certify,
+        own.linearize,
+        lambda factor, rows: factor + len(rows),
+        own.differentiate,
+    )
     return Engine(f"counting:{variant}", "1.0", *functions)
 
 

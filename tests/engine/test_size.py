@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The NumPy engine is the specification of every other engine, so it stays readable in one sitting.
 
-The limit: seven files and 1,250 lines of at most 100 columns, about an hour of reading, with the
+The limit: eight files and 1,400 lines of at most 100 columns, about an hour of reading, with the
 docstrings that state shapes, units and formulas (a third of the lines). It was 800 lines until each
 attribute of a limb's chain was declared with its type, on a line of its own, 850 until rows could
 end near a known goal, by which `inverse` tests the working mode, 870 (five files) until limbs were
-closed one by one at a given platform, and 1,000 (six files) until the engine differentiated the
-platform by parameters, which made blocks of rows for other modules to multiply.
+closed one by one at a given platform, 1,000 (six files) until the engine differentiated the
+platform by parameters, which made blocks of rows for other modules to multiply, and 1,250 (seven
+files) until proofs replaced most tests of the working mode.
 """
 
 import ast
@@ -19,10 +20,10 @@ def list_files(root: Path) -> list[Path]:
     return [folder / "program.py", *sorted((folder / "numpy_engine").glob("*.py"))]
 
 
-def test_engine_has_at_most_seven_files_and_1250_lines(root: Path):
+def test_engine_has_at_most_eight_files_and_1400_lines(root: Path):
     files = list_files(root)
-    assert len(files) <= 7
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 1250
+    assert len(files) <= 8
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 1400
 
 
 def test_engine_imports_numpy_only(root: Path):

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.engine import Block, ClosureBlocks, Engine, ParameterMap, Program, State, Task
+from loopcal.engine.numpy_engine.certificate import Begin, has_driven_rods
 from loopcal.typing import FloatArray, IntArray
 from loopcal_native.library import (
     TASK_FAILED,
@@ -38,7 +40,8 @@ def make_engine(variant: str = "") -> Engine:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
     own = NativeFunctions(sets[name])
     number = version("loopcal-native")
-    return Engine(f"native:{name}", number, own.solve, own.linearize, own.fold, own.differentiate)
+    functions = own.solve, own.certify, own.linearize, own.fold, own.differentiate
+    return Engine(f"native:{name}", number, *functions)
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,33 @@ class NativeFunctions:
                 raise calls.error
             require_done(outcome)
         return State(T, tuple(out), status, residual, iterations, sign)
+
+    def certify(
+        self, program: Program, e: FloatArray, start: State, goal: State
+    ) -> NDArray[np.int8]:
+        """Return the closure signs of goals to which `solve` provably converges, else 0."""
+        t, n = goal.T.shape[:2]
+        sign = np.zeros((t, n), np.int8)
+        if not (has_driven_rods(program) and start.T.shape[1] == 1 and t * n):
+            return sign
+        require(goal.T.shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
+        require(len(e) in (1, t) and e.shape[1:] == (program.n_displacements,), f"e ({t} | 1, ..)")
+        require(start.T.shape == (len(start.T), 1, 4, 4), "a start (t | 1, 1, 4, 4)")
+        require(len(start.T) in (1, len(e)), "a start for each trial, or one")
+        begin, T = pack_begin(Begin.prepare(program, e, start)), as_reals(goal.T)
+        stride = begin.shape[1] if len(begin) > 1 else 0
+        outcome = load_library().loopcal_certify(
+            self.instruction_set,
+            begin.ctypes.data,
+            stride,
+            T.ctypes.data,
+            program.size,
+            t,
+            n,
+            sign.ctypes.data,
+        )
+        require_done(outcome)
+        return sign
 
     def linearize(
         self, program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
@@ -174,6 +204,14 @@ class NativeFunctions:
         call = load_library().loopcal_fold
         require_done(call(self.instruction_set, *addresses, t, m, p, stride))
         return out
+
+
+def pack_begin(begin: Begin) -> FloatArray:
+    """Return the starts of trials (t, numbers) in the order of certify.h."""
+    t, T = len(begin.unit), begin.T
+    parts = [T[:, :3], T[:, 3], begin.tip.swapaxes(0, 1), begin.attachment.swapaxes(0, 1)]
+    parts += [begin.distance, begin.inverse, begin.swing, begin.bend, begin.unit, begin.sign]
+    return as_reals(np.concatenate([a.reshape(-1, t) for a in parts]).T)
 
 
 def _require_arrays(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-ABI = 2
+ABI = 3
 """The C interface that this package calls; dispatch.cpp states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""
@@ -52,6 +52,8 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_instruction_set.argtypes = (INT, ctypes.POINTER(INT))
     library.loopcal_instruction_set.restype = ctypes.c_char_p
     library.loopcal_fold.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 4)
+    library.loopcal_certify.argtypes = (INT, ADDRESS, COUNT, ADDRESS, ctypes.c_double)
+    library.loopcal_certify.argtypes += (*(COUNT,) * 2, ADDRESS)
     library.loopcal_linearize.argtypes = (INT, *(ADDRESS,) * 5, *(COUNT,) * 2)
     library.loopcal_differentiate.argtypes = (INT, *(ADDRESS,) * 7, *(COUNT,) * 2)
     library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3, TASK, *(ADDRESS,) * 7)

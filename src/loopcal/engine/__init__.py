@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine: solve closed loops, linearize and differentiate them, fold rows into a factor.
+"""The engine: solve closed loops, certify solutions, linearize and differentiate, fold rows.
 
 Nothing outside this package depends on how these functions work or on which engine computes:
 another engine is accepted when it passes tests/engine. All functions are pure; threads may call
@@ -23,6 +23,7 @@ from loopcal.engine.program import Slot as Slot
 from loopcal.engine.program import State as State
 from loopcal.engine.program import Task as Task
 from loopcal.engine.selection import Engine as Engine
+from loopcal.engine.selection import certify as certify
 from loopcal.engine.selection import differentiate as differentiate
 from loopcal.engine.selection import fold as fold
 from loopcal.engine.selection import get_current_engine as get_current_engine

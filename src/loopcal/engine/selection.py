@@ -16,6 +16,7 @@ from functools import cache
 from importlib.util import find_spec
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.engine import numpy_engine
 from loopcal.engine.program import ClosureBlocks, ParameterMap, Program, State, Task
@@ -39,6 +40,7 @@ class Engine:
     name: str
     version: str
     solve: Callable[..., State]
+    certify: Callable[..., NDArray[np.int8]]
     linearize: Callable[..., ClosureBlocks]
     fold: Callable[[FloatArray, FloatArray], FloatArray]
     differentiate: Callable[..., tuple[FloatArray, FloatArray]]
@@ -60,7 +62,7 @@ def select_engine(choice: str = "") -> Engine:
     name, _, variant = choice.partition(":")
     if choice == NUMPY:
         own = numpy_engine
-        functions = own.solve, own.linearize, own.fold, own.differentiate
+        functions = own.solve, own.certify, own.linearize, own.fold, own.differentiate
         return Engine(NUMPY, np.__version__, *functions)
     from importlib.metadata import entry_points
 
@@ -108,6 +110,17 @@ def solve(
     Rows that fail are marked in `status`; nothing is raised.
     """
     return get_current_engine().solve(program, e, q, start, task, free, max_iterations, goal)
+
+
+def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArray[np.int8]:
+    """Return the closure sign (t, n) of goals to which `solve` from the start provably converges.
+
+    No singularity lies between them and the start. 0 where nothing is proven: the test is
+    sufficient, and made for six driven rods that begin at one pose.
+
+    e : (t | 1, n_displacements) [m, rad]. start : (t | 1, 1). goal : solutions (t, n).
+    """
+    return get_current_engine().certify(program, e, start, goal)
 
 
 def linearize(

@@ -67,8 +67,13 @@ def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
     """Return the rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz"."""
     axes, fixed = _moving_axes(order)
     moving = angles[..., ::-1] if fixed else angles
-    a, b, c = (rotation_about_axis(moving[..., i], axis) for i, axis in enumerate(axes))
-    return a @ b @ c
+    columns = [np.eye(3)[:, i, None] for i in range(3)]
+    for angle, axis in zip(moving.reshape(-1, 3).T, axes, strict=True):
+        # the turn combines the columns of the two other axes
+        c, s, i, j = np.cos(angle), np.sin(angle), (axis + 1) % 3, (axis + 2) % 3
+        first, second = columns[i], columns[j]
+        columns[i], columns[j] = first * c + second * s, second * c - first * s
+    return np.ascontiguousarray(np.stack(columns).T).reshape(*angles.shape[:-1], 3, 3)
 
 
 def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:

@@ -78,6 +78,21 @@ def forward_trials(
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
+    return close_at_joints(robot, e, joints, start, follow, goal)
+
+
+def close_at_joints(
+    robot: Mechanism,
+    e: FloatArray,
+    joints: FloatArray,
+    start: State | None = None,
+    follow: bool = True,
+    goal: State | None = None,
+) -> State:
+    """Solve forward kinematics like `forward_trials`, for displacements and joint values.
+
+    e : (t | 1, n_displacements). joints : (t | 1, n, n_joints) values of the driven joints, n > 0.
+    """
     begin = clear_sign(robot, start or robot.home_state)
     state = clear_sign(robot, engine.solve(robot.program, e, joints, begin, goal=goal))
     wrong = _find_wrong_rows(robot, state, begin)
@@ -105,6 +120,16 @@ def inverse_trials(
 
     `compute_readings` gives the readings of the states.
     """
+    state = close_at_coordinates(robot, values, target, start)
+    if count_shared_drives(robot.program):
+        return state
+    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+
+
+def close_at_coordinates(
+    robot: Mechanism, values: FloatArray, target: FloatArray, start: State | None = None
+) -> State:
+    """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states."""
     begin = start or robot.home_state
     if count_shared_drives(robot.program):
         return _inverse_with_shared_drives(robot, values, target, begin)
@@ -113,8 +138,7 @@ def inverse_trials(
     T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
     if determine_platform(robot):
         limbs = robot.program.with_fixed_platform
-        state = engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
-        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+        return engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
     t, n = max(len(values), len(target)), target.shape[1]
     flat = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
 
@@ -123,8 +147,7 @@ def inverse_trials(
 
     guess = np.broadcast_to(guess, (t, n, len(robot.actuators)))
     T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
-    state = engine.solve(robot.program, e, guess, replace(begin, T=T), command, free=True)
-    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+    return engine.solve(robot.program, e, guess, replace(begin, T=T), command, free=True)
 
 
 def determine_platform(robot: Mechanism) -> bool:

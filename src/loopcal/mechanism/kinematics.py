@@ -20,10 +20,10 @@ from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.batch_kinematics import (
+    close_at_coordinates,
     compute_readings,
     count_shared_drives,
     forward_trials,
-    inverse_trials,
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
@@ -181,7 +181,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
         state = solve_in_mode(
             robot,
-            lambda x, start: inverse_trials(robot, values, x[None], start),
+            lambda x, start: close_at_coordinates(robot, values, x[None], start),
             np.atleast_2d(wanted),
             begin,
         )
@@ -279,8 +279,8 @@ def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = Non
 def find_nearest_reachable(
     robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
 ) -> State:
-    """Return states (t, n) with the reachable pose nearest to T (t | 1, n, 4, 4)."""
-    state = inverse_trials(robot, values, read_coordinates(T, robot.controlled), start)
+    """Return states (t, n) with the reachable pose nearest to T (t | 1, n, 4, 4), without signs."""
+    state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
     if len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms):
         return state
     for _ in range(PROJECTION_STEPS):
@@ -291,7 +291,7 @@ def find_nearest_reachable(
         step = np.where(np.isfinite(step), step, 0.0)
         moved = geometry.apply_twist(state.T, np.matmul(slope, step[..., None])[..., 0])
         target = read_coordinates(moved, robot.controlled)
-        state = inverse_trials(robot, values, target, state)
+        state = close_at_coordinates(robot, values, target, state)
         if np.abs(step).max(initial=0.0) < 1e-12 * robot.size:
             break
     return state

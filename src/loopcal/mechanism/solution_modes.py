@@ -15,17 +15,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
 from loopcal.mechanism.batch_kinematics import (
     clear_sign,
-    compute_readings,
-    forward_trials,
-    inverse_trials,
+    close_at_coordinates,
+    close_at_joints,
+    compute_closure_sign,
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
-from loopcal.mechanism.states import Status, replace_rows, reshape_rows, select_poses
+from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_poses
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -48,41 +48,52 @@ def solve_in_mode(
 
     A row whose loops close in another mode only is marked `OTHER_MODE`.
     """
-    state = solve(target, start)
-    begin = _repeat_poses(start or robot.home_state, state.T.shape[1])
-    is_other = find_other_modes(robot, state, begin)
+    begin = start or robot.home_state
+    state, is_other = judge_modes(robot, solve(target, start), begin)
     rows = np.flatnonzero(is_other)
     if not len(rows):
         return state
     state = replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
-    first = select_poses(begin, rows)
+    first = select_poses(_repeat_poses(begin, len(is_other)), rows)
     near, arrived = _follow_poses(robot, first, state.T[0, rows])
     if not len(arrived):
         return state
     again = solve(target[rows[arrived]], near)
-    closed = again.status[0] == Status.CONVERGED
-    good = closed & ~find_other_modes(robot, again, select_poses(first, arrived))
+    again, still_other = judge_modes(robot, again, select_poses(first, arrived))
+    good = (again.status[0] == Status.CONVERGED) & ~still_other
     rows, new = rows[arrived[good]], select_poses(again, good)
     return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
 
 
-def find_other_modes(robot: Mechanism, state: State, begin: State) -> BoolArray:
-    """Return the closed rows (n,) of a state (1, n) whose readings lead elsewhere from `begin`.
+def judge_modes(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
+    """Return a state (1, n) with closure signs, and its closed rows that `begin` does not lead to.
 
-    Forward kinematics accepts no solution of another sign, so rows of another sign are not solved.
-    It ends where it comes close to the pose of the state, to which it would converge.
+    The engine proves for most rows that their readings lead to their pose, which gives their sign,
+    too. For the others the sign is computed. Forward kinematics accepts no solution of another
+    sign, so rows of another sign are not solved. It ends where it comes close to the pose of the
+    state, to which it would converge.
     """
-    begin, closed = clear_sign(robot, begin), state.status[0] == Status.CONVERGED
-    is_other = closed & (clear_sign(robot, state).closure_sign[0] != begin.closure_sign[0])
-    rows = np.flatnonzero(closed & ~is_other)
-    values, chosen = robot.values[None], select_poses(state, rows)
-    q = compute_readings(robot, values, chosen)
-    back = forward_trials(robot, values, q, select_poses(begin, rows), goal=chosen)
-    is_other[rows] = back.status[0] != NEAR_GOAL
-    ended = back.status[0] == Status.CONVERGED
-    gap = geometry.pose_difference(back.T[0, ended], chosen.T[0, ended]) * robot.twist_scale
-    is_other[rows[ended]] = np.abs(gap).max(axis=1, initial=0.0) > SAME_POSE * robot.size
-    return is_other
+    e, _ = robot.slots(robot.values[None])
+    begin, n = clear_sign(robot, begin), state.T.shape[1]
+    closed = state.status[0] == Status.CONVERGED
+    sign = engine.certify(robot.program, e, begin, state)[0]
+    is_sure = sign != 0
+    if not is_sure.all():
+        unsure = select_poses(state, ~is_sure)
+        sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
+    state = replace(state, closure_sign=sign[None])
+    is_other = closed & (sign != begin.closure_sign[0])
+    rows = np.flatnonzero(closed & ~is_other & ~is_sure)
+    if len(rows):
+        chosen = select_poses(state, rows)
+        first = select_poses(begin, rows) if begin.T.shape[1] == n > 1 else begin
+        joints = driven_values(robot.program, chosen)
+        back = close_at_joints(robot, e, joints, first, goal=chosen)
+        is_other[rows] = back.status[0] != NEAR_GOAL
+        ended = back.status[0] == Status.CONVERGED
+        gap = geometry.pose_difference(back.T[0, ended], chosen.T[0, ended]) * robot.twist_scale
+        is_other[rows[ended]] = np.abs(gap).max(axis=1, initial=0.0) > SAME_POSE * robot.size
+    return state, is_other
 
 
 def _repeat_poses(state: State, n: int) -> State:
@@ -100,7 +111,7 @@ def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State,
     for i in range(1, STEPS + 1):
         via = geometry.apply_twist(first.T[0, alive], (i / STEPS) * twist[alive])
         target = read_coordinates(via, robot.controlled)
-        current = inverse_trials(robot, values, target[None], current)
+        current = close_at_coordinates(robot, values, target[None], current)
         closed = current.status[0] == Status.CONVERGED
         current, alive = select_poses(current, closed), alive[closed]
         if not len(alive):

@@ -84,6 +84,27 @@ def test_maps_of_wrong_shape_are_refused(what):
         NATIVE.differentiate(PROGRAM, E, Q, state, WRONG_MAPS[what])
 
 
+RODS = make_robot_case("hexapod-42", 2, 3)
+RODS_GOAL = NATIVE.solve(RODS.program, RODS.e, RODS.q, RODS.home)
+
+
+@pytest.mark.parametrize(
+    ("e", "start", "goal"),
+    [
+        (RODS.e[:, 1:], RODS.home.T, RODS_GOAL.T),
+        (np.repeat(RODS.e, 2, axis=0), RODS.home.T, RODS_GOAL.T),
+        (RODS.e[:0], RODS.home.T, RODS_GOAL.T),
+        (RODS.e[:1], np.repeat(RODS.home.T, 2, axis=0), RODS_GOAL.T),
+        (RODS.e, RODS.home.T[..., :3, :], RODS_GOAL.T),
+        (RODS.e, RODS.home.T, RODS_GOAL.T[..., :3, :]),
+    ],
+)
+def test_starts_and_goals_of_wrong_shape_are_refused(e, start, goal):
+    begin, end = replace(RODS.home, T=start), replace(RODS_GOAL, T=goal)
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.certify(RODS.program, e, begin, end)
+
+
 @pytest.mark.parametrize(
     ("factor", "rows"),
     [
@@ -155,6 +176,8 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     closed = state.status == CONVERGED
     assert np.isfinite(state.T[closed]).all()
     assert set(np.unique(state.status)) <= {0, 1, 2, 3}
+    sign = native.certify(case.program, e, case.home, state)
+    assert set(np.unique(sign)) <= {-1, 0, 1}
     blocks = native.linearize(case.program, e, q, state)
     native.linearize(case.program, e, q, state, free=True)
     inputs = draw_map(case.program, (rows, 1), True)

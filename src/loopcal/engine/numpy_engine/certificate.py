@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prove that Newton's method from a start converges to a known solution, for many solutions.
+
+The mechanism has six limbs, each a driven rod between base and platform. All goals share the
+inverse C of the Jacobian at the start, so that a proof takes one step, one product with the
+Jacobian at the goal and some norms: a fraction of solving. Derivation: docs/theory/kinematics.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal.engine.numpy_engine.closure import cross, dot, exponential, matmul, matvec, place_links
+from loopcal.engine.program import Program, State
+from loopcal.typing import BoolArray, FloatArray
+
+CONTRACTION = 0.6
+"""Largest product of the distance from the goal and the change of the Jacobian; proven: 2/3."""
+ANGLE = 0.75
+"""An angle is below 0.75 times the norm of the difference of the rotations, if this is below 1."""
+DECREASE = 0.99
+"""Share of the first residual that may be left after the first step; step control allows 0.9999."""
+
+
+def has_driven_rods(program: Program) -> bool:
+    """Return whether the mechanism has six freedoms and six limbs, each a driven rod alone."""
+    return (
+        len(program.freedoms) == 6
+        and sum(len(group.limbs) for group in program.groups) == 6
+        and all(
+            g.ending == "distance" and not g.joints and g.actuator[0, 0] >= 0
+            for g in program.groups
+        )
+    )
+
+
+def certify(
+    program: Program, e: FloatArray, start: State, goal: State, chunk: int = 2048
+) -> NDArray[np.int8]:
+    """Return the closure signs of goals that are reached; see `loopcal.engine.certify`."""
+    t, n = goal.T.shape[:2]
+    out = np.zeros((t, n), np.int8)
+    if not (has_driven_rods(program) and start.T.shape[1] == 1):
+        return out
+    with np.errstate(all="ignore"):
+        begin = Begin.prepare(program, e, start)
+        for i, first in np.ndindex(t, -(-n // chunk)):
+            rows = slice(first * chunk, (first + 1) * chunk)
+            one = begin.select(min(i, len(e) - 1))
+            goals = goal.T[i, rows, :3].transpose(1, 2, 0).copy()
+            out[i, rows] = np.where(one.reaches(goals), one.sign, 0)
+    return out
+
+
+class Begin(NamedTuple):
+    """The start of each trial (.., t), a twist of which is (unit w, v) for an angle w.
+
+    T : (3, 4, t) platform. tip, attachment : (3, 6, t) ends of the rods, in base and platform.
+    unit : (t,) length for which the inverse is small. distance : (6, t) of the ends. inverse :
+        (6, 6, t) of the Jacobian of the distances. sign : (t,) of its determinant.
+    swing : (6, t) change of a gap by a unit twist. bend : (3, t) coefficients of 1, h, h^2 in the
+        square of the change of the Jacobian, times the inverse, where 1 / h is the shortest rod.
+    size : of the robot [m].
+    """
+
+    T: FloatArray
+    tip: FloatArray
+    attachment: FloatArray
+    unit: FloatArray
+    distance: FloatArray
+    inverse: FloatArray
+    sign: NDArray[np.int8]
+    swing: FloatArray
+    bend: FloatArray
+    size: float
+
+    @classmethod
+    def prepare(cls, program: Program, e: FloatArray, start: State) -> Begin:
+        """Return the start of a program that `has_driven_rods`, a pose for each trial."""
+        links = [place_links(group, e) for group in program.groups]
+        tip, attachment = (np.concatenate([p.origin[i] for p in links], axis=1) for i in (0, 1))
+        T = np.broadcast_to(start.T[:, 0], (len(e), 4, 4))[:, :3].transpose(1, 2, 0)
+        square = dot(attachment, attachment)
+        unit = np.sqrt(2 * np.mean(square, axis=0))
+        rows, distance = _measure_rods(T, tip, attachment, unit)
+        jacobian = rows.transpose(2, 0, 1)
+        good = np.isfinite(jacobian).all(axis=(1, 2))
+        sign = np.linalg.slogdet(np.where(good[:, None, None], jacobian, 0.0))[0]
+        inverse = np.linalg.inv(np.where((sign != 0)[:, None, None], jacobian, np.eye(6)))
+        norm = np.where(sign != 0, np.linalg.norm(inverse, 2, axis=(1, 2)), np.inf)
+        swing, ratio = np.sqrt(1 + square / unit**2), np.sqrt(square) / unit
+        bend = np.array(
+            [
+                np.add.reduce((ratio / unit) ** 2, axis=0),
+                np.add.reduce(2 * ratio**2 * swing / unit, axis=0),
+                np.add.reduce(swing**4, axis=0),
+            ]
+        )
+        begin = T, tip, attachment, unit, distance, inverse.transpose(1, 2, 0)
+        return cls(*begin, sign.astype(np.int8), swing, norm**2 * bend, program.size)
+
+    def select(self, trial: int) -> Begin:
+        """Return the start of one trial, with an axis of length 1 in place of t."""
+        arrays = {name: getattr(self, name) for name in self._fields[:-1]}
+        return self._replace(**{name: array[..., [trial]] for name, array in arrays.items()})
+
+    def reaches(self, goal: FloatArray) -> BoolArray:
+        """Return which goals (3, 4, N) are proven for one trial, (N,)."""
+        size, unit = self.size, self.unit
+        rows, distance = _measure_rods(goal, self.tip, self.attachment, unit)
+        stretch = distance - self.distance
+        step = np.einsum("ij,jn->in", self.inverse[..., 0], stretch)
+        turn, shift = step[:3] / unit, step[3:]
+        length = np.maximum(np.abs(turn).max(axis=0) * size, np.abs(shift).max(axis=0))
+        turned = matmul(exponential(turn), self.T[:, :3]) - goal[:, :3]
+        missed = self.T[:, 3] + shift - goal[:, 3]
+        apart = np.add.reduce(turned**2, axis=(0, 1))
+        error = np.sqrt((ANGLE * unit) ** 2 * apart + dot(missed, missed))
+        left = np.sqrt(np.add.reduce(self.swing**2, axis=0)) * error
+        falls = left**2 <= DECREASE**2 * np.add.reduce(stretch**2, axis=0)
+        shortest = np.minimum.reduce(distance - self.swing * error, axis=0)
+        h = 1 / shortest
+        bend = self.bend[0] + (self.bend[1] + self.bend[2] * h) * h
+        off = np.einsum("ij,jfn->ifn", self.inverse[..., 0], rows)
+        off[range(6), range(6)] -= 1.0
+        square = np.einsum("ifn,ign->fgn", off, off)
+        # the spectral norm of `off` is the root of that of its square, which this norm exceeds
+        deviation = np.sqrt(np.sqrt(np.einsum("fgn,fgn->n", square, square)))
+        contracts = np.sqrt(bend) * error <= CONTRACTION * (1 - deviation)
+        return (shortest > 0) & (apart <= 1) & (length <= size / 2) & falls & contracts
+
+
+def _measure_rods(
+    T: FloatArray, tip: FloatArray, attachment: FloatArray, unit: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Jacobian (6, 6, N) of the distances (6, N) of rods at platforms (3, 4, N)."""
+    arm = matvec(T[:, :3, None], attachment)
+    gap = arm + T[:, 3, None] - tip
+    distance = np.sqrt(dot(gap, gap))
+    rows = np.empty((6, *distance.shape))
+    np.divide(gap, distance, out=rows[3:])
+    np.divide(cross(arm, rows[3:]), unit, out=rows[:3])
+    return rows.swapaxes(0, 1), distance
