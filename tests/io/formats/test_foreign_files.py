@@ -16,7 +16,7 @@ OWN = {
     "reprap": ("robot.g",),
     "linuxcnc": ("hexapod.hal",),
     "linuxcnc-ini": ("machine.ini",),
-    "urdf": ("robot.urdf",),
+    "urdf": ("robot.urdf", "constrained.urdf"),
 }
 """Names in SOURCES of the files of each format that corrects a file."""
 

@@ -103,6 +103,25 @@ def test_hexapods_with_constraints_agree_with_the_solver(tmp_path, seed) -> None
     np.testing.assert_allclose(forward(changed, q).T, expected, rtol=0, atol=1e-9)
 
 
+def test_joint_that_its_loop_keeps_from_moving_is_closed_in_all_freedoms(tmp_path) -> None:
+    """A five-bar with a joint beside its rod and a ball joint instead of the pin."""
+    moved = TREE.replace(make_joint("tip_frame", "rod1", "tip", "0.3 0 0", 0.0, "fixed"), "")
+    split = (
+        moved
+        + make_joint("tip_frame", "end", "tip", "0.3 -0.05 0", 0.0, "fixed")
+        + '<link name="end"/>'
+        + make_joint("twist", "rod1", "end", "0 0.05 0").replace(
+            'axis xyz="0 0 1"', 'axis xyz="1 0 0"'
+        )
+    )
+    ball = PIN.replace("revolute", "spherical").replace('"rod1"', '"end"')
+    ball = ball.replace('parent_origin xyz="0.3 0 0"', 'parent_origin xyz="0.3 -0.05 0"')
+    text = f'<robot name="five-bar">\n{split}{ball}{MOTORS}</robot>\n'
+    robot, planar = read(tmp_path, text)[1], read(tmp_path, FIVE_BAR)[1]
+    q = 0.1 * np.random.default_rng(1).uniform(-1, 1, (5, 2)) + inverse(planar, planar.home[None]).q
+    np.testing.assert_allclose(forward(robot, q).T, forward(planar, q).T, rtol=0, atol=1e-12)
+
+
 def test_link_outside_of_the_loops_is_left_out(tmp_path) -> None:
     camera = '<link name="camera"/>' + make_joint("pan", "rod1", "camera", "0.1 0 0") + "</robot>"
     imported, robot = read(tmp_path, FIVE_BAR.replace("</robot>", camera))

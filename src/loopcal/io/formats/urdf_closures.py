@@ -12,7 +12,7 @@ the example-parallel-robots collection.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal
@@ -59,7 +59,7 @@ class Closures:
     pairs: tuple[tuple[str, str], ...] = ()
     kinds: tuple[str, ...] = ()
     motors: tuple[str, ...] = ()
-    overrides: Mapping[str, str] = ()  # type: ignore[assignment]
+    overrides: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
     FileError : an unknown frame or joint, a closure of a rigid body with itself, a motor that is
         not a movable joint.
     """
-    closures = Closures(overrides={}) if path is None else _read_closures(path, urdf)
+    closures = Closures() if path is None else _read_closures(path, urdf)
     fixed = {name for name, kind in closures.overrides.items() if kind == "FIXED"}
     urdf = urdf.with_fixed(fixed)
     motors = closures.motors or tuple(urdf.motors)

@@ -77,7 +77,7 @@ def find_limb_paths(graph: JointGraph, platform: str) -> LimbPaths:
         raise MechanismError(finding)
     homes = find_homes(graph)
     motions = [find_freedoms(graph, home, platform) for home in homes]
-    limbs = _find_complete_limbs(graph, platform)
+    complete = limbs = _find_complete_limbs(graph, platform)
     if limbs is None:
         limbs = _find_driven_limbs(graph, platform)
         kept = [
@@ -92,6 +92,8 @@ def find_limb_paths(graph: JointGraph, platform: str) -> LimbPaths:
         pair for pair in zip(homes, motions, strict=True) if pair[1].firmness >= limit
     )
     freedoms = _list_freedoms(graph, home, platform)
+    if complete and not _stay_within(graph, home, platform, freedoms):
+        freedoms = AXES
     limbs = _sort_limbs(limbs, graph.motors)
     used = {joint.name for limb in limbs for joint in limb}
     used |= {joint.origin_b for limb in limbs for joint in limb}
@@ -161,6 +163,30 @@ def _list_freedoms(graph: JointGraph, home: FloatArray, platform: str) -> tuple[
         motion = graph.find_twists(q, platform, np.eye(4)) @ graph.find_motions(q)
         largest = np.maximum(largest, np.abs(motion).max(axis=1, initial=0.0))
     return tuple(name for name, size in zip(AXES, largest, strict=True) if size > MOTION)
+
+
+def _stay_within(
+    graph: JointGraph, home: FloatArray, platform: str, freedoms: tuple[str, ...]
+) -> bool:
+    """Return whether rotary joints and slides move the platform in its freedoms only.
+
+    Loops are closed in the freedoms of the platform. A joint across them, which its loop keeps from
+    moving, would be free there.
+    """
+    placement = graph.place(home[None])
+    origin = graph.get_place(placement, platform)[0, :3, 3]
+    others = [AXES.index(name) for name in AXES if name not in freedoms]
+    for joint in graph.joints:
+        if joint.kind == "S":
+            continue
+        frame = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
+        axis = frame[:3, :3] @ joint.axis
+        arm = np.cross(axis, origin - frame[:3, 3])
+        turn, velocity = (axis, arm) if joint.kind == "R" else (0 * axis, axis)
+        twist = dict(zip(("rx", "ry", "rz", "x", "y", "z"), (*turn, *velocity), strict=True))
+        if any(abs(twist[AXES[i]]) > MOTION * max(1.0, graph.size) for i in others):
+            return False
+    return True
 
 
 def _find_complete_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
