@@ -14,6 +14,7 @@ struct RowBlock {
     Mask alive;
     int64_t trial[W], pose[W];
     int used;
+    int64_t unit;
     PlacedUnit *placed;
 };
 
@@ -86,6 +87,7 @@ class Solver {
         block.used = division_.locate(number, block.trial, block.pose);
         // blocks of one chunk belong to fewer than `unit_count` units
         int64_t unit = number / division_.blocks_of_unit();
+        block.unit = unit;
         block.placed = units + unit % unit_count;
         block.placed->place(unit, in_.e);
         gather_platform(in_.T, block.trial, block.pose, block.now);
@@ -128,7 +130,9 @@ class Solver {
                 task.residual[lane] = answer.residual + last * answer.conditions;
                 task.slopes[lane] = answer.slopes + last * answer.conditions * 6;
             }
-            if (first)
+            if (first && !in_.task && !in_.T.pose && equations_.has_rods())
+                evaluate_shared(blocks[b]);
+            else if (first)
                 evaluate(blocks[b], blocks[b].now, in_.task ? &task : nullptr, Mask{},
                          blocks[b].step, blocks[b].measures);
             else
@@ -144,6 +148,22 @@ class Solver {
             equations_.evaluate(placed.lanes(), coordinates, task, may_stay, block.alive, step, measures);
         else
             equations_.evaluate(placed.numbers(), coordinates, task, may_stay, block.alive, step, measures);
+    }
+
+    // The first evaluation of rows that start from one pose of their trial.
+    void evaluate_shared(RowBlock &block) {
+        const PlacedUnit &placed = *block.placed;
+        if (shared_unit_ != block.unit) {
+            shared_unit_ = block.unit;
+            if (division_.by_trials)
+                equations_.factorize(placed.lanes(), block.now, shared_);
+            else
+                equations_.factorize(placed.numbers(), block.now, shared_);
+        }
+        if (division_.by_trials)
+            equations_.evaluate_shared(placed.lanes(), shared_, block.now, block.step, block.measures);
+        else
+            equations_.evaluate_shared(placed.numbers(), shared_, block.now, block.step, block.measures);
     }
 
     // End the rows that have converged, are near their goal, or can go no further.
@@ -251,6 +271,8 @@ class Solver {
     const SolveOutput &out_;
     const Division &division_;
     const Equations &equations_;
+    SharedFactor shared_;
+    int64_t shared_unit_ = -1;
 };
 
 inline int solve(const int64_t *structure, const double *numbers, const SolveInput &input,

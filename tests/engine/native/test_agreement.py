@@ -172,6 +172,15 @@ def test_bits_do_not_depend_on_which_rows_share_lanes():
         assert_array_equal(few.T[:, 0], together.T[:, pose])
 
 
+@pytest.mark.parametrize(("t", "n"), [(1, 21), (5, 17), (9, 3)])
+def test_rows_that_share_their_start_have_the_bits_of_rows_with_one_each(t, n):
+    case = make_robot_case("hexapod-42", t, n)
+    each = replace(case.home, T=np.repeat(case.home.T, n, axis=1))
+    for engine in ENGINES.values():
+        shared = engine.solve(case.program, case.e, case.q, case.home)
+        assert_same_bits([shared, engine.solve(case.program, case.e, case.q, each)])
+
+
 def test_angles_of_many_turns_are_those_of_few():
     case = make_robot_case("3-rrr", 1, 6)
     turned = case.q + 2 * np.pi * np.array([0.0, 1.0, -7.0, 1e3, -1e4, 1e5])[:, None]
