@@ -9,6 +9,7 @@ import numpy as np
 
 from loopcal.engine import State
 from loopcal.mechanism import Mechanism, forward_trials, solve_at_pose
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import FloatArray
 
 
@@ -81,11 +82,4 @@ def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]
     def change(array: np.ndarray) -> np.ndarray:
         return np.broadcast_to(array, (*shape, *array.shape[2:])).reshape(*wanted, *array.shape[2:])
 
-    return State(
-        change(state.T),
-        tuple(change(joints) for joints in state.joints),
-        change(state.status),
-        change(state.residual),
-        change(state.iterations),
-        change(state.closure_sign),
-    )
+    return map_arrays(change, state)

@@ -25,6 +25,9 @@ AXES = ("rx", "ry", "rz", "x", "y", "z")
 ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
 """Endings of a limb, with the number of their closure equations."""
 
+BASE = "base"
+"""Name of the base of a chain of stages."""
+
 MOST_LIMBS, MOST_JOINTS, MOST_ACTUATORS, MOST_PARAMETERS = 100, 50, 200, 2000
 """Largest numbers of limbs, joints of one limb, actuators and parameters."""
 
@@ -197,6 +200,8 @@ class Assembly:
     stored_parameters : names of the parameters that the controller of the machine stores, so that a
         calibration can be entered there; empty where they are not known.
     common_errors : errors that several parameters share.
+    stages : of a chain, each after the one that it is attached to; the fields above are those of
+        all stages together, with the name of the stage before the name of a limb or parameter.
     """
 
     name: str
@@ -213,6 +218,7 @@ class Assembly:
     source: str = ""
     stored_parameters: tuple[str, ...] = ()
     common_errors: tuple[CommonError, ...] = ()
+    stages: tuple[AttachedStage, ...] = ()
 
     @cached_property
     def limb_by_parameter(self) -> Mapping[str, str]:
@@ -229,14 +235,42 @@ class Assembly:
         return {name: next(iter(limbs)) for name, limbs in owners.items() if len(limbs) == 1}
 
 
-def check_assembly(assembly: Assembly) -> None:
-    """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError."""
+@dataclass(frozen=True)
+class AttachedStage:
+    """A stage of a chain: an assembly whose base is attached to the platform of another stage.
+
+    Attributes
+    ----------
+    name : unique in the chain. on : name of that other stage, BASE for the base of the chain.
+    mount : (4, 4) T_platform_base, from the base of this stage to the platform of the other [m].
+    assembly : of this stage alone, with its own names.
+    """
+
+    name: str
+    on: str
+    mount: FloatArray
+    assembly: Assembly
+
+
+def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:
+    """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError.
+
+    A stage that is a serial joint needs no controlled coordinates, because its joint is commanded.
+    """
     _check_size(assembly)
     _check_names(assembly)
     for limb in assembly.limbs:
         _check_limb(limb)
-    _check_freedoms(assembly)
+    _check_freedoms(assembly, is_stage)
     _check_ranges(assembly)
+
+
+def is_serial(assembly: Assembly) -> bool:
+    """Return whether the pose is the product of driven joints: one limb without passive joints."""
+    if assembly.stages or len(assembly.limbs) != 1 or len(assembly.freedoms) < len(AXES):
+        return False
+    (limb,) = assembly.limbs
+    return limb.ending == "rigid" and all(joint.actuator for joint in limb.joints)
 
 
 def _check_size(assembly: Assembly) -> None:
@@ -300,7 +334,7 @@ def _check_limb(limb: Limb) -> None:
         )
 
 
-def _check_freedoms(assembly: Assembly) -> None:
+def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
     """Refuse missing, unknown or duplicate freedoms and controlled coordinates."""
     freedoms = assembly.freedoms
     unknown = [f for f in freedoms if f not in AXES]
@@ -325,6 +359,8 @@ def _check_freedoms(assembly: Assembly) -> None:
             "all freedoms, and add a limb with the joint that holds it, such as {joint: U, axes: "
             "[x, y]} with the ending rigid"
         )
+    if is_stage and is_serial(assembly):
+        return
     if not assembly.controlled:
         raise MechanismError(
             f"{assembly.name} names no controlled coordinate; state one for each freedom, of "

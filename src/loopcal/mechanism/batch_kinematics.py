@@ -14,6 +14,7 @@ docs/theory/kinematics.md.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,9 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.stages.chain_inverse import inverse_stages
+from loopcal.mechanism.stages.chain_kinematics import multiply_signs, solve_stages
+from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import (
     Status,
     driven_values,
@@ -74,6 +78,8 @@ def forward_trials(
     """
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
+    if robot.stages:
+        return solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
     e, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
@@ -94,6 +100,8 @@ def close_at_joints(
     e : (t | 1, n_displacements). joints : (t | 1, n, n_joints) values of the driven joints, n > 0.
     """
     begin = clear_sign(robot, start or robot.home_state)
+    if robot.is_serial:
+        return solve_serial(robot, e, joints, begin.T.shape[:2])
     state = clear_sign(robot, engine.solve(robot.program, e, joints, begin, goal=goal))
     wrong = _find_wrong_rows(robot, state, begin)
     if not wrong.any():
@@ -131,6 +139,8 @@ def close_at_coordinates(
 ) -> State:
     """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states."""
     begin = start or robot.home_state
+    if robot.stages:
+        return inverse_stages(robot, values, target, begin, forward_trials, differentiate_pose)
     if count_shared_drives(robot.program):
         return _inverse_with_shared_drives(robot, values, target, begin)
     e, _ = robot.slots(values)
@@ -171,8 +181,13 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
     """Return the sign of the determinant of closure with locked actuators (t, n).
 
     It changes only at a singularity. A state with free actuators has another sign. With more
-    equations than freedoms the sign is 0.
+    equations than freedoms the sign is 0. The sign of a chain is the product of those of its
+    stages.
     """
+    if robot.stages:
+        return multiply_signs(robot, values, state, compute_closure_sign)
+    if robot.is_serial:
+        return np.ones(state.status.shape, np.int8)
     if not _is_square(robot):
         return np.zeros(state.status.shape, np.int8)
     e, _ = robot.slots(values)
@@ -200,6 +215,8 @@ def count_equations(program: Program, *, free: bool) -> int:
 
 def _is_square(robot: Mechanism) -> bool:
     """Return whether closure with locked actuators has as many equations as freedoms."""
+    if robot.stages:
+        return all(_is_square(stage.robot) for stage in robot.stages)
     return count_equations(robot.program, free=False) == len(robot.freedoms)
 
 

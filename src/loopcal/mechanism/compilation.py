@@ -13,7 +13,7 @@ from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb, check_assembly
+from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb, check_assembly
 from loopcal.mechanism.batch_kinematics import (
     compute_closure_sign,
     count_equations,
@@ -29,7 +29,10 @@ from loopcal.mechanism.mobility import (
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.possible_values import check_nominal_values
-from loopcal.mechanism.states import make_start
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.stages.chain_compilation import build_chain
+from loopcal.mechanism.stages.serial_limb import solve_serial
+from loopcal.mechanism.states import driven_values, make_start
 from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
 from loopcal.typing import IntArray
@@ -62,6 +65,21 @@ def build(
         freedoms that are too many or too few), coordinates that cannot be controlled.
     """
     check_assembly(assembly)
+    if assembly.stages:
+        return build_chain(assembly, units or {}, record, _build_stage, differentiate_pose)
+    return _compile(assembly, units, record)
+
+
+def _build_stage(stage: AttachedStage) -> Mechanism:
+    """Compile a stage of a chain; raises MechanismError."""
+    check_assembly(stage.assembly, is_stage=True)
+    return _compile(stage.assembly)
+
+
+def _compile(
+    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
+) -> Mechanism:
+    """Compile a checked mechanism of one stage; see `build`."""
     table = ParameterTable(assembly.parameters, assembly.common_errors)
     check_nominal_values(table)
     slots = _find_slots(assembly)
@@ -87,6 +105,8 @@ def build(
         tuple(_report_locked(assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]),
         record,
     )
+    if robot.is_serial and not robot.controlled:
+        return replace(robot, home_state=_place_at_start(robot))
     return check_mobility(replace(robot, home_state=_find_home(robot)))
 
 
@@ -302,6 +322,12 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
         for group in groups
     )
     return make_start(assembly.home[None, None], tuple(np.array([[rows]]) for rows in joints))
+
+
+def _place_at_start(robot: Mechanism) -> State:
+    """Return the state of a serial stage with every joint at its `start`."""
+    e, _ = robot.slots(robot.values[None])
+    return solve_serial(robot, e, driven_values(robot.program, robot.home_state))
 
 
 def _find_home(robot: Mechanism) -> State:

@@ -307,7 +307,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     flat = state.T.reshape(-1, 4, 4)
     _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)
-    if count_shared_drives(robot.program):
+    if robot.stages or count_shared_drives(robot.program):
         q = compute_readings(robot, values, state)
         D = differentiate_pose(robot, values, q, state).readings
         return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

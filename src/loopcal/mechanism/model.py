@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from loopcal.engine import Group, Program, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
-from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
+from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.parameter_units import ParameterUnits
 from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
@@ -117,6 +117,27 @@ class LimbMap:
     readings: Columns
 
 
+@dataclass(frozen=True)
+class Stage:
+    """A stage of a chain: a mechanism whose base is attached to the platform of another stage.
+
+    Attributes
+    ----------
+    name : of the stage. parent : the stage that it is attached to, -1 for the base of the chain.
+    mount : (4, 4) T_platform_base, from the base of this stage to the platform of its parent [m].
+    robot : this stage alone; its values are the nominal ones.
+    parameters, actuators, groups : places of its own among those of the chain.
+    """
+
+    name: str
+    parent: int
+    mount: FloatArray
+    robot: Mechanism
+    parameters: slice
+    actuators: slice
+    groups: slice
+
+
 @dataclass(frozen=True, repr=False)
 class Mechanism(TableResult):
     """A robot with closed loops, ready to compute.
@@ -131,6 +152,9 @@ class Mechanism(TableResult):
     home_state : engine state of the home pose.
     units : symbol of the display unit of every dimension.
     findings : remarks about the structure, such as locked joints or redundant constraints.
+    stages : of a chain, each behind its parent; the last one carries the end platform. The program
+        and the slots of a chain are those of all stages, one after the other; an engine computes
+        the stages one by one.
     """
 
     assembly: Assembly
@@ -143,6 +167,7 @@ class Mechanism(TableResult):
     units: Mapping[Dimension, str]
     findings: tuple[Finding, ...] = ()
     record: Any = None
+    stages: tuple[Stage, ...] = ()
 
     def plot(self) -> Figure:
         """Draw the robot at home: in the plane where it is planar, else in two views."""
@@ -216,6 +241,11 @@ class Mechanism(TableResult):
     def home(self) -> FloatArray:
         """T_base_platform (4, 4) of the home pose."""
         return self.home_state.T[0, 0]
+
+    @cached_property
+    def is_serial(self) -> bool:
+        """Whether the pose is the product of driven joints: one limb without passive joints."""
+        return is_serial(self.assembly)
 
     @cached_property
     def limb_maps(self) -> tuple[tuple[LimbMap, ...], ...]:

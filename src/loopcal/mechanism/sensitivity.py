@@ -22,6 +22,7 @@ from loopcal import engine
 from loopcal.engine import Block, State
 from loopcal.mechanism.model import Columns, LimbMap, Mechanism
 from loopcal.mechanism.parameter_units import ParameterUnits
+from loopcal.mechanism.stages.chain_kinematics import differentiate_end, differentiate_joints
 from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
@@ -57,6 +58,9 @@ def differentiate_pose(
     `columns` : the parameters and their units; all parameters in SI without it. Rows of singular
     states have infinities or NaN.
     """
+    if robot.stages:
+        whole = differentiate_end(robot, values, q, state, differentiate_pose, columns)
+        return PoseSensitivity(*whole)
     e, tau = robot.slots(values)
     joints = joints_from_readings(q, tau, robot.slots.frequency)
     chosen = robot.all_parameters if columns is None else columns
@@ -93,6 +97,9 @@ def differentiate_passive_joints(
     A locked joint (one that only spins its limb) has zeros.
     """
     names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
+    if robot.stages:
+        whole = differentiate_joints(robot, values, q, state, differentiate_passive_joints)
+        return PassiveSensitivity(names, *whole)
     parameters = np.zeros((t, n, len(names), len(robot.parameters)))
     readings = np.zeros((t, n, len(names), len(robot.actuators)))
     platform, freedoms = differentiate_pose(robot, values, q, state), list(robot.program.freedoms)

@@ -7,9 +7,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from loopcal import geometry
-from loopcal.engine import LENGTH, PITCH, Group, Program, State
+from loopcal.engine import Program, State
+from loopcal.mechanism.limb_frames import follow_limb
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.stages.chain_state import compute_stage_limb_frames
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
@@ -117,35 +118,15 @@ def compute_limb_frames(
     For each limb of the mechanism, in its order, an array (t, n, J + 2, 4, 4): T_base_link behind
     each link 0..J (the last one is the tip), then the attachment.
     """
+    if robot.stages:
+        return compute_stage_limb_frames(robot, values, state, compute_limb_frames)
     e, _ = robot.slots(values)
     frames: dict[int, FloatArray] = {}
     for group, joints in zip(robot.program.groups, state.joints, strict=True):
         displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
         for k, limb in enumerate(group.limbs):
-            frames[limb] = _follow_limb(group, k, displacements[:, k], joints[:, :, k], state.T)
+            chain, attachment = follow_limb(group, k, displacements[:, k], joints[:, :, k])
+            frames[limb] = np.stack(
+                [*(np.broadcast_to(f, state.T.shape) for f in chain), state.T @ attachment], axis=2
+            )
     return tuple(frames[i] for i in sorted(frames))
-
-
-def _follow_limb(
-    group: Group, k: int, displacements: FloatArray, joints: FloatArray, T: FloatArray
-) -> FloatArray:
-    """Return the frames of limb k for displacements (t, s) and joint values (t, n, J + 1)."""
-    move = np.zeros((len(displacements), len(group.joints) + 2, 6))
-    pitch = np.broadcast_to(group.pitch[k], (len(displacements), len(group.joints))).copy()
-    for slot, value in zip(group.slots, displacements.T, strict=True):
-        if slot.axis == PITCH:
-            pitch[:, slot.element] += value
-        elif slot.axis != LENGTH:
-            move[:, slot.element, slot.axis] += value
-    placed = group.links[k] @ geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
-    frames = [np.broadcast_to(placed[:, None, 0], T.shape)]
-    for j, letter in enumerate(group.joints):
-        value = joints[..., j]
-        if letter == "R":
-            angle, advance = value, pitch[:, None, j] * value
-        else:
-            angle, advance = np.zeros_like(value), value
-        z = np.stack([np.zeros_like(value), np.zeros_like(value), np.ones_like(value)], axis=-1)
-        motion = geometry.make_pose(geometry.exp_so3(angle[..., None] * z), advance[..., None] * z)
-        frames.append(frames[-1] @ motion @ placed[:, None, j + 1])
-    return np.stack([*frames, T @ placed[:, None, -1]], axis=2)

@@ -11,7 +11,7 @@ from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, lo
 from loopcal.mechanism import Mechanism, inverse
 
 LIMBS = tuple(
-    name for name in list_shipped_robots() if "family: limbs" in find_robot_file(name).read_text()
+    name for name in list_shipped_robots() if "\nfamily: limbs" in find_robot_file(name).read_text()
 )
 
 

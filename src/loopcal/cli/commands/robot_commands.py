@@ -36,8 +36,8 @@ from loopcal.cli.options.shared_options import (
 def new(
     family: str, output: Path, measurements: Path | None, force: bool, as_json: bool, **options: Any
 ) -> None:
-    """Write a robot file of FAMILY: gough, linear-delta, 3-prs, ru-pus-prs, limbs, or the name of a
-    shipped robot.
+    """Write a robot file of FAMILY: gough, linear-delta, 3-prs, ru-pus-prs, limbs, stages, or the
+    name of a shipped robot.
 
     The file contains a complete robot. Replace its numbers with your own. The options of the
     instrument are for --measurements.

@@ -62,7 +62,7 @@ def locate_measured_poses(problem: Problem) -> FloatArray | None:
     """
     robot = problem.free.robot
     passive = any(group.unknown_joints(False) for group in robot.program.groups)
-    if passive or len(robot.program.freedoms) < 6:
+    if robot.stages or passive or len(robot.program.freedoms) < 6:
         return None
     if problem.is_uncertain or len(problem.rows) != 1 or problem.nuisance is not None:
         return None

@@ -16,7 +16,7 @@ from loopcal.io.robot.identified_table import add_table
 from loopcal.io.robot.robot_file import format_robot, get_source, list_shipped_robots, write_robot
 from loopcal.mechanism import FAMILIES, Mechanism
 
-EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar"}
+EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar", "stages": "arm-6r"}
 """The shipped robot of a family that does not have the name of the family."""
 
 WIDTH = 120

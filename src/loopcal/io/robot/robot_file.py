@@ -36,6 +36,7 @@ from loopcal.io.robot.identified_table import (
     read_possible_values,
     remove_mark,
 )
+from loopcal.io.robot.stage_records import KEY, place_stages
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,
@@ -44,6 +45,8 @@ from loopcal.mechanism import (
     build,
     match_parameter_names,
 )
+from loopcal.mechanism.families.stages import Stages
+from loopcal.mechanism.stages.joined_assembly import StageError
 from loopcal.typing import FloatArray
 
 FORMAT = 1
@@ -106,6 +109,8 @@ def build_robot(file: YamlFile) -> Mechanism:
     content = {key: value for key, value in file.content.items() if key not in HEADER}
     with name_files(file.path):
         record = read_record(file, content, family, units)
+        if isinstance(record, Stages):
+            record = place_stages(file, record, units)
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
         robot = build(_assemble(record, file), symbols, origin)
@@ -233,6 +238,8 @@ def check_format(file: YamlFile, newest: int) -> None:
 def _read_family(file: YamlFile, known: Sequence[str]) -> str:
     """Return the family that a robot file names."""
     family = file.content.get("family")
+    if "family" not in file.content and KEY in file.content:
+        return Stages.family
     if "family" not in file.content:
         for key in file.content:
             if suggestion := suggest_names(key, ["family"]):
@@ -261,7 +268,10 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     """Return the assembly of a record; an unknown name in a list of parameters, and a common error
     that cannot be, are refused at their line.
     """
-    parameters = record.expand().parameters
+    try:
+        parameters = record.expand().parameters
+    except StageError as error:
+        raise file.error(str(error), (KEY, error.index)) from None
     names = [parameter.name for parameter in parameters]
     for key in ("fixed", "stored_parameters"):
         for i, pattern in enumerate(getattr(record, key)):

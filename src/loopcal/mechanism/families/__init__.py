@@ -20,6 +20,7 @@ FAMILIES: LazyRegistry[type[RobotRecord]] = LazyRegistry(
         "limbs": "loopcal.mechanism.families.limbs:Limbs",
         "linear-delta": "loopcal.mechanism.families.linear_delta:LinearDelta",
         "ru-pus-prs": "loopcal.mechanism.families.ru_pus_prs:RuPusPrs",
+        "stages": "loopcal.mechanism.families.stages:Stages",
     }
 )
 """Records by the name of their family, imported when a robot file names it."""

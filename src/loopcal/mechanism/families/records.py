@@ -262,8 +262,10 @@ class RobotRecord:
         parameters = tuple(
             replace(p, free=False) if p.name in fixed else p for p in expanded.parameters
         )
+        stored.update(expanded.stored_parameters)
         present = tuple(name for name in names if name in stored)
-        common = tuple(record.resolve(parameters) for record in self.common_errors)
+        own = (record.resolve(parameters) for record in self.common_errors)
+        common = (*expanded.common_errors, *own)
         titles = [error.name for error in common]
         if duplicate := [title for title in titles if titles.count(title) > 1]:
             raise MechanismError(

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chains of stages: serial joints and closed loops, each on the platform of another stage.
+
+A stage is a serial joint (`joint:`) or a robot of any other family (`family:` and its keys). Its
+base is the platform of the stage before it, or of the stage that `on:` names, moved by `mount:`.
+How to write such a file: docs/robots.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from loopcal.errors import MechanismError
+from loopcal.mechanism.assembly import (
+    AXES,
+    Actuator,
+    Address,
+    Assembly,
+    AttachedStage,
+    Joint,
+    LinearMap,
+)
+from loopcal.mechanism.families.error_models import (
+    ErrorModel,
+    displacement_error,
+    get_axis_dimension,
+    join_errors,
+    offset_error,
+    single_error,
+)
+from loopcal.mechanism.families.limb_placement import JointPlacement, PlacedLimb, place_limb
+from loopcal.mechanism.families.limb_records import (
+    ORIGIN,
+    Axis,
+    Freedom,
+    LinkTolerances,
+    Place,
+    axis_vector,
+    matrix_from_place,
+)
+from loopcal.mechanism.families.records import (
+    AngleTolerance,
+    LengthTolerance,
+    PoseRecord,
+    RatioTolerance,
+    RobotRecord,
+    standard_deviation,
+)
+from loopcal.mechanism.stages.joined_assembly import StageError, check_stage_names, join_stages
+from loopcal.units import Angle, Dimension, Length, Ratio
+
+JointError = Literal[Freedom, "offset", "gain"]
+LIMB, LINK = "serial", "joint"
+"""Names of the limb and of the joint of a serial stage."""
+
+
+@dataclass(frozen=True)
+class SerialRotation:
+    """A driven rotary joint as a stage of its own.
+
+    Attributes
+    ----------
+    at : where it is on the platform that carries it. axis : direction in the placed frame.
+    tip : platform of this stage in the placed frame, at joint value zero.
+    drive : name of its actuator; default: the name of the stage.
+    start : reading at home. stroke : allowed readings. gain : joint value per reading.
+    sigma : standard deviation of the reading.
+    errors : its unknowns: displacements of the placed frame, the `offset` of the joint, its `gain`.
+    platform_errors : unknown displacements of the platform of this stage.
+    length, angle, ratio : tolerances of these unknowns.
+    """
+
+    kind: Literal["R"]
+    at: Place = ORIGIN
+    axis: Axis = "z"
+    tip: Place = ORIGIN
+    drive: str = ""
+    start: Angle = 0.0
+    stroke: tuple[Angle, Angle] | None = None
+    gain: Ratio = 1.0
+    sigma: Angle | None = None
+    errors: tuple[JointError, ...] = ()
+    platform_errors: tuple[Freedom, ...] = ()
+    length: LengthTolerance | None = None
+    angle: AngleTolerance | None = None
+    ratio: RatioTolerance | None = None
+
+
+@dataclass(frozen=True)
+class SerialSlide:
+    """A driven slide as a stage of its own; keys as those of a rotary joint."""
+
+    kind: Literal["P"]
+    at: Place = ORIGIN
+    axis: Axis = "z"
+    tip: Place = ORIGIN
+    drive: str = ""
+    start: Length = 0.0
+    stroke: tuple[Length, Length] | None = None
+    gain: Ratio = 1.0
+    sigma: Length | None = None
+    errors: tuple[JointError, ...] = ()
+    platform_errors: tuple[Freedom, ...] = ()
+    length: LengthTolerance | None = None
+    angle: AngleTolerance | None = None
+    ratio: RatioTolerance | None = None
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """A stage: a serial joint, or a robot of another family with the keys of that family.
+
+    Attributes
+    ----------
+    on : the stage whose platform carries it, or `base`; default: the previous stage.
+    mount : its base on that platform. joint : a serial joint. family : of any other stage.
+    """
+
+    OTHER_KEYS: ClassVar[bool] = True
+
+    name: str
+    on: str | None = None
+    mount: PoseRecord = field(default_factory=PoseRecord)
+    joint: SerialRotation | SerialSlide | None = None
+    family: str | None = None
+
+
+@dataclass(frozen=True)
+class Stages(RobotRecord):
+    """The file of a chain of stages.
+
+    Attributes
+    ----------
+    controlled : coordinates of the end platform in which the robot is commanded, one for each
+        actuator that moves it. stages : from the base on; the last one carries the end platform.
+    tolerances : of the unknowns of serial joints that state none.
+    """
+
+    family = "stages"
+
+    controlled: tuple[str, ...] = ()
+    stages: tuple[StageRecord, ...] = ()
+    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
+
+    def expand(self) -> Assembly:
+        """Refuse: the robots of the stages are not known, see `PlacedStages`."""
+        raise TypeError("a chain is expanded with the records of its stages")
+
+
+@dataclass(frozen=True)
+class PlacedStages(Stages):
+    """A chain with the records of its stages.
+
+    robots : of every stage, None for a serial joint.
+    """
+
+    robots: tuple[RobotRecord | None, ...] = ()
+
+    def expand(self) -> Assembly:
+        """Return the assembly of all stages.
+
+        Raises
+        ------
+        StageError
+            Names that do not fit together, a stage without actuators, a drive of two stages.
+        MechanismError
+            A stage that cannot be expanded.
+        """
+        if self.home != PoseRecord():
+            raise MechanismError(
+                f"{self.name} states `home:`, but the home of a chain is that of its stages; state "
+                "`start:` of a joint or `home:` of a stage"
+            )
+        names = [stage.name for stage in self.stages]
+        parents = check_stage_names(names, [stage.on for stage in self.stages])
+        attached = tuple(
+            AttachedStage(stage.name, on, stage.mount.matrix, self._expand_stage(i))
+            for i, (stage, on) in enumerate(zip(self.stages, parents, strict=True))
+        )
+        assembly = join_stages(
+            self.name,
+            attached,
+            controlled=self.controlled,
+            tool=self.tool.matrix,
+            workspace=dict(self.workspace.ranges),
+            source=self.source,
+        )
+        if not assembly.parameters:
+            raise MechanismError(
+                f"{self.name} names no unknown; give a joint 'errors:', or a stage unknowns of its "
+                "family"
+            )
+        return assembly
+
+    def _expand_stage(self, i: int) -> Assembly:
+        """Return the assembly of a stage alone."""
+        stage, robot = self.stages[i], self.robots[i]
+        if stage.joint is not None:
+            joint = replace(
+                stage.joint,
+                length=stage.joint.length or self.tolerances.lengths,
+                angle=stage.joint.angle or self.tolerances.angles,
+            )
+            return expand_joint(stage.name, joint)
+        if robot is None:
+            raise StageError(
+                f"stage {stage.name!r} is neither a joint nor a robot; write 'joint:', or "
+                "'family:' with the keys of that family",
+                i,
+            )
+        if robot.tool != PoseRecord():
+            raise StageError(
+                f"stage {stage.name!r} states a tool; state it for the whole robot, or as the "
+                "mount of the next stage",
+                i,
+            )
+        try:
+            return robot.assembly()
+        except MechanismError as error:
+            raise StageError(f"stage {stage.name!r}: {error}", i) from None
+
+
+def expand_joint(name: str, record: SerialRotation | SerialSlide) -> Assembly:
+    """Return the assembly of a serial joint: one rigid limb with one driven joint."""
+    drive, rotates = record.drive or name, isinstance(record, SerialRotation)
+    dimension = Dimension.ANGLE if rotates else Dimension.LENGTH
+    joint = Joint(LINK, record.kind, drive, start=record.gain * record.start)
+    step = JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
+    limb = place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
+    actuator = Actuator(drive, dimension, record.stroke, {"gain": record.gain}, sigma=record.sigma)
+    errors = join_errors(
+        (
+            *(_joint_error(record, limb, drive, error) for error in record.errors),
+            *(
+                displacement_error(
+                    f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis)
+                )
+                for axis in record.platform_errors
+            ),
+        )
+    )
+    return Assembly(
+        name, (limb.limb,), (actuator,), AXES, (), np.eye(4), errors.parameters, errors.maps
+    )
+
+
+def _joint_error(
+    record: SerialRotation | SerialSlide, limb: PlacedLimb, drive: str, error: str
+) -> ErrorModel:
+    """Return one unknown of a serial joint."""
+    if error == "gain":
+        gain = LinearMap(error, Address(drive, "transmission", error))
+        sd = standard_deviation(record.ratio, error)
+        return single_error(error, Dimension.RATIO, record.gain, sd, gain, positive=True)
+    if error == "offset":
+        dimension = Dimension.ANGLE if record.kind == "R" else Dimension.LENGTH
+        tolerance = record.angle if record.kind == "R" else record.length
+        return offset_error(error, drive, dimension, 0.0, standard_deviation(tolerance, error))
+    place = limb.placements[LINK]
+    nominal = 0.0
+    if error in AXES[3:]:
+        nominal = float((place[:3, :3].T @ place[:3, 3])["xyz".index(error)])
+    return displacement_error(error, limb, LINK, error, _tolerance(record, error), nominal)
+
+
+def _tolerance(record: SerialRotation | SerialSlide, axis: str) -> float | None:
+    """Return the tolerance of a displacement along or about an axis."""
+    turns = get_axis_dimension(axis) is Dimension.ANGLE
+    return standard_deviation(record.angle if turns else record.length, axis)

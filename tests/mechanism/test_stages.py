@@ -1,0 +1,405 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chains of stages: their kinematics agree with closed forms and solvers that are written here."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from loopcal import geometry
+from loopcal.errors import FileError, MechanismError
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    compute_limb_frames,
+    differentiate_passive_joints,
+    differentiate_pose,
+    forward,
+    forward_trials,
+    inverse,
+    sample_workspace,
+)
+from tests.jacobians import check_jacobian
+from tests.zoo import load_cached_robot
+
+Array = NDArray[np.float64]
+CHAINS = ("arm-6r", "excavator", "tricept")
+
+HEAD = """format: 1
+family: stages
+name: chain
+units: {length: mm, angle: deg}
+"""
+
+
+def load_text(folder: Path, text: str) -> Mechanism:
+    """Return the robot of a file whose text follows the header."""
+    path = folder / "chain.yaml"
+    path.write_text(HEAD + text, "utf-8")
+    return load_robot(path)
+
+
+def draw_readings(machine: Mechanism, n: int, seed: int) -> Array:
+    """Draw readings (n, a) evenly from the strokes."""
+    low, high = np.array([a.stroke for a in machine.actuators]).T
+    return np.random.default_rng(seed).uniform(low, high, (n, len(low)))
+
+
+def draw_values(machine: Mechanism, seed: int) -> Array:
+    """Draw values (p,) of all parameters by their tolerances."""
+    errors = np.random.default_rng(seed).standard_normal(len(machine.parameters))
+    return machine.parameters.nominal + errors * machine.parameters.tolerance
+
+
+# --- 6R arm: Denavit-Hartenberg
+
+# a [m], alpha [rad], d [m], offset of theta [rad], in the convention of Denavit and Hartenberg:
+# Rz(theta) Tz(d) Tx(a) Rx(alpha)
+RIGHT = np.pi / 2
+DENAVIT_HARTENBERG = (
+    (0.160, -RIGHT, 0.520, 0.0),
+    (0.580, 0.0, 0.0, -RIGHT),
+    (0.125, -RIGHT, 0.0, 0.0),
+    (0.0, RIGHT, 0.620, 0.0),
+    (0.0, -RIGHT, 0.0, 0.0),
+    (0.0, 0.0, 0.100, 0.0),
+)
+FLANGE = np.array([[0, 0, 1.0], [0, -1.0, 0], [1.0, 0, 0]])
+"""Orientation of the platform in the last frame, whose z axis is that of the last joint."""
+
+
+def multiply_denavit_hartenberg(q: Array) -> Array:
+    """Return the end poses (n, 4, 4) of readings (n, 6)."""
+    poses = []
+    for row in q:
+        T = np.eye(4)
+        for (a, alpha, d, offset), angle in zip(DENAVIT_HARTENBERG, row, strict=True):
+            ct, st = np.cos(angle + offset), np.sin(angle + offset)
+            ca, sa = np.cos(alpha), np.sin(alpha)
+            T = T @ np.array(
+                [
+                    [ct, -st * ca, st * sa, a * ct],
+                    [st, ct * ca, -ct * sa, a * st],
+                    [0.0, sa, ca, d],
+                    [0.0, 0.0, 0.0, 1.0],
+                ]
+            )
+        T[:3, :3] = T[:3, :3] @ FLANGE
+        poses.append(T)
+    return np.array(poses)
+
+
+def test_arm_agrees_with_denavit_hartenberg_products() -> None:
+    arm = load_cached_robot("arm-6r")
+    q = draw_readings(arm, 1000, seed=1)
+    # [1, m] rounding of some twenty products of numbers up to 1.4
+    np.testing.assert_allclose(
+        forward(arm, q).T, multiply_denavit_hartenberg(q), rtol=0, atol=1e-12
+    )
+
+
+# --- excavator: triangles
+
+
+def rotate_about_y(angle: float, x: float = 0.0, z: float = 0.0) -> Array:
+    """Return a rotation about y behind a translation in the x-z plane."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s, x], [0, 1.0, 0, 0], [-s, 0, c, z], [0, 0, 0, 1.0]])
+
+
+def solve_triangle(foot: tuple[float, float], head: tuple[float, float], length: float) -> Array:
+    """Return both angles about y of a link whose point `head` has this distance from `foot`.
+
+    Points (x, z) are counted from the pin. Law of cosines; a rotation about y turns x towards -z,
+    so that it is subtracted from the angle of the head.
+    """
+    a, b = np.hypot(*foot), np.hypot(*head)
+    opening = np.arccos((a**2 + b**2 - length**2) / (2 * a * b))
+    between = np.arctan2(head[1], head[0]) - np.arctan2(foot[1], foot[0])
+    return between + np.array([opening, -opening])
+
+
+LINKS = (
+    # mount (x, z), foot, head [m], angle at home [deg]
+    ((0.1, 1.8), (0.6, -0.4), (2.3, 0.35), -45.0),
+    ((5.7, 0.0), (-2.7, 0.9), (-0.8, 0.2), 75.0),
+    ((2.9, 0.0), (-2.2, 0.5), (-0.3, 0.45), 30.0),
+)
+
+
+def multiply_triangles(q: Array) -> Array:
+    """Return the end poses (n, 4, 4) of an excavator at readings (n, 4), by the law of cosines."""
+    poses = []
+    for slew, *lengths in q:
+        T = np.eye(4)
+        T[:2, :2] = [[np.cos(slew), -np.sin(slew)], [np.sin(slew), np.cos(slew)]]
+        for (mount, foot, head, home), length in zip(LINKS, lengths, strict=True):
+            angles = solve_triangle(foot, head, length)
+            turns = np.abs(np.angle(np.exp(1j * (angles - np.deg2rad(home)))))
+            T = T @ rotate_about_y(angles[turns.argmin()], *mount)
+        poses.append(T)
+    return np.array(poses)
+
+
+def test_excavator_agrees_with_the_law_of_cosines() -> None:
+    machine = load_cached_robot("excavator")
+    q = sample_workspace(machine, 200, seed=1).solution.q
+    back = forward(machine, q)
+    assert back.converged.all()
+    np.testing.assert_allclose(back.T, multiply_triangles(q), rtol=0, atol=1e-9 * machine.size)
+
+
+# --- Tricept: a constraint solver
+
+
+def solve_tricept(q: Array) -> Array:
+    """Return the end pose (4, 4) at readings (6,): tilts and length of the guide that fit the legs.
+
+    [m, rad] of the guide, by least squares on the lengths of the legs.
+    """
+    turns = np.deg2rad([0.0, 120.0, 240.0])
+    around = np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=1)
+
+    def place_platform(x: Array) -> Array:
+        R = geometry.exp_so3(np.array([x[0], 0, 0])) @ geometry.exp_so3(np.array([0, x[1], 0]))
+        return geometry.make_pose(R, R @ np.array([0, 0, x[2]]))
+
+    def miss_lengths(x: Array) -> Array:
+        T = place_platform(x)
+        heads = 0.2 * around @ T[:3, :3].T + T[:3, 3]
+        return np.linalg.norm(heads - 0.5 * around, axis=1) - q[:3]
+
+    solved = least_squares(miss_lengths, [0.0, 0.0, 1.2], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    T = place_platform(solved.x)
+    for angle, axis, shift in ((q[3], 2, 0.15), (q[4], 1, 0.0), (q[5], 2, 0.0)):
+        step = geometry.make_pose(
+            geometry.exp_so3(angle * np.eye(3)[axis]), np.array([0, 0, shift])
+        )
+        T = T @ step
+    return T @ geometry.make_pose(np.eye(3), np.array([0, 0, 0.12]))
+
+
+def test_tricept_agrees_with_a_constraint_solver() -> None:
+    machine = load_cached_robot("tricept")
+    q = sample_workspace(machine, 50, seed=1).solution.q
+    back = forward(machine, q)
+    assert back.converged.all()
+    known = np.array([solve_tricept(row) for row in q])
+    np.testing.assert_allclose(back.T, known, rtol=0, atol=1e-9 * machine.size)
+
+
+# --- every chain, with errors of all parameters
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_forward_after_inverse_returns_the_pose_of_a_chain_with_errors(name: str) -> None:
+    machine = load_cached_robot(name)
+    other = machine.with_values(draw_values(machine, seed=2))
+    wanted = sample_workspace(machine, 100, seed=2).coordinates
+    there = inverse(other, wanted)
+    back = forward(other, there.q)
+    assert there.converged.all()
+    assert back.converged.all()
+    np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-9 * machine.size)
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_each_trial_of_a_batch_equals_its_own_solution(name: str) -> None:
+    machine = load_cached_robot(name)
+    wanted = sample_workspace(machine, 5, seed=3).coordinates
+    values = np.stack([draw_values(machine, seed) for seed in (3, 4)])
+    q = inverse(machine, wanted).q
+    together = forward_trials(machine, values, q[None])
+    D = differentiate_pose(machine, values, q[None], together).parameters
+    for trial, own in enumerate(values):
+        alone = forward(machine.with_values(own), q)
+        np.testing.assert_array_equal(together.T[trial], alone.T)
+        single = differentiate_pose(machine, own[None], q[None], alone.state).parameters
+        np.testing.assert_allclose(D[trial], single[0], rtol=0, atol=1e-12)
+
+
+def test_passive_joints_of_a_stage_are_differentiated_by_its_own_parameters() -> None:
+    machine = load_cached_robot("excavator")
+    values, q = draw_values(machine, 5), sample_workspace(machine, 1, seed=5).solution.q
+    state = forward_trials(machine, values[None], q[None])
+    known = differentiate_passive_joints(machine, values[None], q[None], state)
+    assert known.names == ("boom.hinge.pin", "stick.hinge.pin", "bucket.hinge.pin")
+
+    def read_pins(x: Array) -> Array:
+        moved = forward_trials(machine, x, q[None], state)
+        return np.stack([moved.joints[g][:, 0, 0, 0] for g in (1, 3, 5)], axis=-1)
+
+    scale = np.where(machine.parameters.nominal != 0, 0.5, 0.05)
+    check_jacobian(
+        read_pins,
+        known.parameters[0, 0],
+        values,
+        scale=scale,
+        atol=1e-9,
+        atol_reason="[rad] Newton's own accuracy over the smallest step",
+        is_batched=True,
+    )
+    own = [name.startswith("stick.") for name in machine.parameters.names]
+    assert (known.parameters[0, 0, 1] != 0).any()
+    assert not (known.parameters[0, 0, 1] != 0)[~np.array(own)].any()
+
+
+def test_frames_of_limbs_are_those_of_their_stages_in_the_base() -> None:
+    machine = load_cached_robot("excavator")
+    solution = sample_workspace(machine, 3, seed=6).solution
+    frames = compute_limb_frames(machine, machine.values[None], solution.state)
+    names = [limb.name for limb in machine.assembly.limbs]
+    # a cylinder is as long as its reading, wherever its stage is
+    for reading, name in zip(
+        solution.q.T[1:], ("boom.cylinder", "stick.cylinder", "bucket.cylinder"), strict=True
+    ):
+        ends = frames[names.index(name)][0, :, -2:, :3, 3]
+        np.testing.assert_allclose(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), reading)
+    # the last pin is where the platform is
+    pin = frames[names.index("bucket.hinge")][0, :, 0, :3, 3]
+    np.testing.assert_allclose(pin, solution.T[:, :3, 3], atol=1e-12)
+
+
+def test_names_of_parameters_limbs_and_joints_begin_with_their_stage() -> None:
+    machine = load_cached_robot("tricept")
+    assert {name.split(".")[0] for name in machine.parameters.names} == {"head", "w1", "w2", "w3"}
+    assert "head.leg2.offset" in machine.parameters.names
+    assert machine.assembly.limbs[0].name == "head.leg1"
+    assert [a.name for a in machine.actuators] == ["leg1", "leg2", "leg3", "w1", "w2", "w3"]
+
+
+# --- inverse kinematics
+
+
+def test_inverse_kinematics_of_an_arm_keeps_the_elbow_of_its_start() -> None:
+    arm = load_cached_robot("arm-6r")
+    wanted = sample_workspace(arm, 20, seed=7).solution.T
+    up = inverse(arm, wanted)
+    folded = forward(arm, [[0.2, 1.3, -1.9, 0.3, 0.9, 0.1]])
+    down = inverse(arm, wanted, start=folded)
+    assert up.converged.all()
+    assert down.converged.all()
+    # the elbow is on one side of its stretched position in all of them, and on the other side here
+    stretched = -np.arctan2(0.620, 0.125)
+    assert (up.q[:, 2] + np.pi / 2 > stretched + np.pi / 2).all()
+    assert (down.q[:, 2] < stretched).all()
+    np.testing.assert_allclose(down.T, up.T, rtol=0, atol=1e-9)
+
+
+def test_poses_out_of_reach_are_marked_and_cost_no_exception() -> None:
+    arm = load_cached_robot("arm-6r")
+    far = np.repeat(arm.home[None], 3, axis=0)
+    far[:, 0, 3] += [0.0, 2.0, np.nan]
+    solution = inverse(arm, far)
+    assert solution.status.tolist() == [Status.CONVERGED, Status.UNREACHABLE, Status.NOT_FINITE]
+    assert solution.residual[1] > 0.5
+
+
+# --- files
+
+ARM = """controlled: [x, y]
+stages:
+  - name: shoulder
+    joint: {kind: R, start: 20, errors: [offset]}
+  - name: elbow
+    mount: {x: 300}
+    joint: {kind: R, start: 60, tip: [200, 0, 0], errors: [x, offset]}
+"""
+
+
+def test_a_chain_of_two_joints_is_read_from_its_file(tmp_path: Path) -> None:
+    arm = load_text(tmp_path, ARM)
+    q = np.array([[0.3, 0.9]])
+    x = 0.3 * np.cos(0.3) + 0.2 * np.cos(1.2)
+    y = 0.3 * np.sin(0.3) + 0.2 * np.sin(1.2)
+    np.testing.assert_allclose(forward(arm, q).T[0, :2, 3], [x, y], atol=1e-15)
+    assert arm.parameters.names == ("shoulder.offset", "elbow.x", "elbow.offset")
+    np.testing.assert_allclose(inverse(arm, [[x, y]]).q, q, atol=1e-12)
+
+
+def test_a_stage_on_a_named_one_branches_off_it(tmp_path: Path) -> None:
+    text = ARM.replace("controlled: [x, y]", "controlled: [x]") + (
+        "  - {name: finger, on: shoulder, mount: {x: 100}, joint: {kind: R, start: 70, "
+        "tip: [50, 0, 0]}}\n"
+    )
+    text = text.replace("controlled: [x]", "controlled: [x, y]")
+    machine = load_text(tmp_path, text)
+    q = np.array([[0.3, 0.9, 0.5]])
+    x = 0.1 * np.cos(0.3) + 0.05 * np.cos(0.8)
+    np.testing.assert_allclose(forward(machine, q).T[0, 0, 3], x, atol=1e-15)
+    # the elbow does not carry the end platform: it moves nothing, and keeps its reading
+    D = differentiate_pose(machine, machine.values[None], q[None], forward(machine, q).state)
+    assert not D.readings[..., 1].any()
+    there = inverse(machine, forward(machine, q).T[:, :2, 3])
+    assert there.q[0, 1] == pytest.approx(np.deg2rad(60))
+    np.testing.assert_allclose(there.q[0, [0, 2]], q[0, [0, 2]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "sentence"),
+    [
+        ("mount:", "on: shoulde\n    mount:", 9, "'shoulde', which is not a stage"),
+        (
+            "    joint: {kind: R, start: 20",
+            "    on: elbow\n    joint: {kind: R, start: 20",
+            7,
+            "form a cycle: shoulder on elbow on shoulder",
+        ),
+        ("name: elbow", "name: elbow\n    on: elbow", 9, "form a cycle: elbow on elbow"),
+        ("start: 60", "start: 60, drive: shoulder", 9, "drives the stages 'shoulder' and 'elbow'"),
+        ("name: elbow", "name: shoulder", 9, "two stages are called 'shoulder'"),
+        ("name: elbow", "name: base", 9, "cannot be called 'base'"),
+        ("kind: R, start: 60", "kind: X, start: 60", 11, "joint.kind' is 'X'"),
+        ("mount: {x: 300}", "mounted: {x: 300}", 10, "unknown key 'mounted'"),
+        ("mount: {x: 300}", "family: limbs", 9, "states both 'joint' and 'family'"),
+        ("mount: {x: 300}", "mount: {u: 300}", 10, "unknown key 'u'"),
+    ],
+)
+def test_impossible_stages_are_refused_at_their_line(
+    tmp_path: Path, old: str, new: str, line: int, sentence: str
+) -> None:
+    assert old in ARM
+    with pytest.raises(FileError, match=sentence) as error:
+        load_text(tmp_path, ARM.replace(old, new, 1))
+    assert error.value.line == line
+    assert "\n" not in str(error.value)
+
+
+def test_a_stage_is_listed_behind_the_one_that_carries_it(tmp_path: Path) -> None:
+    text = ARM.replace("name: shoulder", "name: shoulder\n    on: elbow")
+    with pytest.raises(FileError, match="list 'elbow' first"):
+        load_text(tmp_path, text.replace("name: elbow", "name: elbow\n    on: base"))
+
+
+def test_a_stage_without_actuators_is_refused(tmp_path: Path) -> None:
+    stage = """  - name: link
+    family: limbs
+    controlled: [yaw]
+    limbs:
+      - {name: pin, ending: rigid, chain: [{joint: R, name: pin}], errors: [{of: pin, shift: [x]}]}
+"""
+    with pytest.raises(FileError, match="stage 'link' has no actuators") as error:
+        load_text(tmp_path, ARM + stage)
+    assert error.value.line == 12
+
+
+def test_more_actuators_than_coordinates_are_refused(tmp_path: Path) -> None:
+    more = ARM + "  - {name: wrist, joint: {kind: R, tip: [50, 0, 0]}}\n"
+    with pytest.raises(MechanismError, match=r"3 actuators .* 2 controlled coordinates"):
+        load_text(tmp_path, more)
+
+
+def test_a_stretched_home_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MechanismError, match="at home its actuators set only 1 of the coordinates"):
+        load_text(tmp_path, ARM.replace("start: 60", "start: 0"))
+
+
+def test_an_error_of_a_stage_names_it(tmp_path: Path) -> None:
+    stage = """  - name: loop
+    family: five-bar
+"""
+    with pytest.raises(FileError, match="'five-bar' is not a family of a stage"):
+        load_text(tmp_path, ARM + stage)
