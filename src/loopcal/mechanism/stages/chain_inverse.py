@@ -130,9 +130,7 @@ class _Rows:
         state = self.solve(robot, self.values, shown, begin, follow=False)
         ok = (state.status == CONVERGED).ravel()
         none = ParameterUnits(robot.slots, np.zeros(0, np.int64), np.zeros(0))
-        D = differentiate_end(
-            robot, self.values, shown, state, self.differentiate, none
-        ).readings
+        D = differentiate_end(robot, self.values, shown, state, self.differentiate, none).readings
         T = state.T.reshape(-1, 4, 4)
         residual, columns = compare_coordinates(T, self.target, robot.controlled, robot.size)
         moving = find_carrying_actuators(robot)
@@ -150,7 +148,8 @@ class _Rows:
         robot = self.robot
         _, tau = robot.slots(self.values)
         frequency = robot.slots.frequency
-        slopes = joint_slopes(np.expand_dims(q, 1 - self.axis), tau, frequency).reshape(q.shape)
+        shown = np.expand_dims(q, 1 - self.axis)
+        slopes = np.broadcast_to(joint_slopes(shown, tau, frequency), shown.shape).reshape(q.shape)
         length = np.abs(step * slopes) / _find_joint_units(robot)
         longest = np.maximum(length.max(axis=1, initial=0.0), LONGEST_STEP)
         return step * (LONGEST_STEP / longest)[:, None]

@@ -180,9 +180,7 @@ def differentiate_platform_entries(
     A column r of the rotation moves by omega x r, the origin by v.
     """
     i = [stage.name for stage in robot.stages].index(name)
-    twist = _differentiate_platform(
-        robot, values, q, state, differentiate, robot.all_parameters, i
-    )
+    twist = _differentiate_platform(robot, values, q, state, differentiate, robot.all_parameters, i)
     slope = differentiate_entries(get_platforms(robot, state)[i])
     return Derivatives(*(slope @ part for part in twist))
 
