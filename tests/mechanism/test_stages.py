@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chains of stages: their kinematics agree with closed forms and solvers that are written here."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,12 @@ from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import (
     Mechanism,
     Status,
+    analyze_singularity,
     compute_limb_frames,
     differentiate_passive_joints,
     differentiate_pose,
+    find_assembly_modes,
+    find_working_modes,
     forward,
     forward_trials,
     inverse,
@@ -298,6 +302,42 @@ def test_poses_out_of_reach_are_marked_and_cost_no_exception() -> None:
     assert solution.residual[1] > 0.5
 
 
+@pytest.mark.slow
+def test_an_arm_with_a_spherical_wrist_has_eight_working_modes() -> None:
+    """Shoulder, elbow and wrist have two each; Pieper 1968."""
+    arm = load_cached_robot("arm-6r")
+    wanted = sample_workspace(arm, 1, seed=8)
+    modes = find_working_modes(arm, wanted.coordinates[0], patience=1)
+    assert len(modes) == 8
+    back = forward(arm, modes.solution.q)
+    np.testing.assert_allclose(back.T, np.tile(wanted.solution.T, (8, 1, 1)), atol=1e-9)
+
+
+def test_each_triangle_of_an_excavator_doubles_the_assembly_modes() -> None:
+    machine = load_cached_robot("excavator")
+    q = sample_workspace(machine, 1, seed=8).solution.q
+    modes = find_assembly_modes(machine, q[0], patience=1)
+    expected = [
+        solve_triangle(foot, head, length)
+        for (_, foot, head, _), length in zip(LINKS, q[0, 1:], strict=True)
+    ]
+    pitch = np.array([sum(angles) for angles in product(*expected)])
+    normals = modes.solution.T[:, 2, 0]  # of the x axis of the bucket: -sin(pitch)
+    np.testing.assert_allclose(np.sort(normals), np.sort(-np.sin(pitch)), atol=1e-9)
+
+
+def test_margins_of_a_chain_vanish_where_its_arm_is_stretched() -> None:
+    arm = load_cached_robot("arm-6r")
+    elbow = -np.arctan2(0.620, 0.125)
+    bends = np.deg2rad([60.0, 6.0, 0.6])
+    path = forward(arm, [[0.2, 0.6, elbow + bend, 0.3, 0.9, 0.1] for bend in bends])
+    near = analyze_singularity(arm, path)
+    ratio = near.drive_margin[1:] / near.drive_margin[:-1]
+    np.testing.assert_allclose(ratio, 0.1, rtol=0.15)  # in proportion to a small bend
+    assert near.is_near.tolist() == [False, True, True]
+    assert near.margin.tolist() == [1.0, 1.0, 1.0]
+
+
 # --- files
 
 ARM = """controlled: [x, y]
@@ -384,6 +424,11 @@ def test_a_stage_without_actuators_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="stage 'link' has no actuators") as error:
         load_text(tmp_path, ARM + stage)
     assert error.value.line == 12
+
+
+def test_a_chain_without_stages_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="there are no stages"):
+        load_text(tmp_path, "controlled: [x]\n")
 
 
 def test_more_actuators_than_coordinates_are_refused(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from loopcal.mechanism.batch_kinematics import (
 )
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.stages.chain_kinematics import judge_stage_modes
 from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_poses
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -71,8 +72,13 @@ def judge_modes(robot: Mechanism, state: State, begin: State) -> tuple[State, Bo
     The engine proves for most rows that their readings lead to their pose, which gives their sign,
     too. For the others the sign is computed. Forward kinematics accepts no solution of another
     sign, so rows of another sign are not solved. It ends where it comes close to the pose of the
-    state, to which it would converge.
+    state, to which it would converge. A chain is in another mode where a stage is; a serial limb
+    has one pose for its readings.
     """
+    if robot.stages:
+        return judge_stage_modes(robot, state, begin, judge_modes)
+    if robot.is_serial:
+        return state, np.zeros(state.T.shape[1], bool)
     e, _ = robot.slots(robot.values[None])
     begin, n = clear_sign(robot, begin), state.T.shape[1]
     closed = state.status[0] == Status.CONVERGED

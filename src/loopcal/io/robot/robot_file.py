@@ -36,7 +36,6 @@ from loopcal.io.robot.identified_table import (
     read_possible_values,
     remove_mark,
 )
-from loopcal.io.robot.stage_records import KEY, place_stages
 from loopcal.mechanism import (
     FAMILIES,
     Assembly,
@@ -45,12 +44,13 @@ from loopcal.mechanism import (
     build,
     match_parameter_names,
 )
-from loopcal.mechanism.families.stages import Stages
 from loopcal.mechanism.stages.joined_assembly import StageError
 from loopcal.typing import FloatArray
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
+KEY = "stages"
+"""The key of the list of stages, and the name of the family of chains."""
 WHAT = "robot file"
 
 PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
@@ -105,11 +105,13 @@ def build_robot(file: YamlFile) -> Mechanism:
     """Build the robot that a robot file describes; raise as `load_robot`."""
     check_format(file, FORMAT)
     units = read_units(file)
-    family = FAMILIES[_read_family(file, sorted(FAMILIES))]
+    name = _read_family(file, sorted(FAMILIES))
     content = {key: value for key, value in file.content.items() if key not in HEADER}
     with name_files(file.path):
-        record = read_record(file, content, family, units)
-        if isinstance(record, Stages):
+        record = read_record(file, content, FAMILIES[name], units)
+        if name == KEY:
+            from loopcal.io.robot.stage_records import place_stages
+
             record = place_stages(file, record, units)
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
@@ -239,7 +241,7 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
     """Return the family that a robot file names."""
     family = file.content.get("family")
     if "family" not in file.content and KEY in file.content:
-        return Stages.family
+        return KEY
     if "family" not in file.content:
         for key in file.content:
             if suggestion := suggest_names(key, ["family"]):

@@ -20,13 +20,14 @@ OWN_KEYS = ("on", "mount", "joint", "family")
 """Keys of a stage that are not those of its family; both have a name."""
 
 
-def place_stages(file: YamlFile, chain: Stages, units: Units) -> PlacedStages:
+def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> PlacedStages:
     """Return a chain with the records of its stages.
 
     Raises
     ------
     FileError : a stage is neither a joint nor a robot, or a key of it does not fit; at its line.
     """
+    assert isinstance(chain, Stages)
     robots = tuple(_read_stage(file, i, stage, units) for i, stage in enumerate(chain.stages))
     own = {field.name: getattr(chain, field.name) for field in fields(chain)}
     return PlacedStages(**own, robots=robots)

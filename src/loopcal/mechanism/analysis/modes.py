@@ -25,6 +25,9 @@ from loopcal.mechanism.batch_kinematics import (
 )
 from loopcal.mechanism.kinematics import Solution, check_arguments, make_solution
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.stages.chain_kinematics import solve_stages
+from loopcal.mechanism.stages.chain_state import join_stage_states
+from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
 from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.presentation import HtmlResult
@@ -122,12 +125,9 @@ def find_assembly_modes(
             "actuators; give one reading for each"
         )
     values = robot.values[None]
-    e, tau = robot.slots(values)
-    joints = joints_from_readings(readings[None, None], tau, robot.slots.frequency)
 
     def solve(start: State) -> State:
-        state = engine.solve(robot.program, e, joints, start)
-        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+        return _close(robot, values, readings[None, None], start)
 
     def measure(state: State) -> FloatArray:
         home = np.broadcast_to(robot.home, state.T[0].shape)
@@ -166,6 +166,8 @@ def find_working_modes(
     home = compute_readings(robot, values, robot.home_state)[0]
 
     def solve(start: State) -> State:
+        if robot.stages:  # a chain moves from a closed start
+            start = _close(robot, values, read(start)[None], start)
         reached = begun.status[0, 0] == Status.CONVERGED
         T = np.broadcast_to(begun.T, start.T.shape) if reached else start.T
         everywhere = np.broadcast_to(wanted, (1, T.shape[1], len(wanted)))
@@ -186,6 +188,19 @@ def find_working_modes(
         )
 
     return _search(robot, _Problem(solve, identify, measure, read), patience, max_starts, seed)
+
+
+def _close(robot: Mechanism, values: FloatArray, q: FloatArray, start: State | None) -> State:
+    """Return the states (1, n) at readings (1, n | 1, a), in whatever mode the start leads to."""
+    if robot.stages:
+        return solve_stages(robot, values, q, start, _close)
+    e, tau = robot.slots(values)
+    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    begin = start or robot.home_state
+    if robot.is_serial:
+        return solve_serial(robot, e, joints, begin.T.shape[:2])
+    state = engine.solve(robot.program, e, joints, begin)
+    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
 
 def _flatten_poses(robot: Mechanism, state: State) -> FloatArray:
@@ -269,6 +284,10 @@ def _merge(
 
 def _draw_starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
     """Draw starts (1, n): free orientations and positions of the platform, and all joints."""
+    if robot.stages:
+        return join_stage_states(
+            robot, [_draw_starts(stage.robot, rng, n) for stage in robot.stages]
+        )
     free, size = robot.program.freedoms, robot.size
     turns = [f for f in free if f < 3]
     if len(turns) == 3:

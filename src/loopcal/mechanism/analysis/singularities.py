@@ -6,8 +6,9 @@ in meters and for a rotation in radians times the robot's size, so that the sing
 are meters per meter. The smallest one, the margin, is zero where the platform can move although
 every actuator is locked (a parallel singularity). The smallest one of Q, columns of rotary
 actuators per size too, is zero where an actuator moves nothing (a serial singularity). A margin has
-no absolute scale, so it is compared with its median over the workspace. Derivation:
-docs/theory/kinematics.md.
+no absolute scale, so it is compared with its median over the workspace. A chain of stages is
+singular where a stage is, and where its readings do not move the controlled coordinates
+independently. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -25,11 +26,21 @@ from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.analysis.workspace import sample_workspace
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.batch_kinematics import compute_closure_sign
+from loopcal.mechanism.batch_kinematics import compute_closure_sign, compute_readings
 from loopcal.mechanism.kinematics import Solution, forward, inverse, make_solution
 from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.sensitivity import (
+    differentiate_pose,
+    stack_driven_columns,
+    stack_platform_rows,
+)
+from loopcal.mechanism.stages.chain_state import (
+    find_carrying_actuators,
+    split_stage_states,
+    transport_to_end,
+)
 from loopcal.mechanism.states import driven_values, join_states
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -227,6 +238,8 @@ def _compute_margins(
 
     The state is (1, n).
     """
+    if robot.stages:
+        return _compute_chain_margins(robot, state)
     program = robot.program
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearize(program, e, driven_values(program, state), state)
@@ -239,3 +252,40 @@ def _compute_margins(
     _, r, W = np.linalg.svd(Q)
     margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
     return margin, V[:, -1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+
+
+def _compute_chain_margins(
+    robot: Mechanism, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Return the margins of a chain: the least margin of its loops, and that of C D.
+
+    C D are the derivatives of the controlled coordinates by the readings. A chain of serial joints
+    alone has the margin 1: locked joints hold the platform in every direction alike.
+    """
+    n, values = state.T.shape[1], robot.values[None]
+    margin, direction = np.ones(n), np.tile(np.eye(6)[0], (n, 1))
+    transports = dict(transport_to_end(robot, state, len(robot.stages) - 1))
+    for i, own in enumerate(split_stage_states(robot, state)):
+        stage = robot.stages[i].robot
+        if stage.is_serial or i not in transports:
+            continue
+        least, motion, *_ = _compute_margins(stage, own)
+        twist = np.zeros((n, 6))
+        freedoms = list(stage.program.freedoms)
+        twist[:, freedoms] = motion / stage.twist_scale[freedoms]
+        twist = np.matmul(transports[i][0], twist[..., None])[..., 0] * robot.twist_scale
+        length = np.linalg.norm(twist, axis=1, keepdims=True)
+        is_less = ~(margin <= least)
+        margin = np.where(is_less, least, margin)
+        direction = np.where(is_less[:, None], twist / np.maximum(length, 1e-300), direction)
+    q = compute_readings(robot, values, state)
+    D = differentiate_pose(robot, values, q, state).readings[0]
+    T, names = state.T[0], robot.controlled
+    _, columns = compare_coordinates(T, read_coordinates(T, names), names, robot.size)
+    moving = find_carrying_actuators(robot)
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
+    slope = np.matmul(columns, D[..., moving]) / np.where(turning, robot.size, 1.0)
+    good = np.isfinite(slope).all(axis=(1, 2))
+    _, r, W = np.linalg.svd(np.where(good[:, None, None], slope, 0.0))
+    drive_margin = np.where(good, r[:, -1], np.nan)
+    return margin, direction, drive_margin, moving[np.abs(W[:, -1]).argmax(axis=1)]

@@ -9,6 +9,7 @@ omega = R_s omega_s, v = R_s v_s + omega x (p_end - p_s). Derivation: docs/theor
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -26,7 +27,7 @@ from loopcal.mechanism.stages.chain_state import (
     split_stage_states,
     transport_to_end,
 )
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 class StageSolver(Protocol):
@@ -107,6 +108,27 @@ def multiply_signs(
         for stage, own in zip(robot.stages, split_stage_states(robot, state), strict=True)
     ]
     return np.multiply.reduce(signs).astype(np.int8)
+
+
+def judge_stage_modes(
+    robot: Mechanism,
+    state: State,
+    begin: State,
+    judge: Callable[[Mechanism, State, State], tuple[State, BoolArray]],
+) -> tuple[State, BoolArray]:
+    """Return a state (1, n) with closure signs, and its rows in which a stage is in another mode.
+
+    `judge` is the same function of a stage at its present values.
+    """
+    is_other, judged = np.zeros(state.T.shape[1], bool), []
+    states, begins = split_stage_states(robot, state), split_stage_states(robot, begin)
+    for stage, own, first in zip(robot.stages, states, begins, strict=True):
+        machine = stage.robot.with_values(robot.values[stage.parameters])
+        part, is_part_other = judge(machine, own, first)
+        judged.append(part)
+        is_other |= is_part_other
+    whole = join_stage_states(robot, judged)
+    return replace(state, closure_sign=whole.closure_sign, signs=whole.signs), is_other
 
 
 def differentiate_end(
