@@ -219,7 +219,8 @@ inline int fold(const double *factor, const double *rows, double *out, int64_t t
         if (count * 2 > W) {
             Arena arena(trials);
             if (!arena.ok()) return 1;
-            fold_trials(from, given, to, count, m, p, stride, m * count, arena);
+            int64_t left = p ? m + (count - 1) * (stride / p) : m;
+            fold_trials(from, given, to, count, m, p, stride, left, arena);
             continue;
         }
         for (int64_t i = 0; i < count; i++) {
