@@ -1,16 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long loopcal takes to start, against a Python that imports numpy and ends."""
+"""How long loopcal takes to start, and whole commands take, against a Python that imports numpy and
+ends.
+"""
 
 import functools
+import os
+import resource
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 from benchmarks.harness import Metric, measure_ratio
 
 
 def _python(*arguments: str) -> None:
-    """Run this Python with the arguments, silently."""
-    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+    """Run this Python with the arguments, silently, and with the engine in NumPy."""
+    engine = {**os.environ, "LOOPCAL_ENGINE": "numpy"}
+    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL, env=engine)
+
+
+def _read_processor_time() -> float:
+    """Return the processor time of all processes that this one has waited for [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 _import_numpy = functools.partial(_python, "-c", "import numpy")
@@ -29,3 +42,23 @@ def bench_help() -> Metric:
     return measure_ratio(
         "start.help", functools.partial(_python, "-c", command), _import_numpy, limit=1.5
     )
+
+
+def bench_calibration() -> list[Metric]:
+    """Time `loopcal calibrate` and `loopcal report` of the example hexapod as whole processes: 40
+    poses, 42 parameters, held-out poses, all checks, and the files that are written and read back.
+    """
+    data = Path(__file__).resolve().parents[1] / "examples" / "hexapod-42" / "measurements.csv"
+    with tempfile.TemporaryDirectory() as folder:
+        run = str(Path(folder) / "run")
+        calibrate = ("calibrate", "hexapod-42", str(data), "-o", run, "--hold-out", "0.25")
+        report = ("report", run, "-o", str(Path(folder) / "report.html"))
+        return [
+            measure_ratio(
+                f"start.{name}",
+                functools.partial(_python, "-m", "loopcal", *words, "--force"),
+                _import_numpy,
+                clock=_read_processor_time,
+            )
+            for name, words in (("calibrate", calibrate), ("report", report))
+        ]
