@@ -41,6 +41,9 @@ without a decrease, if its full step is below SMALL_STEP."""
 MOST_ITERATIONS = 1000
 """Evaluations of the rows: far more than fits need, since those without progress end early."""
 
+CONTRACTION = 0.25
+"""Largest ratio of two steps from which the lengths of further ones are expected."""
+
 FIRST_DAMPING = 1e-6
 """Damping after the first rejected step, in units of the largest squared singular value."""
 
@@ -209,6 +212,8 @@ def descend(
     tolerance: float = RANK_TOLERANCE,
     start: Start | None = None,
     progress: Progress = report_no_progress,
+    arrival: FloatArray | None = None,
+    sufficient: float = 0.0,
 ) -> Descent:
     """Minimize the whitened sum of squares, filtered by the method.
 
@@ -220,6 +225,11 @@ def descend(
     start : warm start; default: the first one of the problem.
     progress : receives each step with the sum of squares of the first trial; how many there will be
         is not known.
+    arrival : (t,), optional; by how much the step that led to `deviation` changed the whitened
+        residuals.
+    sufficient : a trial has also converged where this step and all further ones together would
+        change the whitened residuals by less than that, apart from the step itself, which is taken.
+        They become shorter at least by the ratio of the last two.
 
     Returns
     -------
@@ -227,7 +237,7 @@ def descend(
     """
     control = control or StepControl()
     fixed = fix_penalty(method, problem.parameters)
-    model = _FilteredDescent(problem, method, tolerance, control, fixed)
+    model = _FilteredDescent(problem, method, tolerance, control, fixed, sufficient)
     z = np.array(deviation, dtype=np.float64)
     progress(0, 1, "fitting")
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
@@ -236,7 +246,8 @@ def descend(
     good = np.isfinite(first.cost) & np.isfinite(first.factor).all(axis=(1, 2))
     factor = np.where(good[:, None, None], first.factor, 0.0)
     cost = np.where(good, first.cost, np.inf)
-    point = model.locate(replace(first, deviation=z, factor=factor, cost=cost))
+    arrival = np.full(len(z), np.inf) if arrival is None else arrival
+    point = model.locate(replace(first, deviation=z, factor=factor, cost=cost), arrival)
     linear_model = point.linear_model
     deviations, costs = [z.copy()], [point.cost.copy()]
 
@@ -272,12 +283,17 @@ def descend(
 
 @dataclass(frozen=True, eq=False)
 class _Point(TrialBatch):
-    """Deviations z (a, p) with sums of squares (a,), linear model and warm start."""
+    """Deviations z (a, p) with sums of squares (a,), linear model and warm start.
+
+    arrival : (a,) by how much the full step that led there changed the whitened residuals to first
+    order; infinite where it was damped, or at the start.
+    """
 
     z: FloatArray
     cost: FloatArray
     linear_model: LinearModel
     start: Start
+    arrival: FloatArray
 
     @property
     def spread(self) -> FloatArray:
@@ -294,11 +310,12 @@ class _Candidate:
     model: _FilteredDescent
     linearized: Linearization
     cost: FloatArray
+    arrival: FloatArray
 
     def take(self, trials: IntArray) -> _Point:
         """Return the points of some trials."""
         needed = replace(self.linearized, nuisance=None, poses=None)  # the rest is not copied
-        return self.model.locate(needed.take(trials))
+        return self.model.locate(needed.take(trials), self.arrival[trials])
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,11 +327,13 @@ class _FilteredDescent:
     tolerance: float
     control: StepControl
     fixed: FixedPenalty | None
+    sufficient: float
 
-    def locate(self, linearized: Linearization) -> _Point:
+    def locate(self, linearized: Linearization, arrival: FloatArray) -> _Point:
         """Return the points of a linearization."""
         linear_model = make_linear_model(linearized, self.method, self.tolerance, self.fixed)
-        return _Point(linearized.deviation, linearized.cost, linear_model, linearized.next_start)
+        z, start = linearized.deviation, linearized.next_start
+        return _Point(z, linearized.cost, linear_model, start, arrival)
 
     def propose(self, point: _Point, damping: FloatArray) -> FilteredStep:
         """Return the damped steps."""
@@ -323,7 +342,13 @@ class _FilteredDescent:
     def is_negligible(self, point: _Point, step: FilteredStep) -> BoolArray:
         """Return which steps are the last."""
         by_residuals = step.change <= self.control.relative**2 * point.cost
-        return by_residuals | (step.full_length <= self.control.absolute * point.spread)
+        is_last = by_residuals | (step.full_length <= self.control.absolute * point.spread)
+        if not self.sufficient:
+            return is_last
+        change = np.sqrt(step.change)
+        ratio = change / np.maximum(point.arrival, np.finfo(np.float64).tiny)
+        remaining = change * ratio / np.maximum(1.0 - ratio, 1.0 - CONTRACTION)
+        return is_last | ((ratio <= CONTRACTION) & (remaining <= self.sufficient))
 
     def finish(self, point: _Point, step: FilteredStep) -> _Point:
         """Return the points after their full step, the rest unchanged."""
@@ -333,7 +358,9 @@ class _FilteredDescent:
         """Linearize at the deviations of the steps."""
         linearized = self.problem.take(trials).linearize(step.deviation, point.start)
         good = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
-        return _Candidate(self, linearized, np.where(good, linearized.cost, np.inf))
+        cost = np.where(good, linearized.cost, np.inf)
+        is_full = step.length >= step.full_length
+        return _Candidate(self, linearized, cost, np.where(is_full, np.sqrt(step.change), np.inf))
 
     def judge(
         self, point: _Point, step: FilteredStep, candidate: _Candidate
