@@ -527,7 +527,15 @@ def scale_lengths(assembly: Assembly, s: float) -> Assembly:
 
 
 def move_base(assembly: Assembly, G: Array) -> Assembly:
-    """Move the base: multiply first links and home by G (4, 4) from the left."""
+    """Move the base: multiply first links and home by G (4, 4) from the left; of a chain the mounts
+    of the stages on its base.
+    """
+    if assembly.stages:
+        moved = (
+            replace(stage, mount=G @ stage.mount) if stage.on == "base" else stage
+            for stage in assembly.stages
+        )
+        return replace(assembly, stages=tuple(moved))
 
     def limb_of(limb: Limb) -> Limb:
         first = replace(limb.links[0], transform=G @ limb.links[0].transform)

@@ -26,6 +26,7 @@ from loopcal.mechanism import (
     inverse,
     sample_workspace,
 )
+from loopcal.report.scene.robot_parts import list_parts
 from tests.jacobians import check_jacobian
 from tests.zoo import load_cached_robot
 
@@ -273,6 +274,18 @@ def test_names_of_parameters_limbs_and_joints_begin_with_their_stage() -> None:
     assert "head.leg2.offset" in machine.parameters.names
     assert machine.assembly.limbs[0].name == "head.leg1"
     assert [a.name for a in machine.actuators] == ["leg1", "leg2", "leg3", "w1", "w2", "w3"]
+
+
+def test_outlines_of_platforms_join_what_moves_together() -> None:
+    machine = load_cached_robot("excavator")
+    parts = list_parts(machine, machine.home_state)
+    bodies = [part.points for part in parts if part.role == "platform"]
+    assert len(bodies) == 4
+    later = list_parts(machine, sample_workspace(machine, 1, seed=9).solution.state)
+    moved = [part.points for part in later if part.role == "platform"]
+    for before, after in zip(bodies, moved, strict=True):
+        sides = [np.linalg.norm(np.diff(points[0], axis=0), axis=1) for points in (before, after)]
+        np.testing.assert_allclose(np.sort(sides[0]), np.sort(sides[1]), atol=1e-9)
 
 
 # --- inverse kinematics

@@ -31,12 +31,21 @@ def view_assembly(robot: Mechanism) -> list[Table]:
     """Return the tables of an assembly."""
     units = units_of(robot)
     return [
+        *([_build_stage_table(robot, units)] if robot.stages else []),
         _build_link_table(robot, units),
         _build_joint_table(robot, units),
         _build_ending_table(robot, units),
         _build_transmission_table(robot, units),
         _build_map_table(robot, units),
     ]
+
+
+def _build_stage_table(robot: Mechanism, units: Units) -> Table:
+    """Return where the bases of the stages of a chain are."""
+    rows = [(stage.name, stage.on, *_place(stage.mount, units)) for stage in robot.assembly.stages]
+    columns = (word_column("stage"), word_column("on"), *(Column(title) for title in PLACE))
+    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
+    return Table(f"Stages: bases on the platforms [{length}, {angle}]", columns, tuple(rows))
 
 
 def _build_link_table(robot: Mechanism, units: Units) -> Table:

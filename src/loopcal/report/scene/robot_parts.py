@@ -102,9 +102,9 @@ def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]
 def _list_bodies(
     robot: Mechanism, foot: FloatArray, top: FloatArray, T: FloatArray
 ) -> Iterator[Part]:
-    """Yield base and platform of points (n, k, 3), their frames, and the tool."""
-    yield Part("base", foot[:, _order_outline(foot[0])])
-    yield Part("platform", top[:, _order_outline(top[0])])
+    """Yield base and platforms of points (n, k, 3), the frames of base and tool, and the tool."""
+    for role, points in _list_outlines(robot, foot, top):
+        yield Part(role, points[:, _order_outline(points[0])])
     tool = T @ robot.tool
     yield Part("arm", np.stack([T[:, :3, 3], tool[:, :3, 3]], axis=1))
     for frame in (np.broadcast_to(np.eye(4), T.shape), tool):
@@ -112,6 +112,26 @@ def _list_bodies(
             end = frame[:, :3, 3] + 2 * AXIS * robot.size * frame[:, :3, axis]
             yield Part("frame", np.stack([frame[:, :3, 3], end], axis=1), axis)
     yield Part("tool", tool[:, None, :3, 3])
+
+
+def _list_outlines(
+    robot: Mechanism, foot: FloatArray, top: FloatArray
+) -> Iterator[tuple[Role, FloatArray]]:
+    """Yield the points (n, k, 3) of base and platforms.
+
+    The platform of a stage has the ends of its limbs, and the feet of the stages that it carries.
+    """
+    if not robot.stages:
+        yield "base", foot
+        yield "platform", top
+        return
+    owner = np.repeat(
+        np.arange(len(robot.stages)), [len(s.robot.assembly.limbs) for s in robot.stages]
+    )
+    parent = np.array([stage.parent for stage in robot.stages])[owner]
+    yield "base", foot[:, parent == -1]
+    for i in range(len(robot.stages)):
+        yield "platform", np.concatenate([top[:, owner == i], foot[:, parent == i]], axis=1)
 
 
 def _order_outline(points: FloatArray) -> IntArray:
