@@ -162,6 +162,14 @@ INLINE Lanes triangularize(Lanes *matrix, int rows, int total, int columns) {
         triangularize_from<6, 7, 6>(matrix, sign);
         return sign;
     }
+    if (rows == 6 && total == 12 && columns == 6) {  // their inverses
+        triangularize_from<6, 12, 6>(matrix, sign);
+        return sign;
+    }
+    if (rows == 3 && total == 5 && columns == 2) {  // shares of two joints that end in a ball
+        triangularize_from<3, 5, 2>(matrix, sign);
+        return sign;
+    }
     if (rows == 3 && total == 4 && columns == 3) {  // of three
         triangularize_from<3, 4, 3>(matrix, sign);
         return sign;
