@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism import Mechanism, Solution, Status, forward, inverse
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    Status,
+    compute_readings,
+    forward,
+    inverse,
+    inverse_trials,
+    read_coordinates,
+)
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -109,3 +118,20 @@ def test_readings_beyond_strokes_or_not_finite_are_marked_without_an_exception(n
         assert back.residual[back.converged].max(initial=0.0) <= 1e-9 * machine.size
     for row in np.flatnonzero(~back.converged):
         assert back.explain(int(row))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_inverse_of_many_machines_with_one_start_equals_that_of_each_machine(name):
+    robot, n = load_cached_robot(name), 3
+    rng = np.random.default_rng(4)
+    values = robot.values + 1e-4 * rng.standard_normal((2, len(robot.parameters)))
+    home = read_coordinates(np.repeat(robot.home[None, None], n, axis=1), robot.controlled)
+    target = home + 1e-3 * rng.standard_normal((2, n, len(robot.controlled)))
+    start = inverse_trials(robot, robot.values[None], home)
+    together = inverse_trials(robot, values, target, start)
+    for i in range(2):
+        alone = inverse_trials(robot, values[i : i + 1], target[i : i + 1], start)
+        both = compute_readings(robot, values, together)[i]
+        expected = compute_readings(robot, values[i : i + 1], alone)[0]
+        np.testing.assert_allclose(both, expected, rtol=0, atol=1e-12)
+        assert np.abs(both - compute_readings(robot, robot.values[None], start)[0]).max() > 1e-5

@@ -42,7 +42,7 @@ def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State, ch
         for group, values in zip(program.groups, start.joints, strict=True):
             links, shape = place_links(group, e), (t, n, *values.shape[2:])
             filled = group.insert_driven(np.broadcast_to(values, shape), q)
-            flat = filled.reshape(t * n, *shape[2:])
+            flat = filled.reshape(t * n, *shape[2:])  # a copy where the start is broadcast
             for first in range(0, t * n, chunk):
                 rows = np.arange(first, min(first + chunk, t * n))
                 platform = T[rows, :3].transpose(1, 2, 0).copy()
@@ -52,7 +52,7 @@ def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State, ch
                 flat[rows] = theta.transpose(2, 1, 0)
                 square[rows] += np.add.reduce(residual**2, axis=0)
                 sign[rows] *= np.multiply.reduce(signs, axis=0)
-            joints.append(filled)
+            joints.append(flat.reshape(shape))
         norm = np.sqrt(square)
         status = np.where(norm <= OPEN * program.size, CONVERGED, STALLED)
         status[~np.isfinite(norm)] = NOT_FINITE
