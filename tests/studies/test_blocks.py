@@ -71,7 +71,8 @@ def test_scores_equal_calibrations_made_by_hand():
             "condition": fit.spectrum.condition,
             "noise_scale": np.sqrt(fit.chi_square / fit.residual_test.degrees),
         }
-        assert_allclose([scores[name][i] for name in by_hand], list(by_hand.values()), rtol=1e-6)
+        # single fits are linearized closer to their estimates, which changes the condition number
+        assert_allclose([scores[name][i] for name in by_hand], list(by_hand.values()), rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["linear-delta", "five-bar"])

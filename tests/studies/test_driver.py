@@ -15,7 +15,7 @@ import pytest
 
 import loopcal
 from evidence.study_interruption import BLOCK, Disturbance, examine, read_contents
-from loopcal.errors import FileError, StudyError
+from loopcal.errors import EstimationError, FileError, StudyError
 from loopcal.studies.driver import Share, count_blocks, count_stored, run_blocks
 from loopcal.studies.execution import Answer, Dask, Processes, Serial
 from loopcal.studies.files.merging import merge_studies
@@ -253,6 +253,19 @@ def test_two_processes_give_the_same_blocks(undisturbed, tmp_path) -> None:
     report = run_study(read_source(write_study(tmp_path)), tmp_path / "study", Processes(2))
     assert report.computed == 16
     assert read_contents(tmp_path / "study") == read_contents(undisturbed)
+
+
+@pytest.mark.parametrize("executor", [Serial(), Processes(1)], ids=["here", "in a process"])
+def test_threads_give_the_same_blocks(undisturbed, tmp_path, executor) -> None:
+    source = read_source(write_study(tmp_path))
+    assert run_study(source, tmp_path / "study", executor, threads=2).computed == 16
+    assert read_contents(tmp_path / "study") == read_contents(undisturbed)
+
+
+def test_a_study_without_threads_is_refused(tmp_path) -> None:
+    with pytest.raises(EstimationError, match="threads is 0; give 1 or more"):
+        loopcal.study(write_study(tmp_path), tmp_path / "study", threads=0)
+    assert not (tmp_path / "study").exists()
 
 
 @pytest.mark.slow

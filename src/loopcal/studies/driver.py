@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 
 from loopcal.findings import Finding, report_finding
 from loopcal.studies.execution import Executor
@@ -105,11 +106,12 @@ def run_blocks(
     executor: Executor,
     share: Share = WHOLE,
     progress: Progress = report_no_progress,
+    threads: int = 1,
 ) -> RunReport:
     """Compute and store the blocks of a study that are missing in its store.
 
     Every block is stored as soon as it is there. Work that is stopped, in whatever way, loses only
-    the blocks in flight.
+    the blocks in flight. `threads` compute a block, in each worker.
 
     Raises
     ------
@@ -123,7 +125,8 @@ def run_blocks(
     seconds, given_up = 0.0, []
     progress(before, total, "computing blocks")
     schedule = Schedule(_list_missing(study, store, share))
-    with closing(executor.map_blocks(compute_task, schedule)) as answers:
+    compute = compute_task if threads == 1 else partial(compute_task, threads=threads)
+    with closing(executor.map_blocks(compute, schedule)) as answers:
         for answer in answers:
             task, result = answer.task, answer.result
             losses, seconds = losses + answer.losses, seconds + answer.seconds

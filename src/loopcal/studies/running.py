@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from loopcal.estimate.trial_identification import check_threads
 from loopcal.io.core.text_file import as_path
 from loopcal.studies.driver import WHOLE, RunReport, Share, run_blocks
 from loopcal.studies.execution import Executor, Processes, Serial
@@ -24,6 +25,7 @@ def study(
     resume: bool = False,
     quick: bool = False,
     progress: Progress = report_no_progress,
+    threads: int = 1,
 ) -> StudyResult:
     """Run a study of simulated calibrations, and return its results.
 
@@ -35,10 +37,12 @@ def study(
     executor : other workers, such as `Dask("tcp://host:8786")`.
     resume : continue a folder of this study, which may have got more replicates or levels.
     quick : run the quick tier of the file. progress : receives the blocks that are stored.
+    threads : that compute one block, in each process; numbers do not depend on it.
 
     Raises
     ------
     FileError : the study file or the folder cannot be used. StudyError : no workers.
+    EstimationError : no threads.
 
     Notes
     -----
@@ -46,7 +50,9 @@ def study(
     """
     path = as_path(folder, "study folder")
     given = StudySource(source) if isinstance(source, Study) else read_source(source, quick)
-    run_study(given, path, executor or make_local(workers), resume, progress=progress)
+    check_threads(threads)
+    chosen = executor or make_local(workers)
+    run_study(given, path, chosen, resume, progress=progress, threads=threads)
     return StudyResult(path)
 
 
@@ -67,7 +73,8 @@ def run_study(
     resume: bool = False,
     share: Share = WHOLE,
     progress: Progress = report_no_progress,
+    threads: int = 1,
 ) -> RunReport:
     """Compute what is missing in the folder of a study; see `open_study` and `run_blocks`."""
     with open_study(folder, source, resume) as store:
-        return run_blocks(source.study, store, executor, share, progress)
+        return run_blocks(source.study, store, executor, share, progress, threads)

@@ -43,17 +43,17 @@ class CalibratedBlock:
     fits: FittedTrials
 
 
-def calibrate_block(content: Mapping[str, Any]) -> CalibratedBlock:
-    """Simulate and calibrate the machines of the content of a task."""
+def calibrate_block(content: Mapping[str, Any], threads: int = 1) -> CalibratedBlock:
+    """Simulate and calibrate the machines of the content of a task, by so many threads."""
     cell = prepare_cell(content)
     stream = make_stream(cell.seed, content["block"])
     trials = simulate_block(cell, stream)
-    return CalibratedBlock(cell, stream, trials, fit_trials(cell, trials))
+    return CalibratedBlock(cell, stream, trials, fit_trials(cell, trials, threads))
 
 
-def compute_scores(content: Mapping[str, Any]) -> FloatArray:
+def compute_scores(content: Mapping[str, Any], threads: int = 1) -> FloatArray:
     """Return the scores (B, s) of the content of a task."""
-    block = calibrate_block(content)
+    block = calibrate_block(content, threads)
     cell, stream, trials, fits = block.cell, block.stream, block.trials, block.fits
     scores = score_poses(cell, trials, fits, stream) | score_parameters(cell, trials, fits)
     for name in ("rank", "condition", "iterations", "noise_scale", "verdict"):

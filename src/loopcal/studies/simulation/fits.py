@@ -91,20 +91,25 @@ class FittedTrials:
     verdict: FloatArray
 
 
-def fit_trials(cell: PreparedCell, trials: Trials) -> FittedTrials:
-    """Calibrate all trials."""
+def fit_trials(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
+    """Calibrate all trials; threads compute those that are one batch."""
     options, scores = cell.fit_options, cell.scores
     if cell.method.is_published:
         return describe_published(cell, fit_published(cell.method, cell.robot, trials, cell.layout))
     is_batch = options.loss is None and options.noise == "given" and cell.layout is None
     if is_batch and not scores.verdict and scores.intervals == "stated":
-        return fit_together(cell, trials)
+        return fit_together(cell, trials, threads)
     return fit_each(cell, trials)
 
 
-def fit_together(cell: PreparedCell, trials: Trials) -> FittedTrials:
-    """Calibrate all trials as one batch. The stated noise counts as known."""
-    fits = identify_trials(cell.robot, trials, options=cell.fit_options)
+def fit_together(cell: PreparedCell, trials: Trials, threads: int = 1) -> FittedTrials:
+    """Calibrate all trials as one batch. The stated noise counts as known.
+
+    The fits begin with chords, see `identify_trials`: estimates are those of single fits within
+    1e-3 standard deviations.
+    """
+    options = cell.fit_options
+    fits = identify_trials(cell.robot, trials, options=options, threads=threads, chord_start=True)
     plain = fits.decomposition.plain()
     state, measured = solve_cell_poses(cell, fits.values)
     return FittedTrials(

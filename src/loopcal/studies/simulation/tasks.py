@@ -54,7 +54,7 @@ class BlockResult:
     values: FloatArray
 
 
-def compute_block(task: BlockTask) -> BlockResult:
+def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
     """Simulate and calibrate the machines of a block, and return their scores.
 
     It is a pure function of `task.content`: the same numbers to the last bit in every process, for
@@ -65,11 +65,11 @@ def compute_block(task: BlockTask) -> BlockResult:
     LoopcalError : the cell cannot be simulated at all, such as a kind that the robot does not have.
     """
     content: Mapping[str, Any] = json.loads(task.content)
-    return BlockResult(task.key, compute_scores(content))
+    return BlockResult(task.key, compute_scores(content, threads))
 
 
-def compute_task(task: BlockTask | PosesTask) -> BlockResult | CellPoses:
-    """Compute a block or poses; a pure function of the task.
+def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> BlockResult | CellPoses:
+    """Compute a block or poses; a pure function of the task, whatever the number of threads.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def compute_task(task: BlockTask | PosesTask) -> BlockResult | CellPoses:
     """
     if isinstance(task, PosesTask):
         return compute_poses(json.loads(task.content))
-    return compute_block(task)
+    return compute_block(task, threads)
 
 
 def make_poses_task(content: Mapping[str, Any]) -> PosesTask:

@@ -22,8 +22,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-NUMERICS = 1
-"""Version of the numbers of a block; another one makes all blocks anew."""
+NUMERICS = 2
+"""Version of the numbers of a block; another one makes all blocks anew.
+
+2: fits begin with chords, so that estimates differ from those of version 1 by less than 1e-3
+standard deviations, and the iterations are fewer.
+"""
 
 
 def describe_block(study: Study, cell: Cell, block: int) -> dict[str, Any]:
