@@ -40,6 +40,7 @@ evidence: .venv/dev.stamp native  ## statistics at full size: docs/evidence/*.js
 
 docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json and from the code
 	$(BIN)/python -m tools.evidence --tables
+	$(BIN)/python -m tools.speed_tables
 	$(BIN)/python -m tools.file_reference
 	$(BIN)/python -m tools.findings_reference
 	$(BIN)/python -m tools.api_reference

@@ -33,7 +33,7 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.mechanism import differentiate_pose, forward, forward_trials, inverse
+from loopcal.mechanism import Mechanism, differentiate_pose, forward, forward_trials, inverse
 
 ENGINES = ("numpy", "native") if find_spec("loopcal_native") else ("numpy",)
 POSES, TRIALS = 10_000, 200
@@ -184,6 +184,35 @@ def _time_of_processes() -> float:
     """Return the processor time [s] of all processes that ended."""
     times = os.times()
     return times.children_user + times.children_system
+
+
+def bench_loop() -> list[Metric]:
+    """Forward kinematics of 1000 hexapod poses against a loop over scipy's fsolve."""
+    robot, _, readings, _, _ = _problem()
+    some = readings[:1000]
+    return _of_each(
+        "forward_of_fsolve",
+        lambda: (partial(forward, robot, some), _loop_over_fsolve(robot, some)),
+        3,
+    )
+
+
+def _loop_over_fsolve(robot: Mechanism, readings: np.ndarray) -> Callable[[], object]:
+    """Return forward kinematics as a user writes it: one pose after the other, from home."""
+    from scipy.optimize import fsolve
+    from scipy.spatial.transform import Rotation
+
+    base, platform, length = np.split(robot.values.reshape(6, 7), [3, 6], axis=1)
+    home = np.concatenate([np.zeros(3), robot.home[:3, 3]])
+
+    def gap(pose: np.ndarray, q: np.ndarray) -> np.ndarray:
+        legs = pose[3:] + platform @ Rotation.from_rotvec(pose[:3]).as_matrix().T - base
+        return np.linalg.norm(legs, axis=1) - length[:, 0] - q
+
+    poses = np.array([fsolve(gap, home, args=(q,)) for q in readings])
+    by_loopcal = forward(robot, readings).T[:, :3, 3]
+    assert np.abs(poses[:, 3:] - by_loopcal).max() < 1e-6  # [m], the tolerance of fsolve
+    return lambda: [fsolve(gap, home, args=(q,)) for q in readings]
 
 
 def _fit_by_hand(nominal: np.ndarray) -> Callable[[], object]:

@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 from loopcal.cli import command_line, main
 from loopcal.io import load_robot
 from tests.cli.page_commands import list_commands
+from tools import speed_tables
 
 README = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
 
@@ -62,6 +63,13 @@ def test_picture_is_small_and_its_numbers_are_those_of_the_demo(root) -> None:
     count, before, after, floor = line.groups()
     assert f"errors at {count} held-out poses" in match[1]
     assert f"position {before} mm and {after} mm rms, noise floor {floor} mm" in match[1]
+
+
+def test_stated_speeds_are_those_of_the_committed_benchmarks() -> None:
+    """`python -m tools.speed_tables` writes them."""
+    assert speed_tables.find_outdated() == {}
+    assert speed_tables.describe_ratio(0.0021) == "480 times faster"
+    assert speed_tables.describe_ratio(11.8) == "12 times slower"
 
 
 def test_citation_file_is_valid_cff(root) -> None:

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far the native engine is from the one in NumPy, which bits its instruction sets have, and
+what becomes of a million wrong inputs.
+
+Without the native engine the committed tables are kept.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.bench_engine import use_engine
+from loopcal.engine import Engine, State, select_engine
+from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
+from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
+from loopcal.mechanism import sample_workspace
+from tests.engine.cases import Case, draw_map, make_case
+
+TRIALS, POSES = 5, 40
+ROBOTS = tuple(list_shipped_robots())
+FITTED = ("hexapod-42", "ru-pus-prs", "linear-delta", "five-bar")
+METHODS = {
+    "least squares": LeastSquares(),
+    "MAP": MAP(),
+    "ridge": Ridge(1.0),
+    "truncated SVD": TruncatedSVD(6),
+}
+OUTPUT = Path(__file__).resolve().parent.parent / "docs" / "evidence" / "engines.json"
+
+Results = list[np.ndarray]
+
+
+def collect() -> dict[str, Any]:
+    """Compare, hash and disturb."""
+    if find_spec("loopcal_native") is None:
+        print("evidence: engines keeps its tables; the native engine is not installed")
+        kept = json.loads(OUTPUT.read_text("utf-8"))
+        return {name: kept[name] for name in ("cases", "tables")}
+    from evidence.engine_inputs.wrong_inputs import count_answers
+
+    return {
+        "cases": {"trials": TRIALS, "poses": POSES, "robots": len(ROBOTS)},
+        "tables": {
+            "agreement": compare_functions(),
+            "fits": compare_fits(),
+            "bits": compare_instruction_sets(),
+            "inputs": count_answers(),
+        },
+    }
+
+
+# --- functions of the engine
+
+
+def solve_forward(engine: Engine, case: Case) -> Results:
+    """Return the poses in sizes of the robot, and everything countable."""
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    T = state.T.copy()
+    T[..., :3, 3] /= case.program.size
+    return [T, state.status, state.iterations, state.closure_sign]
+
+
+def solve_inverse(engine: Engine, case: Case) -> Results:
+    """Return the joints of limbs that reach poses, in radians or sizes."""
+    reached = _close(case)
+    limbs = case.program.with_fixed_platform
+    q = np.broadcast_to(case.home_q, case.q.shape)
+    state = engine.solve(limbs, case.e, q, replace(case.home, T=reached.T), free=True)
+    joints = [np.asarray(a) / max(case.program.size, 1.0) for a in state.joints]
+    return [np.concatenate([a.ravel() for a in joints]), state.status, state.iterations]
+
+
+def linearize(engine: Engine, case: Case) -> Results:
+    """Return all rows over the largest number in them."""
+    state = _close(case)
+    rows = []
+    for free in (False, True):
+        blocks = engine.linearize(case.program, case.e, case.q, state, free)
+        parts = [getattr(b, c) for b in (*blocks.closure, *blocks.passive) for c in "UAEQ"]
+        rows.append(np.concatenate([part.ravel() for part in parts]))
+    return [np.concatenate([part / np.abs(part).max(initial=1e-300) for part in rows])]
+
+
+def differentiate(engine: Engine, case: Case) -> Results:
+    """Return derivatives of the platform over the largest of a robot."""
+    shape = case.q.shape[:2]
+    inputs = draw_map(case.program, shape, True)
+    both = engine.differentiate(case.program, case.e, case.q, _close(case), inputs)
+    return [np.concatenate([part.ravel() / np.abs(part).max() for part in both])]
+
+
+def fold(engine: Engine, case: Case) -> Results:
+    """Return R'R over the largest number in it, of rows with parts of zeros and of all sizes."""
+    rng = np.random.default_rng(len(case.name))
+    columns = int(rng.integers(2, 60))
+    rows = rng.normal(size=(TRIALS, 5 * columns, columns)) * 10.0 ** rng.uniform(-3, 3, columns)
+    rows[:, : len(rows[0]) // 2, : columns // 2] = 0.0
+    R = engine.fold(np.zeros((TRIALS, columns, columns)), rows)
+    scale = np.linalg.norm(rows, axis=1)
+    return [(R.swapaxes(1, 2) @ R) / scale[:, :, None] / scale[:, None]]
+
+
+def _close(case: Case) -> State:
+    """Return the state at which all engines begin: one with the same bits on every machine."""
+    return select_engine("native:baseline").solve(case.program, case.e, case.q, case.home)
+
+
+FUNCTIONS: dict[str, tuple[Callable[[Engine, Case], Results], str]] = {
+    "forward kinematics": (solve_forward, "size of the robot"),
+    "inverse kinematics": (solve_inverse, "size of the robot, rad"),
+    "linearized closure": (linearize, "largest entry"),
+    "sensitivities": (differentiate, "largest entry"),
+    "factor": (fold, "lengths of its columns"),
+}
+
+
+def make_cases() -> list[Case]:
+    """Return every shipped robot, displaced and near home."""
+    return [make_case(load_robot(name), t=TRIALS, n=POSES) for name in ROBOTS]
+
+
+def compare_functions() -> dict[str, Any]:
+    """Return the largest deviation of each function, and in how many cases counts differ."""
+    native, plain, rows = select_engine("native"), select_engine("numpy"), []
+    for name, (function, unit) in FUNCTIONS.items():
+        worst, different = 0.0, 0
+        for case in make_cases():
+            mine, theirs = function(native, case), function(plain, case)
+            worst = max(worst, float(np.abs(mine[0] - theirs[0]).max()))
+            counts = zip(mine[1:], theirs[1:], strict=True)
+            different += sum(int((a != b).sum()) for a, b in counts)
+        rows.append([name, len(ROBOTS), worst, unit, different])
+    return {
+        "columns": [
+            "function",
+            "robots",
+            "largest deviation",
+            "in units of",
+            "other status or steps",
+        ],
+        "formats": ["", "d", ".1e", "", "d"],
+        "rows": rows,
+    }
+
+
+# --- fits
+
+
+def compare_fits() -> dict[str, Any]:
+    """Return the largest deviations of estimates and of their standard deviations.
+
+    Estimates differ in standard deviations, and in tolerances where these are infinite.
+    """
+    rows = []
+    for method, value in METHODS.items():
+        of_estimate, of_sd, ranks = 0.0, 0.0, 0
+        for name in FITTED:
+            fits = []
+            for engine in ("numpy", "native"):
+                with use_engine(engine):
+                    robot = load_robot(name)
+                    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+                    at = sample_workspace(truth, 40, seed=1).coordinates
+                    noise = Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))  # [rad] and [m]
+                    data = simulate(truth, at, Instrument((Sensor(Pose(), noise),)), seed=2)
+                    fits.append(identify(robot, data, value))
+            one, two = fits
+            sd, other = one.standard_deviations, two.standard_deviations
+            finite = np.isfinite(sd) & (sd > 0.0)
+            unit = np.where(finite, sd, one.tolerance)
+            away = np.abs(one.estimate - two.estimate) / unit
+            of_estimate = max(of_estimate, float(away.max()))
+            of_sd = max(of_sd, float(np.abs(sd[finite] / other[finite] - 1.0).max(initial=0.0)))
+            ranks += int(one.rank != two.rank)
+        rows.append([method, len(FITTED), of_estimate, of_sd, ranks])
+    return {
+        "columns": [
+            "method",
+            "robots",
+            "estimate [standard deviations]",
+            "standard deviation",
+            "other rank",
+        ],
+        "formats": ["", "d", ".1e", ".1e", "d"],
+        "rows": rows,
+    }
+
+
+# --- instruction sets
+
+
+def compare_instruction_sets() -> dict[str, Any]:
+    """Return the digest of each function's results, and the instruction sets that have it."""
+    from loopcal_native import list_instruction_sets
+
+    sets, rows = list(list_instruction_sets()), []
+    for name, (function, _) in FUNCTIONS.items():
+        digests: dict[str, list[str]] = {}
+        for chosen in sets:
+            digest = hashlib.sha256()
+            engine = select_engine(f"native:{chosen}")
+            for case in make_cases():
+                for array in function(engine, case):
+                    digest.update(np.ascontiguousarray(array).tobytes())
+            digests.setdefault(digest.hexdigest()[:16], []).append(chosen)
+        rows += [[name, digest, ", ".join(chosen)] for digest, chosen in digests.items()]
+    return {
+        "columns": ["function", "SHA-256 of all results", "instruction sets"],
+        "formats": ["", "", ""],
+        "rows": rows,
+    }

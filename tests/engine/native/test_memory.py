@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The memory of a process does not grow with the number of calls of the native engine."""
+
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import resource
+import numpy as np
+from loopcal.engine import select_engine
+from tests.engine.cases import draw_map, make_case
+from tests import zoo
+
+engine, case = select_engine("native"), make_case(zoo.five_bar(), n=3)
+arguments = case.program, case.e, case.q
+R, rows = np.zeros((2, 9, 9)), np.ones((2, 12, 9))
+inputs = draw_map(case.program, (1, 3), True)
+
+def call(times):
+    for _ in range(times):
+        state = engine.solve(*arguments, case.home)
+        engine.linearize(*arguments, state)
+        engine.differentiate(*arguments, state, inputs)
+        engine.fold(R, rows)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+before = call(1000)
+print(call(25_000) - before)
+"""
+
+ALLOWED = 512
+"""[kB] growth of the peak; 100,000 calls that lose 16 bytes each would need 1600."""
+
+
+@pytest.mark.evidence
+def test_peak_memory_does_not_grow_in_100_000_calls(root):
+    command = [sys.executable, "-c", SCRIPT]
+    process = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True)
+    assert int(process.stdout) <= ALLOWED
