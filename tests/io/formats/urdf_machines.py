@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """URDF files of machines that are drawn at home, and a solver of their closures without loopcal.
 
 A machine is a list of joints between bodies, with frames in the base. `write_machine` spans a tree,
