@@ -15,7 +15,9 @@ from loopcal.geometry.euler_angles import wrap_angle as wrap_angle
 from loopcal.geometry.orientation_forms import OrientationForm as OrientationForm
 from loopcal.geometry.orientation_forms import parse_orientation as parse_orientation
 from loopcal.geometry.rigid_transforms import apply_twist as apply_twist
+from loopcal.geometry.rigid_transforms import differentiate_by_entries as differentiate_by_entries
 from loopcal.geometry.rigid_transforms import differentiate_by_frames as differentiate_by_frames
+from loopcal.geometry.rigid_transforms import differentiate_entries as differentiate_entries
 from loopcal.geometry.rigid_transforms import invert_pose as invert_pose
 from loopcal.geometry.rigid_transforms import make_pose as make_pose
 from loopcal.geometry.rigid_transforms import pose_difference as pose_difference

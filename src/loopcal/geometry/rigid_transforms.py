@@ -70,3 +70,25 @@ def differentiate_by_frames(T: FloatArray) -> FloatArray:
     R, t = T[..., :3, :3], T[..., :3, 3]
     eye = np.eye(3)
     return stack_blocks(((eye, None, R, None), (-hat(t), eye, None, R)))
+
+
+def differentiate_entries(T: FloatArray) -> FloatArray:
+    """Return the derivative (..., 12, 6) of the numbers [R t] of poses, row by row, by the twist.
+
+    A column r of the rotation moves by `omega x r`, the origin by `v`.
+    """
+    slope = np.zeros((*T.shape[:-2], 3, 4, 6))
+    columns = np.swapaxes(T[..., :3, :3], -1, -2)
+    slope[..., :3, :3] = -np.swapaxes(hat(columns), -3, -2)
+    slope[..., 3, 3:] = np.eye(3)
+    return slope.reshape(*T.shape[:-2], 12, 6)
+
+
+def differentiate_by_entries(T: FloatArray) -> FloatArray:
+    """Return the derivative (..., 6, 12) of the twist by the numbers of a pose.
+
+    `omega` is half the sum of r x dr over the columns of the rotation. It is the inverse of
+    `differentiate_entries` for motions of a rigid body.
+    """
+    scale = np.repeat([0.5, 1.0], 3)[:, None]
+    return scale * np.swapaxes(differentiate_entries(T), -1, -2)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds import ActuatorReadings, Kind
-from loopcal.mechanism import Mechanism, Solution, inverse
+from loopcal.mechanism import Mechanism, Solution, inverse, select_platform_entries
 from loopcal.typing import FloatArray
 
 # --- commanded poses
@@ -88,6 +88,7 @@ def select_joint_values(
     """
     actuators = [actuator.name for actuator in robot.actuators]
     passive = _index_passive_joints(robot)
+    entries = select_platform_entries(robot, state) if robot.stages else {}
     values = {}
     for name in names:
         if name in actuators:
@@ -95,6 +96,14 @@ def select_joint_values(
         elif name in passive:
             group, limb, joint = passive[name]
             values[name] = state.joints[group][:, :, limb, joint]
+        elif name in entries:
+            values[name] = entries[name]
+        elif ":" in name:
+            stage, stages = name.partition(":")[0], [stage.name for stage in robot.stages]
+            raise DataError(
+                f"{robot.name!r} has no stage {stage!r}{suggest_names(stage, stages)}; "
+                f"{'its stages are ' + ', '.join(stages) if stages else 'it is not a chain'}"
+            )
         else:
             known = [*actuators, *passive]
             raise DataError(

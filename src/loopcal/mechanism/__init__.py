@@ -86,6 +86,15 @@ if TYPE_CHECKING:
         differentiate_passive_joints as differentiate_passive_joints,
     )
     from loopcal.mechanism.sensitivity import differentiate_pose as differentiate_pose
+    from loopcal.mechanism.sensitivity import (
+        differentiate_sensed_values as differentiate_sensed_values,
+    )
+    from loopcal.mechanism.stages.chain_kinematics import (
+        name_platform_entries as name_platform_entries,
+    )
+    from loopcal.mechanism.stages.chain_kinematics import (
+        select_platform_entries as select_platform_entries,
+    )
     from loopcal.mechanism.states import Status as Status
     from loopcal.mechanism.states import compute_limb_frames as compute_limb_frames
     from loopcal.mechanism.states import driven_values as driven_values
@@ -140,7 +149,10 @@ else:
             """,
             "loopcal.mechanism.sensitivity": """
                 PassiveSensitivity PoseSensitivity differentiate_passive_joints
-                differentiate_pose
+                differentiate_pose differentiate_sensed_values
+            """,
+            "loopcal.mechanism.stages.chain_kinematics": """
+                name_platform_entries select_platform_entries
             """,
             "loopcal.mechanism.states": "Status compute_limb_frames driven_values select_poses",
             "loopcal.mechanism.transmission": """

@@ -22,7 +22,12 @@ from loopcal import engine
 from loopcal.engine import Block, State
 from loopcal.mechanism.model import Columns, LimbMap, Mechanism
 from loopcal.mechanism.parameter_units import ParameterUnits
-from loopcal.mechanism.stages.chain_kinematics import differentiate_end, differentiate_joints
+from loopcal.mechanism.stages.chain_kinematics import (
+    differentiate_end,
+    differentiate_joints,
+    differentiate_platform_entries,
+    name_platform_entries,
+)
 from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
@@ -116,6 +121,30 @@ def differentiate_passive_joints(
             readings[rows][:, :, places] = both[..., cut:]
     parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, parameters, readings)
+
+
+def differentiate_sensed_values(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
+) -> PassiveSensitivity:
+    """Differentiate passive joints and the numbers of platforms of stages, by name."""
+    known: list[str] = []
+    parts: list[tuple[FloatArray, FloatArray]] = []
+    for stage in robot.stages:
+        entries = name_platform_entries(stage.name)
+        if not set(entries).isdisjoint(names):
+            known += entries
+            parts.append(
+                differentiate_platform_entries(
+                    robot, values, q, state, differentiate_pose, stage.name
+                )
+            )
+    if not set(names) <= set(known):
+        joints = differentiate_passive_joints(robot, values, q, state)
+        known += joints.names
+        parts.append((joints.parameters, joints.readings))
+    places = [known.index(name) for name in names]
+    whole = (np.concatenate(arrays, axis=2)[:, :, places] for arrays in zip(*parts, strict=True))
+    return PassiveSensitivity(tuple(names), *whole)
 
 
 def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:

@@ -27,8 +27,8 @@ from loopcal.estimate.poses.smooth_errors import SmoothErrors
 from loopcal.measure import Evaluation, select_joint_values
 from loopcal.mechanism import (
     Status,
-    differentiate_passive_joints,
     differentiate_pose,
+    differentiate_sensed_values,
     forward_trials,
     joints_from_readings,
 )
@@ -120,9 +120,8 @@ def linearize_poses(
         unit = np.eye(len(actuators))
         turns = {n: unit[actuators.index(n)] * reading_scale[None] for n in names if n in actuators}
     if passive:
-        moved = differentiate_passive_joints(robot, values, q, state)
-        for name in passive:
-            i = moved.names.index(name)
+        moved = differentiate_sensed_values(robot, values, q, state, passive)
+        for i, name in enumerate(passive):
             slopes[name] = scale_parameters(free, moved.parameters[:, :, i])
             if reading_scale is not None:
                 turns[name] = moved.readings[:, :, i] * reading_scale

@@ -38,7 +38,7 @@ def list_error_groups(kind: Kind) -> tuple[ErrorGroup, ...]:
     """Return the errors of one row of a kind."""
     residuals = kind.noise_columns
     targets = {"": tuple(range(len(residuals)))}
-    if kind.sensed_joints:
+    if kind.sensed_joints and not kind.of:
         targets = {name: (i,) for i, name in enumerate(kind.sensed_joints)}
     elif residuals == kind.columns:
         targets = dict(kind.target_columns)

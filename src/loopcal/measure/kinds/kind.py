@@ -28,6 +28,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
+from loopcal.measure.kinds import stage_platforms
 from loopcal.measure.kinds.rows import (
     Column,
     Evaluation,
@@ -76,6 +77,8 @@ class Kind(ABC):
         Setup items that `unknown` may list.
     unknown : tuple of str
         Setup items that are unknown.
+    of : str
+        The stage of a chain whose platform is measured; empty for the end platform.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every kind is a dataclass
@@ -89,6 +92,7 @@ class Kind(ABC):
     angle_error: ClassVar[str] = "angle"
     allowed_unknown: ClassVar[tuple[str, ...]] = ()
     unknown: tuple[str, ...] = ()
+    of: str = ""
 
     def __post_init__(self) -> None:
         names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
@@ -97,6 +101,7 @@ class Kind(ABC):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
+        stage_platforms.check_stage(self.name, self.of, self.poses_per_row)
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
@@ -127,7 +132,7 @@ class Kind(ABC):
     @property
     def sensed_joints(self) -> tuple[str, ...]:
         """Names of the j joints, driven or passive, whose values the residual depends on."""
-        return ()
+        return stage_platforms.list_sensed_numbers(self.of)
 
     def stack_joints(self, joints: Mapping[str, FloatArray], rows: IntArray) -> FloatArray | None:
         """Return the values (.., r, j) of the sensed joints at the poses of rows (r,), from those
@@ -290,9 +295,11 @@ class Kind(ABC):
         if not isinstance(measured, MeasuredColumns):
             measured = self.prepare_columns(measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance
+        T = stage_platforms.find_platform(self.of, T, joints)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
         result = drop_rounding(self._evaluate(T, measured.reference, values, joints))
+        result = stage_platforms.depend_on_platform(self.of, result, T)
         if self.shared_errors:
             result = add_shared_errors(self, result, measured.columns, values)
         return result if measured.is_complete else zero_absent(result, measured.present)
@@ -326,6 +333,7 @@ class Kind(ABC):
         joints = np.zeros_like(noise) if joints is None else joints
         if self.shared_errors:
             noise = noise + sum_shared_errors(self, values) @ spread_components(self).T
+        T = stage_platforms.find_platform(self.of, T, joints)
         return self._measure(T, noise, values, joints)
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
@@ -373,18 +381,9 @@ class Kind(ABC):
         return tuple(self.wraps_angles and c.dimension is Dimension.ANGLE for c in self.columns)
 
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
-        """Return derivatives side by side: by the twist, then by each unknown setup item.
+        """Return derivatives (*shape, 6 + u): by the twist, then by each unknown setup item.
 
-        Parameters
-        ----------
-        blocks : setup item or "twist" -> (.., w)
-            A missing block is zero.
-        shape : tuple of int
-            Leading axes of the result.
-
-        Returns
-        -------
-        rows : (*shape, 6 + u)
+        blocks : setup item or "twist" -> (.., w); a missing block is zero. shape : leading axes.
         """
         if not self.own_items and "twist" in blocks and blocks["twist"].shape[:-1] == shape:
             return blocks["twist"]

@@ -203,16 +203,8 @@ def differentiate_platform_entries(
     """
     i = [stage.name for stage in robot.stages].index(name)
     twist = _differentiate_platform(robot, values, q, state, differentiate, robot.all_parameters, i)
-    slope = differentiate_entries(get_platforms(robot, state)[i])
+    slope = geometry.differentiate_entries(get_platforms(robot, state)[i])
     return Derivatives(*(slope @ part for part in twist))
-
-
-def differentiate_entries(T: FloatArray) -> FloatArray:
-    """Return the derivative (.., 12, 6) of the numbers [R t] of poses, row by row, by the twist."""
-    slope = np.zeros((*T.shape[:-2], 3, 4, 6))
-    slope[..., :3, :3] = -np.moveaxis(geometry.hat(np.swapaxes(T[..., :3, :3], -1, -2)), -3, -2)
-    slope[..., 3, 3:] = np.eye(3)
-    return slope.reshape(*T.shape[:-2], 12, 6)
 
 
 def _differentiate_platform(

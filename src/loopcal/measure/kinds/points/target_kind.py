@@ -49,6 +49,8 @@ class TargetKind(Kind):
         group of rows).
     frame : str
         Name of the frame. Kinds that use the same name share its parameters.
+    of : str
+        Stage of a chain on whose platform the targets are; default: the end platform.
 
     Raises
     ------
@@ -61,6 +63,7 @@ class TargetKind(Kind):
     T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
+    of: str = ""
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
     per_target: ClassVar[tuple[Column, ...]]
@@ -78,12 +81,13 @@ class TargetKind(Kind):
             set_fields(self, places=check_array(places, "the places of the targets", shape))
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
-        """Return the kind with its targets at the tool's origin, unless it states their places."""
+        """Return the kind with its targets at the origin of the tool, or of the stage's platform,
+        unless it states their places.
+        """
         if self.has_tool:
             return self
-        return replace(
-            self, places=np.repeat(T_platform_tool[None, :3, 3], len(self.targets), axis=0)
-        )
+        origin = np.zeros(3) if self.of else T_platform_tool[:3, 3]
+        return replace(self, places=np.repeat(origin[None], len(self.targets), axis=0))
 
     @property
     def has_tool(self) -> bool:

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration of chains of stages: chi-square of many draws, targets and sensors on any stage."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from loopcal.errors import DataError
+from loopcal.estimate import LeastSquares, identify, identify_trials
+from loopcal.io import load_measurements, save_measurements
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    JointSensor,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    Separation,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
+from loopcal.mechanism import Mechanism, sample_workspace
+from tests.zoo import load_cached_robot
+
+Array = NDArray[np.float64]
+DRAWS, POSES = 20, 16
+PLACES = np.array([[1.0, 0.2, 0.1], [4.0, -0.2, 0.1]])
+FRAME = {"tracker.x": 0.3, "tracker.rz": 0.2}
+
+
+@pytest.mark.parametrize("name", ["arm-6r", "excavator", "tricept"])
+def test_chi_square_of_simulated_calibrations_agrees_with_its_distribution(name: str) -> None:
+    robot = load_cached_robot(name)
+    poses = sample_workspace(robot, POSES, seed=1).coordinates
+    noise = Gaussian(np.repeat([5e-5, 1e-5], 3))  # [rad, m]
+    instrument = Instrument((Sensor(Pose("rotation-vector"), noise),))
+    truth = sample_truth(robot, DRAWS, 2)
+    trials = simulate_trials(robot, truth, poses, instrument, 3)
+    fits = identify_trials(robot, trials, LeastSquares())
+    assert fits.converged.all()
+    freedoms = DRAWS * (6 * POSES - int(robot.parameters.free.sum()))
+    low, high = chi2.ppf([0.005, 0.995], freedoms)
+    assert low < fits.cost.sum() < high
+
+
+def make_kinds() -> tuple[Position, ...]:
+    """Return two targets on the bucket, the boom and the stick, seen by one tracker."""
+    return tuple(
+        Position(
+            targets=(f"{label}1", f"{label}2"),
+            places=share * PLACES,
+            of=stage,
+            unknown=("frame",),
+            frame="tracker",
+        )
+        for label, stage, share in (("t", "", 0.4), ("b", "boom", 1.0), ("s", "stick", 0.5))
+    )
+
+
+def measure_stages(robot: Mechanism) -> tuple[Mechanism, Measurements]:
+    """Return a machine with errors, and measured positions of targets on three of its stages."""
+    sensors = tuple(Sensor(kind, Gaussian(np.full(6, 1e-4))) for kind in make_kinds())
+    true = robot.with_values(sample_truth(robot, 1, 5)[0])
+    poses = sample_workspace(robot, 20, seed=1).coordinates
+    return true, simulate(true, poses, Instrument(sensors), 6, nuisance_values=FRAME)
+
+
+def test_targets_on_any_stage_calibrate_a_chain_in_an_unknown_frame() -> None:
+    robot = load_cached_robot("excavator")
+    true, data = measure_stages(robot)
+    fit = identify(robot, data)
+    low, high = chi2.ppf([0.005, 0.995], fit.residual_test.dof)
+    assert low < fit.chi_square < high
+    sd = fit.standard_deviations
+    error = (fit.robot.values - true.values)[fit.free_parameters.places] / sd
+    assert np.abs(error).max() < 4.5  # of 26 values
+
+
+def test_targets_on_a_stage_do_not_depend_on_the_joints_behind_it() -> None:
+    robot = load_cached_robot("excavator")
+    _, data = measure_stages(robot)
+    alone = replace(data, observations=(data.observations[1],))
+    moved = data.readings.copy()
+    moved[:, 2:] += 0.05  # [m] of the cylinders of stick and bucket
+    fits = [
+        identify(robot, replace(alone, readings=readings)) for readings in (data.readings, moved)
+    ]
+    np.testing.assert_allclose(fits[0].robot.values, fits[1].robot.values, atol=1e-9)
+    behind = [n.startswith(("stick.", "bucket.")) for n in robot.parameters.names]
+    np.testing.assert_array_equal(fits[0].robot.values[behind], robot.parameters.nominal[behind])
+
+
+def test_targets_on_a_stage_are_written_and_read(tmp_path: Path) -> None:
+    robot = load_cached_robot("excavator")
+    _, data = measure_stages(robot)
+    save_measurements(data, tmp_path / "targets.csv", robot)
+    read = load_measurements(tmp_path / "targets.csv", robot)
+    assert [rows.kind.of for rows in read.observations] == ["", "boom", "stick"]
+    assert identify(robot, read).chi_square == pytest.approx(identify(robot, data).chi_square)
+
+
+def test_sensor_on_a_joint_of_a_stage_is_named_with_the_stage() -> None:
+    robot = load_cached_robot("excavator")
+    kind = JointSensor(joints=("boom.hinge.pin", "stick.hinge.pin"), measures="angle")
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(2, 1e-5))),))
+    true = robot.with_values(sample_truth(robot, 1, 7)[0])
+    data = simulate(true, sample_workspace(robot, 20, seed=2).coordinates, instrument, 8)
+    fit = identify(robot, data)
+    low, high = chi2.ppf([0.005, 0.995], fit.residual_test.dof)
+    assert low < fit.chi_square < high
+
+
+def test_targets_on_an_unknown_stage_are_refused() -> None:
+    robot = load_cached_robot("excavator")
+    poses = sample_workspace(robot, 2, seed=1).coordinates
+    instrument = Instrument((Sensor(Position(of="bom"), Gaussian(np.full(3, 1e-4))),))
+    with pytest.raises(DataError, match="no stage 'bom'"):
+        simulate(robot, poses, instrument, 1)
+    with pytest.raises(DataError, match="it is not a chain"):
+        simulate(load_cached_robot("3-prs"), np.array([[0.7, 0.0, 0.0]]), instrument, 1)
+
+
+def test_a_kind_that_compares_poses_has_no_stage() -> None:
+    with pytest.raises(DataError, match="compares poses"):
+        Separation(of="boom")
