@@ -19,7 +19,7 @@ from benchmarks.bench_identify import _measured, _poses, _tracker
 from benchmarks.bench_kinematics import _problem
 from benchmarks.bench_sensitivity import _first_answer, _record
 from benchmarks.bench_start import _import_numpy, _python
-from benchmarks.harness import Metric, measure_ratio
+from benchmarks.harness import Metric, measure_ratio, time_once
 from loopcal.engine import get_current_engine
 from loopcal.engine.selection import VARIABLE
 from loopcal.estimate import LeastSquares, identify, identify_trials
@@ -36,7 +36,7 @@ from loopcal.measure import (
 from loopcal.mechanism import Mechanism, differentiate_pose, forward, forward_trials, inverse
 
 ENGINES = ("numpy", "native") if find_spec("loopcal_native") else ("numpy",)
-POSES, TRIALS = 10_000, 200
+POSES, TRIALS, MANY = 10_000, 200, 10_000
 ROOT = Path(__file__).resolve().parents[1]
 
 measure = partial(measure_ratio, clock=time.process_time, tolerance=0.3)
@@ -109,6 +109,38 @@ def bench_stacked_fits() -> list[Metric]:
         ),
         3,
     )
+
+
+def bench_chord_fits() -> list[Metric]:
+    """The same fits as in studies: the first step of all by one factor."""
+    robot = load_robot("hexapod-42")
+    trials = _simulate(TRIALS)
+    rows = np.random.default_rng(0).normal(size=(TRIALS, 300, 43))
+    fit = partial(identify_trials, robot, trials, LeastSquares(), chord_start=True)
+    return _of_each("chord_fits", lambda: (fit, lambda: np.linalg.qr(rows, mode="r")), 3)
+
+
+def bench_threads() -> list[Metric]:
+    """How many times as fast two threads are as one, in wall time: 10 000 fits of studies. It needs
+    two idle processors.
+    """
+    robot, trials = load_robot("hexapod-42"), _simulate(MANY)
+    fit = partial(identify_trials, robot, trials, LeastSquares(), chord_start=True)
+    metrics = []
+    for engine in ENGINES:
+        with use_engine(engine):
+            one, two = (time_once(partial(fit, threads=n)) for n in (1, 2))
+        name = f"engine.{engine}.two_threads"
+        note = f"one {one:.1f} s, two {two:.1f} s"
+        metrics.append(Metric(name, one / two, direction="higher", tolerance=0.3, note=note))
+    return metrics
+
+
+def _simulate(count: int) -> Trials:
+    """Return measurements of 50 poses of so many hexapods."""
+    robot = load_robot("hexapod-42")
+    truth = sample_truth(robot, count, 0)
+    return simulate_trials(robot, truth, _poses(robot, 50), _tracker(), 0)
 
 
 def bench_single_fit() -> list[Metric]:

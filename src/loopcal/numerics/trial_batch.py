@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
+from functools import cache
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -21,20 +22,26 @@ def map_arrays(function: Callable[..., np.ndarray], *values: Value) -> Value:
     first one. What is None in one of them is None. A dataclass keeps the fields that it names in
     `shared`.
     """
-    if any(value is None for value in values):
-        return None  # type: ignore[return-value]
     first: Any = values[0]
+    if first is None or (len(values) > 1 and any(value is None for value in values)):
+        return None  # type: ignore[return-value]
     if isinstance(first, np.ndarray):
         return function(*values)  # type: ignore[return-value]
     if isinstance(first, tuple):
         parts: Any = zip(*values, strict=True)  # type: ignore[call-overload]
         return tuple(map_arrays(function, *part) for part in parts)  # type: ignore[return-value]
     if is_dataclass(first):
-        shared = getattr(first, "shared", ())
-        names = [f.name for f in fields(first) if f.name not in shared]
-        made = {n: map_arrays(function, *(getattr(value, n) for value in values)) for n in names}
+        names = _list_batched(type(first))
+        made = {n: map_arrays(function, *[getattr(value, n) for value in values]) for n in names}
         return replace(first, **made)  # type: ignore[type-var]
     return first
+
+
+@cache
+def _list_batched(kind: type[Any]) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass that belong to trials."""
+    shared = getattr(kind, "shared", ())
+    return tuple(f.name for f in fields(kind) if f.name not in shared)
 
 
 class TrialBatch:
@@ -83,6 +90,5 @@ class TrialBatch:
 def _count_trials(value: Any) -> int:
     """Return the length of the first array of a dataclass."""
     while is_dataclass(value):
-        shared = getattr(value, "shared", ())
-        value = next(getattr(value, f.name) for f in fields(value) if f.name not in shared)
+        value = getattr(value, _list_batched(type(value))[0])
     return len(value)
