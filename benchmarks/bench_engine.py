@@ -29,6 +29,7 @@ from loopcal.measure import (
     Gaussian,
     Instrument,
     Sensor,
+    Trials,
     sample_truth,
     simulate,
     simulate_trials,
