@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal.errors import EstimationError
 from loopcal.estimate import (
     GCV,
     MAP,
@@ -119,3 +120,15 @@ def test_fits_without_a_shared_factor_are_the_usual_ones(method):
     usual, chords = fit_both(DELTA, trials, method)
     assert np.array_equal(usual.values, chords.values)
     assert np.array_equal(usual.iterations, chords.iterations)
+
+
+def test_fits_of_fewer_rows_than_parameters_are_the_usual_ones():
+    trials = simulate(HEXAPOD, 2, 12, kind=Position())  # 36 rows for 42 parameters
+    usual, chords = fit_both(HEXAPOD, trials, LeastSquares())
+    assert np.array_equal(usual.values, chords.values)
+
+
+def test_no_trials_are_refused():
+    trials = simulate(HEXAPOD, 1, 12)
+    with pytest.raises(EstimationError, match="no trials"):
+        identify_trials(HEXAPOD, replace(trials, truth=trials.truth[:0]))

@@ -3,6 +3,7 @@
 instead of exceptions.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,18 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal import engine, geometry
 from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.findings.catalog import load_catalog
-from loopcal.mechanism import Status, build, forward, forward_trials, inverse, jacobian
+from loopcal.mechanism import (
+    Address,
+    LinearMap,
+    Status,
+    build,
+    compute_readings,
+    forward,
+    forward_trials,
+    inverse,
+    jacobian,
+)
+from loopcal.parameters import Parameter
 from tests import zoo
 from tests.engine.cases import actuated_joint_values, stack_dense_rows
 
@@ -165,8 +177,6 @@ def test_start_selects_the_assembly_mode():
 
 def move_solution(robot, sol, T):
     """Move the platform of a solution and reverse its closure sign."""
-    from dataclasses import replace
-
     state = replace(sol.state, T=T[None], closure_sign=-sol.state.closure_sign)
     return replace(sol, T=T, state=state)
 
@@ -278,6 +288,31 @@ def test_jacobian_has_labels_and_is_the_derivative_of_the_poses():
         assert_allclose(result.of(name), slope, atol=1e-5)  # [rad/m, m/m] of a forward difference
     with pytest.raises(DataError, match="no column 'leg9'"):
         result.of("leg9")
+
+
+def test_jacobian_contains_backlash_where_directions_of_approach_are_given():
+    assembly = zoo.mixed_hexapod_assembly()
+    actuator = assembly.actuators[0]
+    backlash = Parameter(f"{actuator.name}.backlash", actuator.dimension, 0.0)
+    address = Address(actuator.name, "transmission", "backlash")
+    robot = build(
+        replace(
+            assembly,
+            parameters=(*assembly.parameters, backlash),
+            maps=(*assembly.maps, LinearMap(backlash.name, address)),
+        )
+    )
+    rng = np.random.default_rng(6)
+    robot = robot.with_values(robot.values + 1e-3 * rng.standard_normal(len(robot.values)))
+    q = compute_readings(robot, robot.values[None], robot.home_state)[0]
+    readings = np.hstack([q, np.ones_like(q)])
+    result, step = jacobian(robot, readings), 1e-6
+    for name in (backlash.name, "limb1.link0.x", "limb4.link0.x"):
+        change = step * (np.array(robot.parameters.names) == name)
+        ends = [forward(robot.with_values(robot.values + c), readings).T for c in (change, -change)]
+        slope = geometry.pose_difference(*ends) / (2 * step)
+        assert np.abs(slope).max() > 0.01  # [rad/m, m/m]
+        assert_allclose(result.of(name), slope, atol=1e-6)  # of a central difference
 
 
 def test_repr_of_robots_and_results_is_short():

@@ -135,3 +135,10 @@ def test_inverse_of_many_machines_with_one_start_equals_that_of_each_machine(nam
         expected = compute_readings(robot, values[i : i + 1], alone)[0]
         np.testing.assert_allclose(both, expected, rtol=0, atol=1e-12)
         assert np.abs(both - compute_readings(robot, robot.values[None], start)[0]).max() > 1e-5
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_no_poses_have_no_readings(name):
+    robot = load_cached_robot(name)
+    for target in (np.zeros((0, 4, 4)), np.zeros((0, len(robot.controlled)))):
+        assert inverse(robot, target).q.shape == (0, len(robot.actuators))

@@ -74,6 +74,8 @@ def identify_trials(
     check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
     check_type(trials, Trials, "trials", "as from simulate_trials(...)")
     check_threads(threads)
+    if not len(trials):
+        raise EstimationError("there are no trials; simulate at least one machine")
     options = merge_options(options, method)
     for name in ("loss", "prior", "nuisance", "excluded_poses"):
         value = getattr(options, name)
@@ -176,5 +178,5 @@ def _descend_from_chords(
 def _divide(problem: Problem) -> Iterator[IntArray]:
     """Yield the numbers of the trials of each part."""
     size, total = max(1, BLOCK // problem.poses.block_size), len(problem)
-    for first in range(0, max(total, 1), size):
+    for first in range(0, total, size):
         yield np.arange(first, min(first + size, total))

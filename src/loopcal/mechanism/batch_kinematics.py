@@ -139,6 +139,8 @@ def close_at_coordinates(
 ) -> State:
     """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states."""
     begin = start or robot.home_state
+    if not target.shape[1]:
+        return without_poses(robot.home_state, max(len(values), len(target)))
     if robot.stages:
         return inverse_stages(robot, values, target, begin, forward_trials, differentiate_pose)
     if count_shared_drives(robot.program):

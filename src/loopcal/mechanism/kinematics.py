@@ -263,8 +263,8 @@ def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = Non
     Parameters and raised errors as for `forward`. Rows that fail have NaN.
     """
     solution = forward(robot, readings, start)
-    values = robot.values[None]
-    derivatives = differentiate_pose(robot, values, solution.q[None], solution.state)
+    values, q = robot.values[None], np.atleast_2d(np.asarray(readings, dtype=np.float64))
+    derivatives = differentiate_pose(robot, values, q[None], solution.state)  # with directions
     return Jacobian(
         derivatives.parameters[0],
         robot.parameters.names,
@@ -281,7 +281,8 @@ def find_nearest_reachable(
 ) -> State:
     """Return states (t, n) with the reachable pose nearest to T (t | 1, n, 4, 4), without signs."""
     state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
-    if len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms):
+    is_full = len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms)
+    if is_full or not state.T.size:
         return state
     for _ in range(PROJECTION_STEPS):
         gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))

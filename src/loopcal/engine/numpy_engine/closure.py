@@ -24,11 +24,11 @@ def linearize(
 ) -> ClosureBlocks:
     """Linearize closure and eliminate the passive joints; see `loopcal.engine.linearize`."""
     t, n = state.T.shape[:2]
-    T, trial = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0), np.arange(t * n) // n
+    T, trial = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0), np.arange(t * n) // max(n, 1)
     closure, passive, eliminated = [], [], []
     for group, joints in zip(program.groups, state.joints, strict=True):
         values = joints if free else group.insert_driven(joints, q)
-        theta = values.reshape(t * n, len(group.limbs), -1).transpose(2, 1, 0)
+        theta = values.reshape(t * n, *values.shape[2:]).transpose(2, 1, 0)
         unknown = group.unknown_joints(free)
         with np.errstate(all="ignore"):
             chain = Chain(group, place_links(group, e).select(trial), T, theta, program.size)

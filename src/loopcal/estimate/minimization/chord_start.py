@@ -94,8 +94,10 @@ def share_factor(
     ]
     A = np.concatenate([kind.by_parameters.reshape(-1, p) for kind in kinds])
     q, r = np.linalg.qr(np.concatenate([A, fixed.matrix]))
+    if len(r) < p:  # fewer rows than parameters
+        return None
     _, is_regular = solve_regular(r[None], np.zeros((1, p)), tolerance)
-    if len(r) < p or not is_regular[0]:
+    if not is_regular[0]:
         return None
     inverse = np.linalg.solve(r, q.T)
     states, is_near = poses.next_start(solution, begin)
