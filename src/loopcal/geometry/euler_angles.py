@@ -73,7 +73,7 @@ def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
         c, s, i, j = np.cos(angle), np.sin(angle), (axis + 1) % 3, (axis + 2) % 3
         first, second = columns[i], columns[j]
         columns[i], columns[j] = first * c + second * s, second * c - first * s
-    return np.ascontiguousarray(np.stack(columns).T).reshape(*angles.shape[:-1], 3, 3)
+    return np.stack(columns).T.copy().reshape(*angles.shape[:-1], 3, 3)
 
 
 def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
