@@ -166,7 +166,7 @@ def bench_many_poses() -> list[Metric]:
     rows = np.random.default_rng(0).normal(size=(100, 6000, 43))
 
     def factorize() -> None:
-        np.linalg.qr(np.linalg.qr(rows, mode="r").reshape(-1, 43), mode="r")
+        np.linalg.qr(np.asarray(np.linalg.qr(rows, mode="r")).reshape(-1, 43), mode="r")
 
     return _of_each(
         "many_poses", lambda: (partial(identify, robot, data, LeastSquares()), factorize), 2

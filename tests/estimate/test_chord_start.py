@@ -39,7 +39,7 @@ def simulate(robot: Mechanism, count: int, poses: int, factor: float = 1.0, kind
     """Return measurements of machines whose errors are `factor` times those of the tolerances."""
     kind = Pose() if kind is None else kind
     truth = robot.values + factor * (sample_truth(robot, count, 2) - robot.values)
-    noise = Gaussian(tuple([1e-5] * len(kind.noise_columns)))
+    noise = Gaussian(np.full(len(kind.noise_columns), 1e-5))
     coordinates = sample_workspace(robot, poses, 1).coordinates
     instrument = Instrument((Sensor(kind, noise),))
     return simulate_trials(robot, truth, coordinates, instrument, 3)

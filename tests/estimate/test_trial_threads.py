@@ -31,8 +31,7 @@ POSES = BLOCK // 4
 def simulate(trials: int, kind=None, poses: int = POSES) -> Trials:
     """Return measurements of simulated deltas."""
     kind = Pose() if kind is None else kind
-    sigma = [1e-5] * len(kind.noise_columns)
-    instrument = Instrument((Sensor(kind, Gaussian(tuple(sigma))),))
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(len(kind.noise_columns), 1e-5))),))
     coordinates = sample_workspace(DELTA, poses, 1).coordinates
     return simulate_trials(DELTA, sample_truth(DELTA, trials, 2), coordinates, instrument, 3)
 
@@ -50,7 +49,7 @@ def test_results_depend_neither_on_threads_nor_on_the_number_of_trials(method):
 
 def test_all_parts_begin_with_the_same_unknown_frame():
     kind = Position(places=np.array([[0.03, -0.02, 0.05]]), unknown=("frame",))
-    instrument = Instrument((Sensor(kind, Gaussian((1e-5,) * 3)),))
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(3, 1e-5))),))
     coordinates = sample_workspace(DELTA, POSES, 1).coordinates
     station = {"frame.x": -2.5, "frame.y": -1.8, "frame.z": 0.1}
     truth = sample_truth(DELTA, 9, 2)

@@ -144,7 +144,7 @@ def multiply_triangles(q: Array) -> Array:
         for (mount, foot, head, home), length in zip(LINKS, lengths, strict=True):
             angles = solve_triangle(foot, head, length)
             turns = np.abs(np.angle(np.exp(1j * (angles - np.deg2rad(home)))))
-            T = T @ rotate_about_y(angles[turns.argmin()], *mount)
+            T = T @ rotate_about_y(float(angles[turns.argmin()]), *mount)
         poses.append(T)
     return np.array(poses)
 
@@ -155,6 +155,15 @@ def test_excavator_agrees_with_the_law_of_cosines() -> None:
     back = forward(machine, q)
     assert back.converged.all()
     np.testing.assert_allclose(back.T, multiply_triangles(q), rtol=0, atol=1e-9 * machine.size)
+
+
+def test_four_targets_in_four_coordinates_are_no_pose() -> None:
+    machine = load_cached_robot("excavator")
+    sample = sample_workspace(machine, 4, seed=1)
+    alone = [inverse(machine, row[None]).q[0] for row in sample.coordinates]
+    np.testing.assert_array_equal(inverse(machine, sample.coordinates).q, alone)
+    one = inverse(machine, sample.solution.T[2])
+    np.testing.assert_allclose(one.q[0], alone[2], rtol=0, atol=1e-9)  # [m, rad]
 
 
 # --- Tricept: a constraint solver

@@ -172,7 +172,11 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
     wanted = _as_numbers(target, shapes)
     values = robot.values[None]
-    if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
+    is_pose = wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4)
+    if wanted.ndim == 2 and c == 4 and is_pose:
+        # one pose, or four targets in four coordinates
+        is_pose = bool(np.array_equal(wanted[3], np.eye(4)[3]))
+    if is_pose:
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
         state = solve_in_mode(

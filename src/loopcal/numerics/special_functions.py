@@ -17,23 +17,21 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from scipy.special import (  # noqa: F401 names of this module
-        bdtr,
-        bdtrc,
-        betainc,
-        betaincinv,
-        chdtrc,
-        chdtri,
-        chndtr,
-        chndtrinc,
-        fdtrc,
-        fdtri,
-        gammaln,
-        ndtr,
-        ndtri,
-        stdtr,
-        stdtrit,
-    )
+    from scipy.special import bdtr as bdtr
+    from scipy.special import bdtrc as bdtrc
+    from scipy.special import betainc as betainc
+    from scipy.special import betaincinv as betaincinv
+    from scipy.special import chdtrc as chdtrc
+    from scipy.special import chdtri as chdtri
+    from scipy.special import chndtr as chndtr
+    from scipy.special import chndtrinc as chndtrinc
+    from scipy.special import fdtrc as fdtrc
+    from scipy.special import fdtri as fdtri
+    from scipy.special import gammaln as gammaln
+    from scipy.special import ndtr as ndtr
+    from scipy.special import ndtri as ndtri
+    from scipy.special import stdtr as stdtr
+    from scipy.special import stdtrit as stdtrit
 else:
 
     def __getattr__(name: str) -> Any:

@@ -94,11 +94,12 @@ def test_sensitivities_agree_with_finite_differences(tmp_path, machine) -> None:
     for i in range(6):
         step = 1e-5 * np.eye(6)[i]
         ends = [solver.forward(q[0] + s * step, "tool", start) for s in (1, -1)]
-        np.testing.assert_allclose(by_motor[:, i], twist(*ends, 2e-5), rtol=0, atol=1e-7)
+        np.testing.assert_allclose(by_motor[:, i], twist(ends[0], ends[1], 2e-5), rtol=0, atol=1e-7)
     for i in range(0, len(robot.values), 7):
         step = 1e-5 * np.eye(len(robot.values))[i]
         ends = [forward(robot.with_values(robot.values + s * step), q).T[0] for s in (1, -1)]
-        np.testing.assert_allclose(by_parameter[:, i], twist(*ends, 2e-5), rtol=0, atol=1e-7)
+        slope = twist(ends[0], ends[1], 2e-5)
+        np.testing.assert_allclose(by_parameter[:, i], slope, rtol=0, atol=1e-7)
 
 
 def twist(T: np.ndarray, other: np.ndarray, step: float) -> np.ndarray:

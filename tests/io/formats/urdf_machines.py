@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
@@ -34,7 +35,7 @@ class MachineJoint:
     is_motor: bool = False
 
 
-def make_pose(R: np.ndarray, p: Sequence[float]) -> np.ndarray:
+def make_pose(R: np.ndarray, p: ArrayLike) -> np.ndarray:
     """Return a pose (4, 4)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, p
@@ -66,11 +67,12 @@ def make_hexapod(legs: Sequence[str], seed: int = 0) -> list[MachineJoint]:
             "RUS": [(across, foot), (along, knee), (along, head)],
         }
         frames = places["PUS" if letters[0] == "P" else "RUS" if letters[0] == "R" else "UPS"]
-        bodies = [BASE, f"leg{k + 1}_a", f"leg{k + 1}_b", PLATFORM]
+        bodies = (BASE, f"leg{k + 1}_a", f"leg{k + 1}_b", PLATFORM)
         driven = letters.index("P") if "P" in letters else 0
         for i, (letter, (R, p)) in enumerate(zip(letters, frames, strict=True)):
             name = f"{letter.lower()}{k + 1}_{i + 1}"
-            joint = MachineJoint(name, letter, *bodies[i : i + 2], make_pose(R, p), i == driven)
+            a, b = bodies[i], bodies[i + 1]
+            joint = MachineJoint(name, letter, a, b, make_pose(R, p), i == driven)
             joints.append(joint)
     return joints
 
@@ -184,11 +186,11 @@ class UrdfSolver:
         self.overrides = dict(
             zip(content.get("joint_name", []), content.get("joint_type", []), strict=True)
         )
-        self.joints = {joint.get("name"): joint for joint in self.root.findall("joint")}
+        self.joints = {joint.attrib["name"]: joint for joint in self.root.findall("joint")}
         self.columns: dict[str, slice] = {}
         n = 0
         for name, joint in self.joints.items():
-            kind = self.overrides.get(name, joint.get("type"))
+            kind: str = self.overrides.get(name, joint.attrib["type"])
             width = {"SPHERICAL": 3, "FIXED": 0, "fixed": 0}.get(kind, 2 if "UJ" in kind else 1)
             self.columns[name] = slice(n, n + width)
             n += width
@@ -199,21 +201,21 @@ class UrdfSolver:
     def place(self, values: np.ndarray) -> dict[str, np.ndarray]:
         """Return the poses of all links in the base."""
         left = dict(self.joints)
-        children = {joint.find("child").get("link") for joint in left.values()}
-        links = [link.get("name") for link in self.root.findall("link")]
+        children = {find_link(joint, "child") for joint in left.values()}
+        links = [link.attrib["name"] for link in self.root.findall("link")]
         T = {next(link for link in links if link not in children): np.eye(4)}
         while left:
             for name, joint in list(left.items()):
-                parent = joint.find("parent").get("link")
+                parent = find_link(joint, "parent")
                 if parent in T:
                     origin = read_origin(joint.find("origin"))
                     motion = self._move(name, joint, values[self.columns[name]])
-                    T[joint.find("child").get("link")] = T[parent] @ origin @ motion
+                    T[find_link(joint, "child")] = T[parent] @ origin @ motion
                     del left[name]
         return T
 
     def _move(self, name: str, joint: ET.Element, value: np.ndarray) -> np.ndarray:
-        kind = self.overrides.get(name, joint.get("type"))
+        kind: str = self.overrides.get(name, joint.attrib["type"])
         if not value.size:
             return np.eye(4)
         if kind == "SPHERICAL":
@@ -230,15 +232,13 @@ class UrdfSolver:
         T = self.place(values)
         parts = []
         for pair, kind in zip(self.pairs, self.kinds, strict=True):
-            A, B = (
-                T[self.joints[n].find("child").get("link") if n in self.joints else n] for n in pair
-            )
+            A, B = (T[find_link(self.joints[n], "child") if n in self.joints else n] for n in pair)
             parts.append(A[:3, 3] - B[:3, 3])
             if kind == "6d":
                 parts.append(Rotation.from_matrix(A[:3, :3].T @ B[:3, :3]).as_rotvec())
         for constraint in self.root.findall("constraint"):
             A, B = (
-                T[constraint.find(end).get("link")] @ read_origin(constraint.find(f"{end}_origin"))
+                T[find_link(constraint, end)] @ read_origin(constraint.find(f"{end}_origin"))
                 for end in ("parent", "child")
             )
             parts.append(A[:3, 3] - B[:3, 3])
@@ -259,8 +259,8 @@ class UrdfSolver:
         """Return all joint values with the motors at q, with idle motions as at the start."""
         values = np.zeros(len(self.values)) if start is None else start.copy()
         values[self.driven] = q
+        r = self._residual(values)
         for _ in range(25):
-            r = self._residual(values)
             if np.abs(r).max() < 1e-14:
                 break
             J = np.empty((len(r), len(self.free)))
@@ -269,12 +269,20 @@ class UrdfSolver:
                 moved[i] += 1e-7
                 J[:, column] = (self._residual(moved) - r) / 1e-7
             values[self.free] -= np.linalg.lstsq(J, r, rcond=1e-6)[0]
+            r = self._residual(values)
         assert np.abs(r).max() < 1e-11  # [m, rad]
         return values
 
     def forward(self, q: np.ndarray, link: str, start: np.ndarray | None = None) -> np.ndarray:
         """Return the pose of a link with the motors at q."""
         return self.place(self.solve(q, start))[link]
+
+
+def find_link(element: ET.Element, end: str) -> str:
+    """Return the link of an end of a joint or constraint."""
+    found = element.find(end)
+    assert found is not None
+    return found.attrib["link"]
 
 
 def read_origin(origin: ET.Element | None) -> np.ndarray:
@@ -289,6 +297,5 @@ def read_origin(origin: ET.Element | None) -> np.ndarray:
 
 def read_vector(element: ET.Element | None, default: tuple[float, float, float]) -> np.ndarray:
     """Return the xyz of an element."""
-    if element is None or element.get("xyz") is None:
-        return np.array(default)
-    return np.array([float(v) for v in element.get("xyz").split()])
+    xyz = None if element is None else element.get("xyz")
+    return np.array(default if xyz is None else [float(v) for v in xyz.split()])

@@ -89,8 +89,9 @@ class Begin(NamedTuple):
         jacobian = rows.transpose(2, 0, 1)
         good = np.isfinite(jacobian).all(axis=(1, 2))
         sign = np.linalg.slogdet(np.where(good[:, None, None], jacobian, 0.0))[0]
-        inverse = np.linalg.inv(np.where((sign != 0)[:, None, None], jacobian, np.eye(6)))
-        norm = np.where(sign != 0, np.linalg.norm(inverse, 2, axis=(1, 2)), np.inf)
+        is_regular = np.asarray(np.not_equal(sign, 0.0))
+        inverse = np.linalg.inv(np.where(is_regular[:, None, None], jacobian, np.eye(6)))
+        norm = np.where(is_regular, np.linalg.norm(inverse, 2, axis=(1, 2)), np.inf)
         swing, ratio = np.sqrt(1 + square / unit**2), np.sqrt(square) / unit
         bend = np.array(
             [

@@ -121,13 +121,14 @@ def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
         *balls,
         *(closure for one in constraints for closure in one if isinstance(closure, GraphJoint)),
     ]
-    ends = {_find_link(urdf, name) for pair in closures.pairs for name in pair}
+    found = [_find_link(urdf, name) for pair in closures.pairs for name in pair]
+    ends = frozenset(link for link in found if link is not None)
     try:
         bodies = weld_bodies(urdf.root, welds)
         graph = assemble_graph(urdf.root, [bodies.move(joint) for joint in joints], motors)
     except MechanismError as error:
         raise _locate_error(error, urdf, closures) from None
-    return UrdfMechanism(urdf, graph, bodies, frozenset(ends))
+    return UrdfMechanism(urdf, graph, bodies, ends)
 
 
 def _read_closures(path: Path, urdf: Urdf) -> Closures:
@@ -265,7 +266,7 @@ def _find_perpendicular(axis: FloatArray, near: FloatArray) -> FloatArray:
     across = near - axis * (axis @ near)
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    return across / np.linalg.norm(across)
+    return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
 
 
 def _turn_between(one: FloatArray, other: FloatArray) -> FloatArray:

@@ -58,6 +58,7 @@ def format_limb(
     pending: FloatArray = np.eye(4)
     before: GraphJoint | None = None
     ends_in_point = last.kind == "S" or not turns
+    tip: FloatArray = np.eye(4)
     for joint in limb:
         place = pending @ joint.T_a
         is_tip = joint is last and ends_in_point
@@ -74,10 +75,8 @@ def format_limb(
     attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
     if last.origin_b:
         errors.append(_format_shifts("platform", last.origin_b, last.shifts))
-    if not ends_in_point:
-        tip = np.eye(4)
-        if not last.origin_b:
-            tip, attach = pending @ T_body_frame, np.eye(4)
+    if not ends_in_point and not last.origin_b:
+        tip, attach = pending @ T_body_frame, np.eye(4)
     text = LIMB.format(
         name=quote_scalar(name),
         chain="\n".join(chain),
