@@ -75,4 +75,7 @@ def test_start_cost_of_a_robust_fit_has_its_weights_and_the_prior() -> None:
     cost = problem.linearize(start, problem.start(start)).cost[0]
     held = (((robot.values[free.places] - prior.mean) / spread) ** 2).sum()
     assert held > 100.0
-    assert fit.history.cost[0] == pytest.approx(cost + held, rel=1e-12)  # rounding of sums
+    assert fit.history.cost[0] == pytest.approx(
+        cost + held,
+        rel=1e-11,  # poses are closed to 1e-13 of the size from other starts, 1e-8 sigma
+    )

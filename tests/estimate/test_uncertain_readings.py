@@ -218,9 +218,9 @@ def test_redundant_readings_equal_the_dense_solution(cable):
     )
     inverse_r = np.linalg.inv(np.linalg.qr(fit.jac)[1])
     sd = np.linalg.norm(inverse_r, axis=1)[:p] * unit
-    assert_allclose(
-        result.estimate, robot.parameters.nominal + unit * fit.x[:p], atol=1e-3 * sd.min(), rtol=0
-    )
+    distance = result.estimate - (robot.parameters.nominal + unit * fit.x[:p])
+    # both descents end where a step hardly changes the residuals
+    assert np.abs(distance / sd).max() < 1e-3
     assert_allclose(
         result.standard_deviations, sd, rtol=1e-4
     )  # at two solutions that differ by the noise's curvature

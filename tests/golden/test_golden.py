@@ -27,7 +27,14 @@ CONDITION = (
     "all 25 combinations are solved with a condition number of 5.6e8: rounding of 2.2e-16 may "
     "change the first step by 1.2e-7, and the two engines do change it by 1e-9"
 )
+END_OF_DESCENT = (
+    "a descent ends where a step changes the residuals by less than 1e-6 of their norm; poses that "
+    "begin elsewhere, or differ by rounding, let it end at points within 1e-5 standard deviations"
+)
 EXCEPTIONS: dict[str, tuple[float, str, str]] = {
+    "accuracy/hexapod-42/monte-carlo": (1e3, "observed", END_OF_DESCENT),
+    "losses/tukey/ls": (1e2, "*", END_OF_DESCENT),
+    "recalibration/freed-limb": (1e4, "again/fit/*", END_OF_DESCENT),
     # shares of 5e-4 of the distances
     "outliers/least-squares": (1e6, "blunders/*", ROBUST_REFERENCE),
     "outliers/map": (1e6, "blunders/*", ROBUST_REFERENCE),

@@ -87,9 +87,9 @@ class Begin(NamedTuple):
         unit = np.sqrt(2 * np.mean(square, axis=0))
         rows, distance = _measure_rods(T, tip, attachment, unit)
         jacobian = rows.transpose(2, 0, 1)
-        good = np.isfinite(jacobian).all(axis=(1, 2))
+        good = np.asarray(np.isfinite(jacobian).all(axis=(1, 2)))
         sign = np.linalg.slogdet(np.where(good[:, None, None], jacobian, 0.0))[0]
-        is_regular = np.asarray(np.not_equal(sign, 0.0))
+        is_regular = np.abs(sign) > 0.0
         inverse = np.linalg.inv(np.where(is_regular[:, None, None], jacobian, np.eye(6)))
         norm = np.where(is_regular, np.linalg.norm(inverse, 2, axis=(1, 2)), np.inf)
         swing, ratio = np.sqrt(1 + square / unit**2), np.sqrt(square) / unit
