@@ -29,12 +29,17 @@ CONDITION = (
 )
 END_OF_DESCENT = (
     "a descent ends where a step changes the residuals by less than 1e-6 of their norm; poses that "
-    "begin elsewhere, or differ by rounding, let it end at points within 1e-5 standard deviations"
+    "begin elsewhere, or differ by rounding, let it end at points within 1e-4 standard deviations"
 )
 EXCEPTIONS: dict[str, tuple[float, str, str]] = {
     "accuracy/hexapod-42/monte-carlo": (1e3, "observed", END_OF_DESCENT),
     "losses/tukey/ls": (1e2, "*", END_OF_DESCENT),
+    "papers/hexapod-42/methods": (1e1, "errors", END_OF_DESCENT),
     "recalibration/freed-limb": (1e4, "again/fit/*", END_OF_DESCENT),
+    # of two engines; chains have tolerances of several kinds, whose factors are estimated
+    "robots/excavator/map": (1e5, "*", END_OF_DESCENT),
+    "robots/tricept/map": (1e5, "*", END_OF_DESCENT),
+    "validation/hexapod-42/targets": (1e1, "errors/*", END_OF_DESCENT),
     # shares of 5e-4 of the distances
     "outliers/least-squares": (1e6, "blunders/*", ROBUST_REFERENCE),
     "outliers/map": (1e6, "blunders/*", ROBUST_REFERENCE),

@@ -27,8 +27,8 @@ from loopcal.studies.specification.levels import (
 from tests.studies.studies import compute_cells, make_study, read_robot
 
 POSE = InstrumentLevel(("pose",), sigma_position=1e-7, sigma_angle=1e-7)
-FIRST_KEY = "0b5fafce58b8870932723e4bbd43912f1327fd4d97746f316314d4115f572b02"
-SECOND_KEY = "1670e76092db1fe1347edf9692705f423a29dd79adc20c99bc8dd2f4f8dd8368"
+FIRST_KEY = "5015342e7fd26b3f806c4ffaebf4648f7555c9e0cc9512b67ff41e6e4aa2ab58"
+SECOND_KEY = "5632e757e0e76b6b74972babdc06f50b590121e9827f5bde6d71b79cf40d63e3"
 
 CMM = InstrumentLevel(("plane", "line"), sigma_position=1e-6)
 HELD = PosesLevel(100, "plane-line", sweeps=0)
@@ -50,7 +50,7 @@ def make_held(method: MethodLevel, **changes):
     return make_study("hexapod-nategh-agheli", **settings)
 
 
-def test_keys_of_blocks_are_those_of_earlier_versions():
+def test_keys_of_blocks_are_those_of_version_2_of_the_numbers():
     study = make_study()
     assert study.compute_key(study.cells[0], 0) == FIRST_KEY
     changed = make_study(
