@@ -93,6 +93,7 @@ def search_in_browser(site: Path) -> Iterator[str]:
         if os.environ.get("LOOPCAL_STRICT"):
             yield "Chromium is not installed, so that the search was not tried"
         return
+    from playwright.sync_api import TimeoutError as NotFound
     from playwright.sync_api import sync_playwright
 
     requests: list[str] = []
@@ -107,9 +108,10 @@ def search_in_browser(site: Path) -> Iterator[str]:
         page.on("pageerror", lambda error: errors.append(str(error)))
         for words, expected in SEARCHES.items():
             page.goto(f"{site.resolve().as_uri()}/search.html?q={words}")
-            page.wait_for_selector("#search-results li a")
-            results = page.locator("#search-results li").all_text_contents()
-            if not any(expected in result for result in results):
+            result = page.locator("#search-results li", has_text=expected).first
+            try:  # the page adds its results one by one
+                result.wait_for()
+            except NotFound:
                 yield f"searching for {words}: no result with {expected}"
         page.goto(f"{site.resolve().as_uri()}/index.html")
         page.wait_for_selector("text=Getting started")
