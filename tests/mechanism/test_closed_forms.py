@@ -5,7 +5,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Status, forward, inverse
+from loopcal.mechanism import Status, forward, inverse, sample_workspace
 from tests import zoo
 
 # Table 4 of "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism":
@@ -131,3 +131,54 @@ def test_five_bar_readings_agree_with_two_triangles():
         assert_allclose(
             sol.q[:, k], np.arctan2(points[:, 1], points[:, 0] - pivot) + side * inner, atol=1e-13
         )
+
+
+def test_3_rps_leg_lengths_agree_with_the_closed_form_of_the_parasitic_motion():
+    robot, radius = zoo.load_cached_robot("3-rps"), 0.15
+    rng = np.random.default_rng(5)
+    z, phi, theta = rng.uniform([0.43, -np.pi, 0.0], [0.57, np.pi, np.deg2rad(20)], (60, 3)).T
+    sol = inverse(robot, np.stack([z, phi, theta], axis=1))
+    assert_array_equal(sol.status, Status.CONVERGED)
+    # the planes of the legs are those of a 3-PRS, and so is the motion of the platform
+    half = radius / 2 * (1 - np.cos(theta))
+    center = np.stack([-half * np.cos(2 * phi), half * np.sin(2 * phi), z], axis=1)
+    R = geometry.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
+    assert_allclose(sol.T[:, :3, 3], center, atol=1e-13)
+    assert_allclose(sol.T[:, :3, :3], R, atol=1e-13)
+    for i, angle in enumerate(2 * np.pi * np.arange(3) / 3):
+        out = np.array([np.cos(angle), np.sin(angle), 0.0])
+        leg = center + radius * R @ out - 0.25 * out
+        assert_allclose(sol.q[:, i], np.linalg.norm(leg, axis=1), atol=1e-13)
+
+
+def test_6_rus_readings_agree_with_the_intersection_of_crank_circle_and_rod_sphere():
+    robot = zoo.load_cached_robot("6-rus")
+    sol = inverse(robot, sample_workspace(robot, 60, seed=6).coordinates)
+    assert_array_equal(sol.status, Status.CONVERGED)
+    servo, crank, rod = np.array([0.1, 0.04, 0.0]), 0.025, 0.16
+    ball = np.array([0.045886, 0.065532, 0.0])
+    for k in range(6):
+        turn, side = geometry.rotation_about_axis(2 * np.pi / 3 * (k % 3), 2), 1 if k < 3 else -1
+        mirror = np.array([1, side, 1])
+        out, up = turn @ [0, side, 0], np.array([0.0, 0.0, 1.0])  # at zero and at 90 degrees
+        to_ball = (
+            sol.T[:, :3, 3] + sol.T[:, :3, :3] @ turn @ (mirror * ball) - turn @ (mirror * servo)
+        )
+        a, b = to_ball @ out, to_ball @ up
+        c = ((to_ball**2).sum(axis=1) + crank**2 - rod**2) / (2 * crank)
+        assert_allclose(
+            sol.q[:, k], np.arctan2(b, a) - np.arccos(c / np.hypot(a, b)), rtol=0, atol=1e-12
+        )
+
+
+def test_agile_eye_readings_are_arc_tangents_of_the_rotation_matrix():
+    # the elbow axis of limb 1 is (0, -sin q1, cos q1), normal to its pin axis -R (0, 1, 0); the
+    # other limbs are this one with the axes permuted
+    robot = zoo.load_cached_robot("agile-eye")
+    sol = inverse(robot, sample_workspace(robot, 60, seed=7).coordinates)
+    assert_array_equal(sol.status, Status.CONVERGED)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        expected = np.arctan2(sol.T[:, j, i], sol.T[:, i, i])
+        assert_allclose(sol.q[:, k], expected, rtol=0, atol=1e-13)
+    assert_allclose(sol.T[:, :3, 3], 0.0, atol=1e-15)

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations of every shipped robot: chi-square of many draws of its errors.
+
+A new file in src/loopcal/robots is included automatically.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from loopcal.estimate import LeastSquares, identify_trials
+from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
+from loopcal.mechanism import sample_workspace
+from tests.zoo import load_cached_robot
+
+DRAWS, POSES = 20, 40
+# their chi-square has other degrees of freedom: redundant readings; parameters without effect
+OTHER_FREEDOMS = ("cable-4", "linear-delta-6")
+ROBOTS = [name for name in list_shipped_robots() if name not in OTHER_FREEDOMS]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_chi_square_of_simulated_calibrations_agrees_with_its_distribution(name: str) -> None:
+    robot = load_cached_robot(name)
+    poses = sample_workspace(robot, POSES, seed=1).coordinates
+    noise = Gaussian(np.repeat([5e-5, 1e-5], 3))  # [rad, m]
+    instrument = Instrument((Sensor(Pose("rotation-vector"), noise),))
+    truth = sample_truth(robot, DRAWS, 2)
+    trials = simulate_trials(robot, truth, poses, instrument, 3)
+    fits = identify_trials(robot, trials, LeastSquares())
+    assert fits.converged.all()
+    freedoms = DRAWS * (6 * POSES - int(robot.parameters.free.sum()))
+    low, high = chi2.ppf([0.005, 0.995], freedoms)
+    assert low < fits.cost.sum() < high
