@@ -89,7 +89,7 @@ def test_transmission_derivatives_agree_with_differences():
     for i in range(len(TERMS)):
         unit = np.zeros_like(tau)
         unit[..., i] = 1.0
-        column = term_derivatives(READINGS, w)[i]
+        column = term_derivatives(READINGS, tau, w)[i]
         check_jacobian(
             lambda x, u=unit: joints_from_readings(READINGS, tau + x[0] * u, w),
             column[..., None],
@@ -111,7 +111,9 @@ def test_transmission_round_trips_to_rounding():
 
 
 def test_actuator_without_period_has_no_harmonics():
-    columns = term_derivatives(READINGS, harmonic_frequencies(ACTUATORS))
+    columns = term_derivatives(
+        READINGS, nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
+    )
     for term, column in zip(TERMS, columns, strict=True):
         if term.startswith(("sin", "cos")):
             assert_array_equal(column[..., 1], 0.0)

@@ -27,7 +27,6 @@ from loopcal.mechanism import Mechanism, sample_workspace
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
-DRAWS, POSES = 20, 16
 PLACES = np.array([[1.0, 0.2, 0.1], [4.0, -0.2, 0.1]])
 FRAME = {"tracker.x": 0.3, "tracker.rz": 0.2}
 
@@ -90,7 +89,7 @@ def test_targets_on_a_stage_are_written_and_read(tmp_path: Path) -> None:
 
 def test_sensor_on_a_joint_of_a_stage_is_named_with_the_stage() -> None:
     robot = load_cached_robot("excavator")
-    kind = JointSensor(joints=("boom.hinge.pin", "stick.hinge.pin"), measures="angle")
+    kind = JointSensor(joints=("boom.serial.joint", "stick.serial.joint"), measures="angle")
     instrument = Instrument((Sensor(kind, Gaussian(np.full(2, 1e-5))),))
     true = robot.with_values(sample_truth(robot, 1, 7)[0])
     data = simulate(true, sample_workspace(robot, 20, seed=2).coordinates, instrument, 8)

@@ -200,9 +200,7 @@ def _passive_joints(robot: Mechanism) -> list[tuple[str, str]]:
     """Return passive joints to which a sensor could be attached, with what it would measure."""
     return [
         (f"{limb.name}.{joint.name}", "length" if joint.kind == "P" else "angle")
-        for limb in robot.assembly.limbs
-        for joint in limb.joints
-        if joint.actuator is None
+        for limb, joint in robot.assembly.passive_joints
     ]
 
 

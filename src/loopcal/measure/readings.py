@@ -116,13 +116,14 @@ def select_joint_values(
 def _index_passive_joints(robot: Mechanism) -> dict[str, tuple[int, int, int]]:
     """Return the indices of passive joints by name: group, limb in the group, joint in the limb."""
     limbs = robot.assembly.limbs
-    return {
+    passive = {f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints}
+    places = {
         f"{limbs[limb].name}.{joint.name}": (g, k, j)
         for g, group in enumerate(robot.program.groups)
         for k, limb in enumerate(group.limbs)
         for j, joint in enumerate(limbs[limb].joints)
-        if joint.actuator is None
     }
+    return {name: place for name, place in places.items() if name in passive}
 
 
 def make_readings_kind(robot: Mechanism) -> ActuatorReadings:

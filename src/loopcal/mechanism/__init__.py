@@ -106,6 +106,9 @@ if TYPE_CHECKING:
     from loopcal.mechanism.transmission import nominal_terms as nominal_terms
     from loopcal.mechanism.transmission import readings_from_joints as readings_from_joints
     from loopcal.mechanism.transmission import term_derivatives as term_derivatives
+    from loopcal.mechanism.triangle import TRIANGLE_TERMS as TRIANGLE_TERMS
+    from loopcal.mechanism.triangle import compute_range as compute_range
+    from loopcal.mechanism.triangle_anchors import locate_anchors as locate_anchors
 else:
     __getattr__ = import_lazily(
         __name__,
@@ -159,5 +162,7 @@ else:
                 TERMS harmonic_frequencies joint_slopes joints_from_readings nominal_terms
                 readings_from_joints term_derivatives
             """,
+            "loopcal.mechanism.triangle": "TRIANGLE_TERMS compute_range",
+            "loopcal.mechanism.triangle_anchors": "locate_anchors",
         },
     )

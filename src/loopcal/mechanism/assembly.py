@@ -184,6 +184,11 @@ class Actuator:
     period: float = 0.0
     sigma: float | None = None
 
+    @property
+    def is_triangle(self) -> bool:
+        """Whether it turns its joint through two anchors, so that it reads no joint value."""
+        return "side" in self.terms
+
 
 @dataclass(frozen=True)
 class Assembly:
@@ -219,6 +224,15 @@ class Assembly:
     stored_parameters: tuple[str, ...] = ()
     common_errors: tuple[CommonError, ...] = ()
     stages: tuple[AttachedStage, ...] = ()
+
+    @cached_property
+    def passive_joints(self) -> tuple[tuple[Limb, Joint], ...]:
+        """Joints whose value is no reading, with their limbs: passive ones, and pins of triangles
+        that a linear actuator turns.
+        """
+        read = {a.name for a in self.actuators if not a.is_triangle}
+        pairs = ((limb, joint) for limb in self.limbs for joint in limb.joints)
+        return tuple((limb, joint) for limb, joint in pairs if joint.actuator not in read)
 
     @cached_property
     def limb_by_parameter(self) -> Mapping[str, str]:

@@ -39,7 +39,12 @@ from loopcal.mechanism.states import (
     select_rows,
     without_poses,
 )
-from loopcal.mechanism.transmission import joints_from_readings, readings_from_joints
+from loopcal.mechanism.transmission import (
+    find_triangles,
+    joints_from_readings,
+    measure_excess,
+    readings_from_joints,
+)
 from loopcal.typing import BoolArray, FloatArray
 
 PATH_STEPS = (8, 64)
@@ -84,7 +89,19 @@ def forward_trials(
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
-    return close_at_joints(robot, e, joints, start, follow, goal)
+    state = close_at_joints(robot, e, joints, start, follow, goal)
+    return _mark_out_of_reach(robot, state, q, tau) if len(find_triangles(tau)) else state
+
+
+def _mark_out_of_reach(robot: Mechanism, state: State, q: FloatArray, tau: FloatArray) -> State:
+    """Return a state (t, n) whose rows with a length that no angle reaches are unreachable."""
+    excess = np.broadcast_to(measure_excess(q, tau, robot.slots.frequency), state.status.shape)
+    is_beyond = (state.status == Status.NOT_FINITE) & (excess > 0.0) & np.isfinite(excess)
+    return replace(
+        state,
+        status=np.where(is_beyond, np.int8(Status.UNREACHABLE), state.status),
+        residual=np.where(is_beyond, excess, state.residual),
+    )
 
 
 def close_at_joints(

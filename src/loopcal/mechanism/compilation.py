@@ -33,7 +33,7 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.stages.chain_compilation import build_chain
 from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import driven_values, make_start
-from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
+from loopcal.mechanism.transmission import ALL_TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
 from loopcal.typing import IntArray
 from loopcal.units import DISPLAY_UNITS, SI_SYMBOLS, Dimension
@@ -147,7 +147,7 @@ def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
     addresses |= dict.fromkeys(a for s in assembly.shared for a in s.outputs)
     unknown = []
     for address in addresses:
-        is_term = address.element == "transmission" and address.axis in TERMS
+        is_term = address.element == "transmission" and address.axis in ALL_TERMS
         if is_term and address.owner in actuators:
             continue
         slot = _find_slot(limbs[address.owner], address) if address.owner in limbs else None
@@ -302,16 +302,16 @@ def _map_slots(
     def place(address: Address) -> int:
         if address in places:
             return places[address]
-        return count + len(TERMS) * actuators[address.owner] + TERMS.index(address.axis)
+        return count + terms.shape[1] * actuators[address.owner] + ALL_TERMS.index(address.axis)
 
-    matrix = np.zeros((count + len(TERMS) * len(actuators), len(table)))
+    terms, w = nominal_terms(assembly.actuators), harmonic_frequencies(assembly.actuators)
+    matrix = np.zeros((count + terms.size, len(table)))
     for entry in assembly.maps:
         matrix[place(entry.address), table.index(entry.parameter)] += entry.coefficient
     shared = tuple(
         (s, tuple(table.index(name) for name in s.inputs), tuple(place(a) for a in s.outputs))
         for s in assembly.shared
     )
-    terms, w = nominal_terms(assembly.actuators), harmonic_frequencies(assembly.actuators)
     return SlotMap(matrix, shared, table.nominal, count, terms, w)
 
 

@@ -201,8 +201,9 @@ def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
     for group, joints in zip(robot.program.groups, state.joints, strict=True):
         for k, limb in enumerate(robot.assembly.limbs[i] for i in group.limbs):
             for j, joint in enumerate(limb.joints):
-                if joint.actuator is None:
-                    passive[:, place[f"{limb.name}.{joint.name}"]] = joints[0, :, k, j]
+                column = place.get(f"{limb.name}.{joint.name}")
+                if column is not None:
+                    passive[:, column] = joints[0, :, k, j]
     return Solution(
         state.T[0],
         q,

@@ -16,7 +16,6 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.parameter_units import ParameterUnits
-from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -36,13 +35,14 @@ class SlotMap:
     """Map of parameter values onto displacements e and transmission terms tau.
 
     slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]. The first
-    `n_displacements` slots are e, the others the terms of the actuators, (a, 8) row by row.
+    `n_displacements` slots are e, the others the terms of the actuators, (a, k) row by row, with
+    k = 18 where one is a triangle drive, and 8 elsewhere.
 
     Attributes
     ----------
     matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and outputs.
     nominal : (p,). n_displacements : length of e.
-    terms : (a, 8) nominal transmission terms. frequency : (a,) of their harmonics.
+    terms : (a, k) nominal transmission terms. frequency : (a,) of their harmonics.
     """
 
     matrix: FloatArray
@@ -53,7 +53,7 @@ class SlotMap:
     frequency: FloatArray
 
     def __call__(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return e (t, n_displacements) and tau (t, a, 8) of values (t, p)."""
+        """Return e (t, n_displacements) and tau (t, a, k) of values (t, p)."""
         slots = np.zeros((len(values), len(self.matrix)))
         change = values - self.nominal
         # element by element, so that a trial's result does not depend on its neighbors
@@ -296,8 +296,9 @@ def _map_limb(program: Program, group: Group, k: int, slots: SlotMap) -> LimbMap
     for j, actuator in enumerate(group.actuator[:, k]):
         if actuator >= 0:
             a = int(actuator)
-            begin = program.n_displacements + len(TERMS) * a
-            terms = slots.touches[begin : begin + len(TERMS)]
+            count = slots.terms.shape[1]
+            begin = program.n_displacements + count * a
+            terms = slots.touches[begin : begin + count]
             touched = touched | terms.any(axis=0)
             drives.append((j, a, tuple(int(i) for i in np.flatnonzero(terms.any(axis=1)))))
     columns = np.flatnonzero(touched)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal.engine import MapPattern, ParameterMap
-from loopcal.mechanism.transmission import TERMS, joint_slopes, term_derivatives
+from loopcal.mechanism.transmission import find_triangles, joint_slopes, term_derivatives
 from loopcal.typing import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class ParameterUnits:
     def linearize(self, values: FloatArray, tau: FloatArray, q: FloatArray) -> ParameterMap:
         """Return how these parameters and the readings move displacements and joint values.
 
-        values : (t | 1, all). tau : (t | 1, a, 8) their terms. q : (t | 1, n, a) readings.
+        values : (t | 1, all). tau : (t | 1, a, k) their terms. q : (t | 1, n, a) readings.
         """
         slots, cut = self.slots, len(self._pattern.displacements)
         slopes = self._constant
@@ -43,16 +43,18 @@ class ParameterUnits:
             self._pattern,
             slopes[:, :cut],
             slopes[:, cut:],
-            self._evaluate_terms(q),
+            self._evaluate_terms(q, tau),
             joint_slopes(q, tau, slots.frequency),
         )
 
-    def _evaluate_terms(self, q: FloatArray) -> FloatArray:
+    def _evaluate_terms(self, q: FloatArray, tau: FloatArray) -> FloatArray:
         """Return what the moved transmission terms contribute, (t | 1, n | 1, a, terms)."""
         w = self.slots.frequency
-        if not any(self._terms):  # offsets are the same for all poses
+        has_offsets_only = not any(self._terms) and not len(find_triangles(tau))
+        if not self._terms or has_offsets_only:
+            # offsets are the same for all poses
             return np.ones((1, 1, len(w), len(self._terms)))
-        return np.stack(term_derivatives(q, w, self._terms), axis=-1)
+        return np.stack(term_derivatives(q, tau, w, self._terms), axis=-1)
 
     @cached_property
     def _entries(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -70,14 +72,14 @@ class ParameterUnits:
     def _terms(self) -> tuple[int, ...]:
         """Numbers of the transmission terms that these parameters move."""
         moved = self._entries[0] - self.slots.n_displacements
-        return tuple(np.unique(moved[moved >= 0] % len(TERMS)).tolist())
+        return tuple(np.unique(moved[moved >= 0] % self.slots.terms.shape[1]).tolist())
 
     @cached_property
     def _pattern(self) -> MapPattern:
         """Entries as the engine knows them; displacements are the first slots."""
         slot, parameter = np.nonzero(self.slots.touches[:, self.places])
         cut = int(np.searchsorted(slot, self.slots.n_displacements))
-        joint, term = np.divmod(slot[cut:] - self.slots.n_displacements, len(TERMS))
+        joint, term = np.divmod(slot[cut:] - self.slots.n_displacements, self.slots.terms.shape[1])
         function = np.searchsorted(np.array(self._terms, dtype=np.int64), term)
         return MapPattern(
             len(self.places),

@@ -79,6 +79,10 @@ def differentiate_at_pose(
             moved[..., p:] += limb.A
             moved[..., :p][..., limb.parameters] += limb.by_parameter
             passive[rows][:, :, places] = solve_passive_motion(U, moved)
+        for place, column, by_values in limbs.turned_joints(names):
+            slope = limbs.joints_by_reading[:, :, column, None]
+            passive[rows][:, :, place] = slope * readings[rows][:, :, column]
+            passive[rows][:, :, place, :p] += by_values
     return PoseDrivenSensitivity(
         names, (readings[..., :p], readings[..., p:]), (passive[..., :p], passive[..., p:])
     )

@@ -119,6 +119,9 @@ def differentiate_passive_joints(
             cut = moved.shape[-1]
             parameters[rows][:, :, places] = both[..., :cut]
             readings[rows][:, :, places] = both[..., cut:]
+        for place, column, by_values in limbs.turned_joints(names):
+            parameters[rows][:, :, place] = by_values
+            readings[rows][:, :, place, column] = limbs.joints_by_reading[:, :, column]
     parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, parameters, readings)
 
@@ -148,13 +151,8 @@ def differentiate_sensed_values(
 
 
 def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
-    """Return the names `limb.joint` of all passive joints, limb by limb."""
-    return tuple(
-        f"{limb.name}.{joint.name}"
-        for limb in robot.assembly.limbs
-        for joint in limb.joints
-        if joint.actuator is None
-    )
+    """Return the names `limb.joint` of all joints that no reading states, limb by limb."""
+    return tuple(f"{limb.name}.{joint.name}" for limb, joint in robot.assembly.passive_joints)
 
 
 def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
@@ -211,7 +209,7 @@ def _linearize_block(
         engine.linearize(robot.program, e, joints, state),
         J[:, :d],
         J[:, d:].reshape(len(J), *slots.terms.shape, -1),
-        term_derivatives(q, slots.frequency),
+        term_derivatives(q, tau, slots.frequency),
         joint_slopes(q, tau, slots.frequency),
     )
 
@@ -229,8 +227,8 @@ class LinearizedLimbs:
     Attributes
     ----------
     blocks : of the engine.
-    displacements_by_parameter : (t, d, p). terms_by_parameter : (t, a, 8, p).
-    joints_by_term : 8 arrays (t, n, a). joints_by_reading : (t, n, a).
+    displacements_by_parameter : (t, d, p). terms_by_parameter : (t, a, k, p).
+    joints_by_term : k arrays (t, n, a). joints_by_reading : (t, n, a).
     """
 
     robot: Mechanism
@@ -266,6 +264,22 @@ class LinearizedLimbs:
                 if joints:
                     chosen = [f"{limbs[i].name}.{limbs[i].joints[j].name}" for j in joints]
                     yield [names.index(name) for name in chosen], block.U[:, :, k], rows
+
+    def turned_joints(self, names: tuple[str, ...]) -> Iterator[tuple[int, int, FloatArray]]:
+        """Yield, for each joint that a triangle drive turns, its place in `names`, its actuator and
+        its derivatives (t, n, p) by the parameters, of which its angle alone depends on those of
+        its drive.
+        """
+        column = {a.name: i for i, a in enumerate(self.robot.actuators) if a.is_triangle}
+        for limb, joint in self.robot.assembly.passive_joints:
+            if joint.actuator is not None:
+                a = column[joint.actuator]
+                slopes = self.terms_by_parameter[:, None, a]
+                moved = (
+                    self.joints_by_term[i][:, :, a, None] * slopes[:, :, i]
+                    for i in range(len(self.joints_by_term))
+                )
+                yield names.index(f"{limb.name}.{joint.name}"), a, sum(moved, start=np.zeros(1))
 
     def _differentiate_by_parameters(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
         """Return d rows / d parameters of limb k (t, n, r, ..)."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal import geometry
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import TRIANGLE_TERMS, Mechanism
 from loopcal.report.numbers import ABSENT, format_in, format_number, units_of
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.units import Dimension, Unit
@@ -36,6 +36,11 @@ def view_assembly(robot: Mechanism) -> list[Table]:
         _build_joint_table(robot, units),
         _build_ending_table(robot, units),
         _build_transmission_table(robot, units),
+        *(
+            [_build_triangle_table(robot, units)]
+            if any(a.is_triangle for a in robot.actuators)
+            else []
+        ),
         _build_map_table(robot, units),
     ]
 
@@ -107,7 +112,7 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
         joint_unit = units[_joint_dimension(robot, actuator.name)]
         reading = units[actuator.dimension]
         for term, value in {"gain": 1.0, **actuator.terms}.items():
-            if value:
+            if value and term not in TRIANGLE_TERMS:
                 power = POWERS.get(term, 0)
                 number = value * reading.factor_to_si**power / joint_unit.factor_to_si
                 rows.append(
@@ -127,6 +132,22 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
         word_column("unit"),
     )
     return Table("Transmissions: from reading to joint value", columns, tuple(rows))
+
+
+def _build_triangle_table(robot: Mechanism, units: Units) -> Table:
+    """Return the anchors of triangle drives in the frames of their joints, whose axis is z."""
+    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
+    rows = []
+    for actuator in robot.actuators:
+        if actuator.is_triangle:
+            terms = [actuator.terms[term] for term in TRIANGLE_TERMS]
+            shown = [_format(value, length) for value in terms[:6]]
+            skew = [_format(value, angle) for value in terms[6:8]]
+            rows.append((actuator.name, *shown, length.symbol, *skew, angle.symbol))
+    names = [*TRIANGLE_TERMS[:6], "unit", *TRIANGLE_TERMS[6:8], "unit"]
+    columns = tuple(word_column(name) if name == "unit" else Column(name) for name in names)
+    title = "Triangles: anchors in the frame of the joint, z along its axis"
+    return Table(title, (word_column("actuator"), *columns), tuple(rows))
 
 
 def _build_map_table(robot: Mechanism, units: Units) -> Table:
@@ -191,6 +212,8 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     length = units[Dimension.LENGTH]
     if address.element == "transmission":
         reading = units[next(a.dimension for a in robot.actuators if a.name == address.owner)]
+        if address.axis in ("skew.x", "skew.y"):
+            return units[Dimension.ANGLE].factor_to_si, units[Dimension.ANGLE].symbol
         joint, power = units[_joint_dimension(robot, address.owner)], POWERS.get(address.axis, 0)
         factor = joint.factor_to_si / reading.factor_to_si**power
         return factor, _unit_of_term(joint, reading, power)
@@ -201,7 +224,9 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
 
 
 def _joint_dimension(robot: Mechanism, actuator: str) -> Dimension:
-    """Return the dimension of the joint that an actuator drives."""
+    """Return the dimension of what a transmission gives: a joint, or the length of a triangle."""
+    if any(a.is_triangle for a in robot.actuators if a.name == actuator):
+        return Dimension.LENGTH
     kinds = [
         joint.kind
         for limb in robot.assembly.limbs

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
-from loopcal.mechanism import Mechanism
+import numpy as np
+
+from loopcal.mechanism import TRIANGLE_TERMS, Mechanism, compute_range
 from loopcal.report.numbers import format_in, format_number, format_with_uncertainty, units_of
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block, format_list
+from loopcal.units import Dimension
 from loopcal.workflow.robot_inspection import RobotInspection
 
 DIGITS = 9
@@ -29,6 +32,7 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
         f"commanded in: {' '.join(robot.controlled)}",
         *format_list([(f.severity.value, str(f)) for f in inspection.findings]),
         _build_actuator_table(inspection),
+        *([_build_triangle_table(robot)] if any(a.is_triangle for a in robot.actuators) else []),
         _build_parameter_table(robot),
         *([_build_common_error_table(robot)] if robot.parameters.common else []),
     ]
@@ -48,6 +52,28 @@ def _build_actuator_table(inspection: RobotInspection) -> Table:
     numbers = (Column(title) for title in ("lowest", "highest", "at home"))
     columns = (word_column("name"), *numbers, word_column("unit"))
     return Table("Actuators", columns, tuple(rows))
+
+
+def _build_triangle_table(robot: Mechanism) -> Table:
+    """Return the lengths of triangle drives at their dead points, and the angles there."""
+    units = units_of(robot)
+    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
+    rows = []
+    for actuator in robot.actuators:
+        if actuator.is_triangle:
+            terms = np.array([actuator.terms[term] for term in TRIANGLE_TERMS])
+            middle, ends = terms[-1], np.array([-1.0, 1.0]) * terms[-2] * np.pi / 2
+            numbers = [format_in(length, float(end), 6) for end in compute_range(terms)]
+            angles = [format_in(angle, float(end), 6) for end in middle + ends]
+            rows.append((actuator.name, *numbers, length.symbol, *angles, angle.symbol))
+    columns = (
+        word_column("drive"),
+        *(Column(title) for title in ("shortest", "longest")),
+        word_column("unit"),
+        *(Column(title) for title in ("joint at shortest", "at longest")),
+        word_column("unit"),
+    )
+    return Table("Triangles: dead points, where a drive turns nothing", columns, tuple(rows))
 
 
 def _build_parameter_table(robot: Mechanism) -> Table:

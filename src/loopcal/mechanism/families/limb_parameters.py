@@ -8,6 +8,7 @@ stand for gain and curve. Formulas: docs/theory/parameters.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,6 +31,13 @@ from loopcal.mechanism.families.records import (
     RatioTolerance,
     standard_deviation,
 )
+from loopcal.mechanism.families.triangle_records import (
+    TriangleDrive,
+    is_of_triangle,
+    place_triangle,
+    triangle_errors,
+)
+from loopcal.typing import FloatArray
 from loopcal.units import ARTICLES, Dimension
 
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
@@ -46,31 +54,58 @@ Term = tuple[Dimension, float, Tolerance, str, float]
 """Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
 
 
-def build_actuator(name: str, drive: Drive) -> Actuator:
-    """Return the actuator of a drive."""
+@dataclass(frozen=True)
+class PlacedDrive:
+    """A drive and the joint that it moves; of several joints, the first.
+
+    turns : whether the joint is rotary. rotation : (3, 3) R_placed_joint, whose third column is
+    the joint's axis. start : value of the joint near home [rad or m].
+    """
+
+    drive: Drive
+    turns: bool
+    rotation: FloatArray
+    start: float = 0.0
+
+    @property
+    def dimension(self) -> Dimension:
+        """Dimension of what the transmission gives: the joint, or the length of a triangle."""
+        is_angle = self.turns and not isinstance(self.drive, TriangleDrive)
+        return Dimension.ANGLE if is_angle else Dimension.LENGTH
+
+
+def build_actuator(name: str, placed: PlacedDrive) -> Actuator:
+    """Return the actuator of a drive; raises MechanismError for an impossible triangle."""
+    drive = placed.drive
     if isinstance(drive, SpoolDrive):
         terms = {"gain": drive.radius, "curve": CURVE_OF_BUILDUP * drive.buildup}
     else:
         terms = {"gain": drive.gain}
-    dimension = Dimension.LENGTH if isinstance(drive, LengthDrive) else Dimension.ANGLE
+    if isinstance(drive, TriangleDrive):
+        terms |= place_triangle(name, drive, placed.rotation, placed.start)
+    reads_length = isinstance(drive, LengthDrive | TriangleDrive)
+    dimension = Dimension.LENGTH if reads_length else Dimension.ANGLE
     return Actuator(
         name, dimension, drive.stroke, {"offset": drive.offset, **terms}, drive.period, drive.sigma
     )
 
 
-def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
+def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
     """Return the unknown terms of a drive, `q1.offset` and so on.
-
-    `turns` is True if its joint is rotary.
 
     Raises
     ------
     MechanismError
         A term that the drive does not have, or a harmonic without a period.
     """
-    known = _list_terms(drive, Dimension.ANGLE if turns else Dimension.LENGTH)
+    drive = placed.drive
+    known = _list_terms(drive, placed.dimension)
     errors = []
+    if isinstance(drive, TriangleDrive):
+        errors.append(triangle_errors(name, drive, placed.rotation, tuple(known)))
     for term in drive.unknown:
+        if is_of_triangle(drive, term):
+            continue
         if term not in known:
             raise MechanismError(
                 f"actuator {name!r} has no term {term!r}; allowed are {', '.join(known)}"
@@ -151,11 +186,10 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
     return entry.axis, coefficient
 
 
-def check_units(named: NamedParameter, entry: MapEntry, drive: tuple[Drive, bool] | None) -> None:
+def check_units(named: NamedParameter, entry: MapEntry, drive: PlacedDrive | None) -> None:
     """Refuse a map between unlike units; raises MechanismError with what to state.
 
-    `drive` is the drive that the entry names, with whether its joint is rotary. A ratio is a slope
-    for an angle.
+    `drive` is the drive that the entry names. A ratio is a slope for an angle.
     """
     (dimension, _), needed = get_quantity(named), _find_needed_dimension(entry.axis, drive)
     what = f"parameter {named.name!r} is {ARTICLES[dimension]}"
@@ -178,11 +212,10 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: tuple[Drive, bool
     raise MechanismError(f"{what} and {onto}; state it as {ARTICLES[needed]}")
 
 
-def _find_needed_dimension(axis: str, drive: tuple[Drive, bool] | None) -> Dimension:
+def _find_needed_dimension(axis: str, drive: PlacedDrive | None) -> Dimension:
     """Return the dimension of what an entry moves; gain and curve count per unit of the reading."""
     if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
         return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
-    how, turns = drive
     if axis in ("gain", "curve"):
-        return Dimension.LENGTH if isinstance(how, SpoolDrive) else Dimension.RATIO
-    return Dimension.ANGLE if turns else Dimension.LENGTH
+        return Dimension.LENGTH if isinstance(drive.drive, SpoolDrive) else Dimension.RATIO
+    return drive.dimension

@@ -26,6 +26,7 @@ from loopcal.mechanism.families.records import (
     PoseRecord,
     RatioTolerance,
 )
+from loopcal.mechanism.families.triangle_records import TriangleDrive
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
 
@@ -276,7 +277,7 @@ class SpoolDrive:
     buildups: LengthTolerance | None = None
 
 
-Drive = LengthDrive | AngleDrive | SpoolDrive
+Drive = LengthDrive | AngleDrive | SpoolDrive | TriangleDrive
 
 
 @dataclass(frozen=True)

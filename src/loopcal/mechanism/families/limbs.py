@@ -36,6 +36,7 @@ from loopcal.mechanism.families.error_models import (
     single_error,
 )
 from loopcal.mechanism.families.limb_parameters import (
+    PlacedDrive,
     build_actuator,
     check_units,
     drive_errors,
@@ -57,7 +58,6 @@ from loopcal.mechanism.families.limb_placement import (
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Cylindrical,
-    Drive,
     JointRecord,
     LengthDrive,
     LimbRecord,
@@ -74,6 +74,7 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.families.records import RobotRecord, standard_deviation
+from loopcal.mechanism.families.triangle_records import TriangleDrive
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -106,13 +107,14 @@ class Limbs(LimbsFile, RobotRecord):
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
         copies = [member for group in members.values() for member in group]
         # a drive that several limbs name is one drive
-        drives = {
-            name: (drive, turns) for copy in copies for name, drive, turns in self._drives(copy)
-        }
+        drives: dict[str, PlacedDrive] = {}
+        for copy in copies:
+            for name, drive in self._drives(copy):
+                drives.setdefault(name, drive)
         errors = join_errors(
             (
                 *(_limb_errors(member) for member in copies),
-                *(drive_errors(name, *drive) for name, drive in drives.items()),
+                *(drive_errors(name, drive) for name, drive in drives.items()),
                 *(_named(named, members, drives) for named in self.parameters),
             )
         )
@@ -121,7 +123,7 @@ class Limbs(LimbsFile, RobotRecord):
         self._check(errors, tuple(drives))
         return self.assemble(
             (member.placed.limb for member in copies),
-            (build_actuator(name, drive) for name, (drive, _) in drives.items()),
+            (build_actuator(name, drive) for name, drive in drives.items()),
             errors,
             freedoms=self.freedoms,
             controlled=self.controlled,
@@ -144,26 +146,30 @@ class Limbs(LimbsFile, RobotRecord):
                 "state error_model: complete"
             )
 
-    def _drives(self, member: _Member) -> Iterator[tuple[str, Drive, bool]]:
-        """Yield the names of a limb's drives, the drives, and whether their joints are rotary."""
-        limb = member.placed.limb
-        driven = [(j.actuator, j.kind == "R") for j in limb.joints if j.actuator]
+    def _drives(self, member: _Member) -> Iterator[tuple[str, PlacedDrive]]:
+        """Yield the names of a limb's drives, and the drives with their joints."""
+        limb, rotations = member.placed.limb, member.placed.rotations
+        driven = [
+            (j.actuator, j.kind == "R", rotations[j.name], j.start)
+            for j in limb.joints
+            if j.actuator
+        ]
         if limb.actuator:
-            driven.append((limb.actuator, False))
-        for name, turns in driven:
+            driven.append((limb.actuator, False, np.eye(3), 0.0))
+        for name, turns, rotation, start in driven:
             plain = AngleDrive("angle") if turns else LengthDrive("length")
             shared_name = name.removesuffix(member.suffix)
             drive = self.actuators.get(name) or self.actuators.get(shared_name) or plain
-            if turns != isinstance(drive, AngleDrive):
+            if turns != isinstance(drive, AngleDrive | TriangleDrive):
                 motion, allowed = (
-                    ("turns", "reads: angle without a radius")
+                    ("turns", "reads: angle without a radius, or a triangle")
                     if turns
                     else ("slides", "reads: length, or reads: angle with a radius")
                 )
                 raise MechanismError(
                     f"actuator {name!r} drives a joint that {motion}; state {allowed}"
                 )
-            yield name, drive, turns
+            yield name, PlacedDrive(drive, turns, rotation, start)
 
     def _complete(self, copies: list[_Member], drives: Drives) -> ErrorModel:
         """Return all errors of all limbs, and the offset of every drive once."""
@@ -172,10 +178,10 @@ class Limbs(LimbsFile, RobotRecord):
             standard_deviation(self.tolerances.angles, "the angles"),
         )
         errors = [complete_errors(member.placed, spread, offsets=False) for member in copies]
-        for name, (drive, turns) in drives.items():
-            dimension = Dimension.ANGLE if turns else Dimension.LENGTH
-            sd = spread.angle if turns else spread.length
-            errors.append(offset_error(f"{name}.offset", name, dimension, drive.offset, sd))
+        for name, placed in drives.items():
+            dimension, offset = placed.dimension, placed.drive.offset
+            sd = spread.angle if dimension is Dimension.ANGLE else spread.length
+            errors.append(offset_error(f"{name}.offset", name, dimension, offset, sd))
         return join_errors(errors)
 
 
@@ -190,8 +196,8 @@ class _Member:
 
 Members = Mapping[str, tuple[_Member, ...]]
 """The copies of each limb of the file."""
-Drives = Mapping[str, tuple[Drive, bool]]
-"""Drives by name, with whether their joints are rotary."""
+Drives = Mapping[str, PlacedDrive]
+"""Drives by name, with the joints that they move."""
 
 
 def _refuse_many(robot: Limbs) -> None:

@@ -31,6 +31,7 @@ from loopcal.mechanism.families.error_models import (
     offset_error,
     single_error,
 )
+from loopcal.mechanism.families.limb_parameters import PlacedDrive, build_actuator, drive_errors
 from loopcal.mechanism.families.limb_placement import JointPlacement, PlacedLimb, place_limb
 from loopcal.mechanism.families.limb_records import (
     ORIGIN,
@@ -49,6 +50,7 @@ from loopcal.mechanism.families.records import (
     RobotRecord,
     standard_deviation,
 )
+from loopcal.mechanism.families.triangle_records import NamedTriangleDrive
 from loopcal.mechanism.stages.joined_assembly import StageError, check_stage_names, join_stages
 from loopcal.units import Angle, Dimension, Length, Ratio
 
@@ -65,8 +67,10 @@ class SerialRotation:
     ----------
     at : where it is on the platform that carries it. axis : direction in the placed frame.
     tip : platform of this stage in the placed frame, at joint value zero.
-    drive : name of its actuator; default: the name of the stage.
-    start : reading at home. stroke : allowed readings. gain : joint value per reading.
+    drive : name of its actuator; default: the name of the stage. Or a linear actuator that turns
+        it, `{triangle: ..}`, which states its own stroke, gain, sigma and unknowns.
+    start : reading at home; with a triangle, angle of the joint at home. stroke : allowed readings.
+    gain : joint value per reading.
     sigma : standard deviation of the reading.
     errors : its unknowns: displacements of the placed frame, the `offset` of the joint, its `gain`.
     platform_errors : unknown displacements of the platform of this stage.
@@ -77,7 +81,7 @@ class SerialRotation:
     at: Place = ORIGIN
     axis: Axis = "z"
     tip: Place = ORIGIN
-    drive: str = ""
+    drive: str | NamedTriangleDrive = ""
     start: Angle = 0.0
     stroke: tuple[Angle, Angle] | None = None
     gain: Ratio = 1.0
@@ -225,15 +229,24 @@ class PlacedStages(Stages):
 
 def expand_joint(name: str, record: SerialRotation | SerialSlide) -> Assembly:
     """Return the assembly of a serial joint: one rigid limb with one driven joint."""
-    drive, rotates = record.drive or name, isinstance(record, SerialRotation)
-    dimension = Dimension.ANGLE if rotates else Dimension.LENGTH
+    triangle = record.drive if isinstance(record.drive, NamedTriangleDrive) else None
+    drive = (triangle.name if triangle else record.drive) or name
+    assert isinstance(drive, str)
+    if triangle is not None:
+        _refuse_terms_beside_triangle(record, drive)
+    dimension = Dimension.ANGLE if isinstance(record, SerialRotation) else Dimension.LENGTH
     joint = Joint(LINK, record.kind, drive, start=record.gain * record.start)
     step = JointPlacement(joint, matrix_from_place(record.at), axis_vector(record.axis))
     limb = place_limb(LIMB, (step,), matrix_from_place(record.tip), "rigid", np.eye(4))
     actuator = Actuator(drive, dimension, record.stroke, {"gain": record.gain}, sigma=record.sigma)
+    drive_model = ErrorModel()
+    if triangle is not None:
+        placed = PlacedDrive(triangle, True, limb.rotations[LINK], record.start)
+        actuator, drive_model = build_actuator(drive, placed), drive_errors(drive, placed)
     errors = join_errors(
         (
             *(_joint_error(record, limb, drive, error) for error in record.errors),
+            drive_model,
             *(
                 displacement_error(
                     f"platform.{axis}", limb, "platform", axis, _tolerance(record, axis)
@@ -245,6 +258,21 @@ def expand_joint(name: str, record: SerialRotation | SerialSlide) -> Assembly:
     return Assembly(
         name, (limb.limb,), (actuator,), AXES, (), np.eye(4), errors.parameters, errors.maps
     )
+
+
+def _refuse_terms_beside_triangle(record: SerialRotation | SerialSlide, drive: str) -> None:
+    """Refuse what a triangle drive states itself; raises MechanismError."""
+    stated = {"stroke": record.stroke is not None, "gain": record.gain != 1.0}
+    stated |= {"sigma": record.sigma is not None}
+    for key in ("offset", "gain"):
+        stated[f"errors: [{key}]"] = key in record.errors
+    for key, is_stated in stated.items():
+        if is_stated:
+            raise MechanismError(
+                f"the joint states '{key}' beside the triangle of drive {drive!r}, whose readings "
+                "are lengths; state it in the drive"
+                + (" under 'unknown'" if key.startswith("errors") else "")
+            )
 
 
 def _joint_error(

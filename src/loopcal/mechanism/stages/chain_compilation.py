@@ -145,17 +145,24 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
     """Return the maps of all stages: first the displacements of all, then their transmissions."""
     maps = [stage.robot.slots for stage in stages]
     displacements = sum(own.n_displacements for own in maps)
-    matrix = np.zeros((sum(len(own.matrix) for own in maps), len(nominal)))
+    actuators = sum(len(own.terms) for own in maps)
+    k = max(own.terms.shape[1] for own in maps)
+    matrix = np.zeros((displacements + actuators * k, len(nominal)))
     shared, first, term = [], 0, displacements
     for stage, own in zip(stages, maps, strict=True):
         d = own.n_displacements
-        places = np.concatenate([np.arange(d) + first, np.arange(len(own.matrix) - d) + term])
+        a, width = own.terms.shape
+        of_terms = (np.arange(a)[:, None] * k + np.arange(width)).ravel()
+        places = np.concatenate([np.arange(d) + first, of_terms + term])
         matrix[places, stage.parameters] = own.matrix
         for function, inputs, outputs in own.shared:
             columns = tuple(i + stage.parameters.start for i in inputs)
             shared.append((function, columns, tuple(int(places[o]) for o in outputs)))
-        first, term = first + d, term + len(own.matrix) - d
-    terms = np.concatenate([own.terms for own in maps])
+        first, term = first + d, term + a * k
+    # a stage without triangle drives has no terms of them
+    terms = np.concatenate(
+        [np.pad(own.terms, ((0, 0), (0, k - own.terms.shape[1]))) for own in maps]
+    )
     frequency = np.concatenate([own.frequency for own in maps])
     return SlotMap(matrix, tuple(shared), nominal, displacements, terms, frequency)
 

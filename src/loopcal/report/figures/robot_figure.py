@@ -161,6 +161,7 @@ def _legend(robot: Mechanism) -> list[Any]:
     driven = {joint.kind for limb in limbs for joint in limb.joints if joint.actuator}
     marker = "s" if "P" in driven else "o" if driven else "D"
     has_rods = any(limb.ending == "distance" for limb in limbs)
+    has_rods = has_rods or any(actuator.is_triangle for actuator in robot.actuators)
     rows: list[tuple[str, bool, dict[str, Any]]] = [
         (
             "axis of a revolute joint",

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from loopcal.engine import State
-from loopcal.mechanism import Mechanism, compute_limb_frames
+from loopcal.mechanism import Mechanism, compute_limb_frames, locate_anchors
 from loopcal.typing import FloatArray, IntArray
 
 AXIS, GUIDE = 0.06, 0.12
@@ -72,7 +72,8 @@ def list_parts(robot: Mechanism, state: State) -> tuple[Part, ...]:
     foot, top = (np.stack([limb[:, j, :3, 3] for limb in frames], axis=1) for j in (0, -1))
     lines = (Part("limb", limb[:, :-1, :3, 3], i) for i, limb in enumerate(frames))
     joints = (part for i, limb in enumerate(frames) for part in _list_joints(robot, i, limb))
-    return (*lines, *joints, *_list_bodies(robot, foot, top, T))
+    triangles = (part for part in _list_triangles(robot, state))
+    return (*lines, *joints, *triangles, *_list_bodies(robot, foot, top, T))
 
 
 def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]:
@@ -97,6 +98,14 @@ def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]
         yield Part("rod drive", place, i, is_driven)
     if limb.ending != "rigid":
         yield Part("end", points[:, -1:], i)
+
+
+def _list_triangles(robot: Mechanism, state: State) -> Iterator[Part]:
+    """Yield the linear actuators that turn joints through two anchors."""
+    for anchors in locate_anchors(robot, state):
+        yield Part("rod", anchors.points, anchors.limb)
+        yield Part("rod drive", anchors.points.mean(axis=1, keepdims=True), anchors.limb, True)
+        yield Part("end", anchors.points[:, 1:], anchors.limb)
 
 
 def _list_bodies(
