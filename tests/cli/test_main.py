@@ -61,6 +61,7 @@ UNUSED = {
         "rich",
         "pandas",
         "xarray",
+        "pydantic",
         "unittest",
         "numpy.f2py",
         "numpy.testing",

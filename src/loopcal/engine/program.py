@@ -113,6 +113,15 @@ class Program:
         """The same limbs with a platform that stays where the start has it."""
         return replace(self, freedoms=())
 
+    @cached_property
+    def is_square(self) -> bool:
+        """Whether closure with locked actuators has as many equations as the platform freedoms."""
+        return self.count_equations(free=False) == len(self.freedoms)
+
+    def count_equations(self, *, free: bool) -> int:
+        """Return the number of closure equations without passive joints, and with `free` drives."""
+        return sum(len(g.limbs) * (len(g.rows) - len(g.unknown_joints(free))) for g in self.groups)
+
 
 @dataclass(frozen=True)
 class State:

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 
 import numpy as np
@@ -64,14 +65,9 @@ def select_engine(choice: str = "") -> Engine:
         own = numpy_engine
         functions = own.solve, own.certify, own.linearize, own.fold, own.differentiate
         return Engine(NUMPY, np.__version__, *functions)
-    from importlib.metadata import entry_points
-
-    installed = {entry.name: entry for entry in entry_points(group=GROUP)}
-    if name not in installed:
-        known = (NUMPY, *sorted(installed))
-        raise MissingPackageError(report_finding("engine.unknown", engine=choice, known=known))
+    load = _find_loader(choice, name)
     try:
-        return installed[name].load()(variant)
+        return load()(variant)
     except TypeError as cause:  # its record of functions is that of another version
         reason = "it belongs to another version of loopcal; install both anew"
         finding = report_finding("engine.not-usable", engine=choice, reason=reason)
@@ -79,6 +75,20 @@ def select_engine(choice: str = "") -> Engine:
     except (ImportError, OSError, ValueError) as cause:
         finding = report_finding("engine.not-usable", engine=choice, reason=str(cause))
         raise MissingPackageError(finding) from cause
+
+
+def _find_loader(choice: str, name: str) -> Callable[[], Callable[[str], Engine]]:
+    """Return what imports the function that makes an engine; raise MissingPackageError."""
+    if name == NATIVE and find_spec(NATIVE_MODULE):
+        # known without a search through all installed packages, which takes 0.04 s
+        return lambda: import_module(NATIVE_MODULE).make_engine
+    from importlib.metadata import entry_points
+
+    installed = {entry.name: entry for entry in entry_points(group=GROUP)}
+    if name not in installed:
+        known = (NUMPY, *sorted(installed))
+        raise MissingPackageError(report_finding("engine.unknown", engine=choice, known=known))
+    return installed[name].load
 
 
 @cache

@@ -227,16 +227,11 @@ def count_shared_drives(program: Program) -> int:
     return driven - program.n_joints
 
 
-def count_equations(program: Program, *, free: bool) -> int:
-    """Return the number of closure equations without passive joints, and with `free` drives."""
-    return sum(len(g.limbs) * (len(g.rows) - len(g.unknown_joints(free))) for g in program.groups)
-
-
 def _is_square(robot: Mechanism) -> bool:
     """Return whether closure with locked actuators has as many equations as freedoms."""
     if robot.stages:
         return all(_is_square(stage.robot) for stage in robot.stages)
-    return count_equations(robot.program, free=False) == len(robot.freedoms)
+    return robot.program.is_square
 
 
 def clear_sign(robot: Mechanism, state: State) -> State:

@@ -16,7 +16,6 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb, check_assembly
 from loopcal.mechanism.batch_kinematics import (
     compute_closure_sign,
-    count_equations,
     count_shared_drives,
     inverse_trials,
 )
@@ -340,7 +339,7 @@ def _find_home(robot: Mechanism) -> State:
     """
     program, values = robot.program, robot.values[None]
     shared = count_shared_drives(program)
-    movable = len(program.freedoms) - count_equations(program, free=True) - shared
+    movable = len(program.freedoms) - program.count_equations(free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but names only "

@@ -15,7 +15,7 @@ from loopcal.engine import Group, Program, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
-from loopcal.mechanism.parameter_units import ParameterUnits
+from loopcal.mechanism.parameter_units import MovedSlots, ParameterUnits, find_moved_slots
 from loopcal.parameters import ParameterTable
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -59,8 +59,10 @@ class SlotMap:
         # element by element, so that a trial's result does not depend on its neighbors
         for places, columns, coefficients in self._layers:
             slots[:, places] += change[:, columns] * coefficients
-        for shared, inputs, outputs in self.shared:
-            change = shared.value(values[:, inputs]) - shared.value(self.nominal[None, inputs])
+        for (shared, inputs, outputs), nominal in zip(
+            self.shared, self._shared_nominal, strict=True
+        ):
+            change = shared.value(values[:, inputs]) - nominal
             for place, column in zip(outputs, change.T, strict=True):
                 slots[:, place] += column
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
@@ -78,12 +80,32 @@ class SlotMap:
         ]
 
     @cached_property
+    def _shared_nominal(self) -> list[FloatArray]:
+        """Values (1, outputs) of the shared maps at the nominal parameters."""
+        return [shared.value(self.nominal[None, inputs]) for shared, inputs, _ in self.shared]
+
+    @cached_property
     def touches(self) -> BoolArray:
         """Return which parameters may move which slots, (s, p)."""
         touches = self.matrix != 0
         for _, inputs, outputs in self.shared:
             touches[np.ix_(outputs, inputs)] = True
         return touches
+
+    def moved_by(self, places: IntArray) -> MovedSlots:
+        """Return the slots that parameters at places (p,) move; found once for each selection, so
+        that every fit of a robot shares them, and what an engine derives from their pattern.
+        """
+        key = places.tobytes()
+        if key not in self._moved:
+            touches, count = self.touches[:, places], self.terms.shape[1]
+            self._moved[key] = find_moved_slots(touches, self.n_displacements, count)
+        return self._moved[key]
+
+    @cached_property
+    def _moved(self) -> dict[bytes, MovedSlots]:
+        """Results of `moved_by`, by the bytes of the places."""
+        return {}
 
     def jacobian(self, values: FloatArray) -> FloatArray:
         """Return d slots / d values, (t, s, p)."""

@@ -11,10 +11,44 @@ import numpy as np
 
 from loopcal.engine import MapPattern, ParameterMap
 from loopcal.mechanism.transmission import find_triangles, joint_slopes, term_derivatives
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from loopcal.mechanism.model import SlotMap
+
+
+@dataclass(frozen=True, eq=False)
+class MovedSlots:
+    """Which slots of a mechanism some parameters move.
+
+    Attributes
+    ----------
+    slots, columns : (z,) slots that may move, and by which of the parameters.
+    terms : numbers of the transmission terms among them.
+    pattern : the same as the engine knows it; displacements are the first slots.
+    """
+
+    slots: IntArray
+    columns: IntArray
+    terms: tuple[int, ...]
+    pattern: MapPattern
+
+
+def find_moved_slots(touches: BoolArray, n_displacements: int, n_terms: int) -> MovedSlots:
+    """Return the slots that p parameters move.
+
+    touches : (s, p) which of the slots each may move. n_terms : of the transmission of an actuator.
+    """
+    slot, column = np.nonzero(touches)
+    cut = int(np.searchsorted(slot, n_displacements))
+    joint, term = np.divmod(slot[cut:] - n_displacements, n_terms)
+    terms, function = np.unique(term, return_inverse=True)
+    pattern = MapPattern(
+        touches.shape[1],
+        np.column_stack([slot[:cut], column[:cut]]),
+        np.column_stack([joint, function, column[cut:]]),
+    )
+    return MovedSlots(slot, column, tuple(terms.tolist()), pattern)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +68,14 @@ class ParameterUnits:
 
         values : (t | 1, all). tau : (t | 1, a, k) their terms. q : (t | 1, n, a) readings.
         """
-        slots, cut = self.slots, len(self._pattern.displacements)
+        slots, pattern = self.slots, self.slots.moved_by(self.places).pattern
+        cut = len(pattern.displacements)
         slopes = self._constant
         if slots.shared:
             of_slots, of_columns, units = self._entries
             slopes = slots.jacobian(values)[:, of_slots, of_columns] * units
         return ParameterMap(
-            self._pattern,
+            pattern,
             slopes[:, :cut],
             slopes[:, cut:],
             self._evaluate_terms(q, tau),
@@ -49,40 +84,21 @@ class ParameterUnits:
 
     def _evaluate_terms(self, q: FloatArray, tau: FloatArray) -> FloatArray:
         """Return what the moved transmission terms contribute, (t | 1, n | 1, a, terms)."""
-        w = self.slots.frequency
-        has_offsets_only = not any(self._terms) and not len(find_triangles(tau))
-        if not self._terms or has_offsets_only:
+        w, terms = self.slots.frequency, self.slots.moved_by(self.places).terms
+        has_offsets_only = not any(terms) and not len(find_triangles(tau))
+        if not terms or has_offsets_only:
             # offsets are the same for all poses
-            return np.ones((1, 1, len(w), len(self._terms)))
-        return np.stack(term_derivatives(q, tau, w, self._terms), axis=-1)
+            return np.ones((1, 1, len(w), len(terms)))
+        return np.stack(term_derivatives(q, tau, w, terms), axis=-1)
 
     @cached_property
     def _entries(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Slots that may move, by which column of all parameters, and its unit, (z,) each."""
-        slot, parameter = np.nonzero(self.slots.touches[:, self.places])
-        return slot, self.places[parameter], self.units[parameter]
+        moved = self.slots.moved_by(self.places)
+        return moved.slots, self.places[moved.columns], self.units[moved.columns]
 
     @cached_property
     def _constant(self) -> FloatArray:
         """Derivatives (1, z) of slots without shared maps."""
         slot, column, unit = self._entries
         return (self.slots.matrix[slot, column] * unit)[None]
-
-    @cached_property
-    def _terms(self) -> tuple[int, ...]:
-        """Numbers of the transmission terms that these parameters move."""
-        moved = self._entries[0] - self.slots.n_displacements
-        return tuple(np.unique(moved[moved >= 0] % self.slots.terms.shape[1]).tolist())
-
-    @cached_property
-    def _pattern(self) -> MapPattern:
-        """Entries as the engine knows them; displacements are the first slots."""
-        slot, parameter = np.nonzero(self.slots.touches[:, self.places])
-        cut = int(np.searchsorted(slot, self.slots.n_displacements))
-        joint, term = np.divmod(slot[cut:] - self.slots.n_displacements, self.slots.terms.shape[1])
-        function = np.searchsorted(np.array(self._terms, dtype=np.int64), term)
-        return MapPattern(
-            len(self.places),
-            np.column_stack([slot[:cut], parameter[:cut]]),
-            np.column_stack([joint, function, parameter[cut:]]),
-        )

@@ -161,7 +161,9 @@ class _Run:
             self.taken[active[last]] += 1
             finished = self.model.finish(current.take(last), step.take(last))
             self.point = self.point.put(active[last], finished)
-            active, current, step = active[going], current.take(going), step.take(going)
+            active = active[going]
+            if active.size:
+                current, step = current.take(going), step.take(going)
         return active, current, step
 
     def evaluate(self, active: IntArray, current: Any, step: Any, round_number: int) -> bool:

@@ -75,9 +75,10 @@ class TrialBatch:
     def _are_all(self, trials: IntArray) -> bool:
         """Return whether these indices, or this mask, are all trials in their order."""
         count = _count_trials(self)
-        if trials.dtype == np.bool_:
-            return len(trials) == count and bool(trials.all())
-        return len(trials) == count and np.array_equal(trials, np.arange(count))
+        if len(trials) != count:
+            return False
+        is_in_place = trials if trials.dtype == np.bool_ else trials == np.arange(count)
+        return bool(is_in_place.all())
 
     @staticmethod
     def join(parts: Sequence[Value]) -> Value:

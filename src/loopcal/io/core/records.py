@@ -4,8 +4,8 @@
 The annotations of the fields say everything. Numbers annotated `Length`, `Angle` or `Ratio` are
 converted to SI: by the units of the file, or, where the file has none, from texts such as `5 um`.
 Keys that are not fields are refused, except in records whose class says `OTHER_KEYS = True`; a
-field `from_` has the key `from`. pydantic checks the rest strictly (text is not a number), and its
-first complaint becomes one sentence with a line.
+field `from_` has the key `from`. The rest is checked strictly (text is not a number). pydantic is
+imported only where something does not fit: its first complaint becomes one sentence with a line.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import json
 import types
 import typing
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, UnitError, suggest_names
+from loopcal.io.core.record_building import NoFitError, make_builder
 from loopcal.io.core.yaml_file import (
     Location,
     YamlFile,
@@ -58,9 +60,11 @@ def read_record(
     ------
     FileError : the first value that does not fit, at its line.
     """
+    scaled = _to_si(record, dict(content), file, units, location)
+    with suppress(NoFitError):
+        return make_builder(record)(scaled)
     from pydantic import ValidationError
 
-    scaled = _to_si(record, dict(content), file, units, location)
     try:
         return _make_adapter(record).validate_json(json.dumps(scaled), strict=True)
     except ValidationError as error:

@@ -72,9 +72,8 @@ class TowerMap:
 
 def _compute_rise(arm: FloatArray, radius: FloatArray) -> FloatArray:
     """Return how high rods rise over a radius [m]; NaN where they are too short for it."""
-    with np.errstate(invalid="ignore"):
-        rise = np.sqrt(arm**2 - radius**2)
-    return np.where(rise > 0.0, rise, np.nan)
+    square = arm**2 - radius**2
+    return np.sqrt(np.where(square > 0.0, square, np.nan))
 
 
 @dataclass(frozen=True)
