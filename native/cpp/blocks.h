@@ -17,7 +17,9 @@ struct Division {
     int64_t t, n;
     bool by_trials;
 
-    Division(int64_t trials, int64_t poses) : t(trials), n(poses), by_trials(poses < W && trials > 1) {}
+    Division(int64_t trials, int64_t poses) : Division(trials, poses, poses < W && trials > 1) {}
+    Division(int64_t trials, int64_t poses, bool trials_share_lanes)
+        : t(trials), n(poses), by_trials(trials_share_lanes) {}
 
     int64_t units() const { return by_trials ? (t + W - 1) / W : t; }  // that share placed links
     int64_t blocks_of_unit() const { return by_trials ? n : (n + W - 1) / W; }

@@ -20,6 +20,9 @@ int loopcal_linearize(int, const int64_t *, const double *, const loopcal::Strid
 int loopcal_differentiate(int, const int64_t *, const double *, const int64_t *,
                           const loopcal::Strided *, const loopcal::Strided *, double *, double *,
                           int64_t, int64_t);
+int loopcal_fold_poses(int, const int64_t *, const double *, const int64_t *, const loopcal::Strided *,
+                       const loopcal::Strided *, const loopcal::TwistRows *, const double *,
+                       double *, int8_t *, int64_t, int64_t);
 int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
                   const loopcal::Strided *, int64_t, int64_t, int64_t, loopcal::Task, void *,
                   double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
@@ -192,6 +195,19 @@ void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Dige
         loopcal_differentiate(set, machine.structure.data(), machine.numbers.data(), entries.data(),
                               mapped, solved.data(), twists.data(), driven.data(), t, n);
         digest.add(twists), digest.add(driven);
+        constexpr int64_t EACH = 5;  // rows of a pose
+        std::vector<int64_t> pose;
+        for (int64_t i = 0; i < EACH * n; i++) pose.push_back(i / EACH);
+        Reals by_twist = random.reals((size_t)(6 * t * EACH * n), 1.0);
+        Reals white = random.reals((size_t)(t * EACH * n), 1.0);
+        loopcal::TwistRows observed = {EACH * n, pose.data(), {by_twist.data(), 6 * EACH * n, 0},
+                                       {white.data(), EACH * n, 0}};
+        Reals factor((size_t)(t * (parameters + 1) * (parameters + 1)));
+        std::vector<int8_t> finite((size_t)(t * n));
+        loopcal_fold_poses(set, machine.structure.data(), machine.numbers.data(), entries.data(),
+                           mapped, solved.data(), &observed, factor.data(), factor.data(),
+                           finite.data(), t, n);
+        digest.add(factor), digest.add(finite);
     }
     digest.add(poses), digest.add(residual), digest.add(iterations);
     digest.add(status), digest.add(sign);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 3;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 4;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -83,6 +83,15 @@ EXPORT int loopcal_differentiate(int set, const int64_t *structure, const double
                                  double *by_reading, int64_t t, int64_t n) {
     return list_sets()[set].kernels->differentiate(structure, numbers, entries, arrays, joints,
                                                    by_parameter, by_reading, t, n);
+}
+
+EXPORT int loopcal_fold_poses(int set, const int64_t *structure, const double *numbers,
+                              const int64_t *entries, const loopcal::Strided *arrays,
+                              const loopcal::Strided *joints, const loopcal::TwistRows *rows,
+                              const double *factor, double *out, int8_t *is_finite, int64_t t,
+                              int64_t n) {
+    return list_sets()[set].kernels->fold_poses(structure, numbers, entries, arrays, joints, rows,
+                                                factor, out, is_finite, t, n);
 }
 
 EXPORT int loopcal_solve(int set, const int64_t *structure, const double *numbers,

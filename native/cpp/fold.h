@@ -74,27 +74,45 @@ inline size_t need_by_trials(int64_t p) {
     return Arena::need<Lanes>(packed(p, p)) + Arena::need<Lanes>(p * ROWS);
 }
 
+// Factors of `count` <= W trials, one after the other; lanes without a trial repeat the last one.
+inline void load_factors(const double *factor, int64_t count, int64_t p, Lanes *R) {
+    const double *of_lane[W];
+    for (int lane = 0; lane < W; lane++)
+        of_lane[lane] = factor + (lane < count ? lane : count - 1) * p * p;
+    for (int64_t i = 0; i < p; i++) {
+        Lanes *row = R + packed(i, p) - i;
+        for (int64_t j = i; j < p; j++) {
+            Lanes value;
+            for (int lane = 0; lane < W; lane++) value[lane] = of_lane[lane][i * p + j];
+            row[j] = value;
+        }
+    }
+}
+
+inline void store_factors(const Lanes *R, int64_t count, int64_t p, double *out) {
+    for (int64_t i = 0; i < p; i++) {
+        const Lanes *row = R + packed(i, p) - i;
+        for (int64_t lane = 0; lane < count; lane++) {
+            double *to = out + lane * p * p + i * p;
+            for (int64_t j = 0; j < i; j++) to[j] = 0.0;
+            for (int64_t j = i; j < p; j++) to[j] = row[j][lane];
+        }
+    }
+}
+
 // Fold `count` <= W trials. rows : m x p of each trial, `stride` apart. left : rows from the first
 // one of the first trial to the end of the memory; those beyond are zero.
 inline void fold_trials(const double *factor, const double *rows, double *out, int64_t count,
                         int64_t m, int64_t p, int64_t stride, int64_t left, Arena &arena) {
     Lanes *R = arena.take<Lanes>(packed(p, p)), *block = arena.take<Lanes>(p * ROWS);
-    const double *factors[W], *rows_of[W];
+    const double *rows_of[W];
     int64_t rows_left[W];
     for (int lane = 0; lane < W; lane++) {  // lanes without a trial repeat the last one
         int64_t trial = lane < count ? lane : count - 1;
-        factors[lane] = factor + trial * p * p;
         rows_of[lane] = rows + trial * stride;
         rows_left[lane] = p && trial ? left - trial * (stride / p) : left;
     }
-    for (int64_t i = 0; i < p; i++) {
-        Lanes *row = R + packed(i, p) - i;
-        for (int64_t j = i; j < p; j++) {
-            Lanes value;
-            for (int lane = 0; lane < W; lane++) value[lane] = factors[lane][i * p + j];
-            row[j] = value;
-        }
-    }
+    load_factors(factor, count, p, R);
     for (int64_t first = 0; first < m; first += ROWS) {
         int64_t height = m - first < ROWS ? m - first : ROWS;
         for (int64_t j = 0; j < p; j++)
@@ -120,14 +138,7 @@ inline void fold_trials(const double *factor, const double *rows, double *out, i
         }
         fold_block(R, block, p);
     }
-    for (int64_t i = 0; i < p; i++) {
-        const Lanes *row = R + packed(i, p) - i;
-        for (int64_t lane = 0; lane < count; lane++) {
-            double *to = out + lane * p * p + i * p;
-            for (int64_t j = 0; j < i; j++) to[j] = 0.0;
-            for (int64_t j = i; j < p; j++) to[j] = row[j][lane];
-        }
-    }
+    store_factors(R, count, p, out);
 }
 
 // --- by columns: factor [p][width], block [ROWS][width], width a multiple of W ----------------

@@ -26,6 +26,14 @@ struct Strided {
     int64_t trial, pose;
 };
 
+// Whitened rows of poses: derivatives (t | 1, count, 6) by the platform's twist and residuals
+// (t, count), `trial` numbers apart. pose : of each row, ascending.
+struct TwistRows {
+    int64_t count;
+    const int64_t *pose;
+    Strided by_twist, residual;
+};
+
 struct Kernels {
     int (*fold)(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
                 int64_t p, int64_t stride);
@@ -39,6 +47,10 @@ struct Kernels {
     int (*differentiate)(const int64_t *structure, const double *numbers, const int64_t *entries,
                          const Strided *arrays, const Strided *joints, double *by_parameter,
                          double *by_reading, int64_t t, int64_t n);
+    // factor, out : (t, p + 1, p + 1). is_finite : (t, n), 1 where all derivatives are; see fold_poses.h
+    int (*fold_poses)(const int64_t *structure, const double *numbers, const int64_t *entries,
+                      const Strided *arrays, const Strided *joints, const TwistRows *rows,
+                      const double *factor, double *out, int8_t *is_finite, int64_t t, int64_t n);
     int (*solve)(const int64_t *structure, const double *numbers, const Strided *arrays,
                  const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, Task task,
                  void *context, double *T, double *const *joints_out, double *residual,

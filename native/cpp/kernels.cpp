@@ -3,6 +3,7 @@
 // INSTRUCTION_SET (a namespace) and LANES (doubles of a vector).
 #include "certify.h"
 #include "fold.h"
+#include "fold_poses.h"
 #include "interface.h"
 #include "linearize.h"
 #include "sensitivity.h"
@@ -30,6 +31,7 @@ static int call_solve(const int64_t *structure, const double *numbers,
 }
 
 extern const loopcal::Kernels kernels;
-const loopcal::Kernels kernels = {fold, certify, call_linearize, differentiate, call_solve};
+const loopcal::Kernels kernels = {fold,          certify,    call_linearize,
+                                   differentiate, fold_poses, call_solve};
 
 }  // namespace INSTRUCTION_SET

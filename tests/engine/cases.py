@@ -4,7 +4,7 @@ time.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -12,7 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.engine import LENGTH, PITCH, Block, Group, MapPattern, ParameterMap, Program, State
+from loopcal.engine import (
+    LENGTH,
+    PITCH,
+    Block,
+    Engine,
+    Group,
+    MapPattern,
+    ParameterMap,
+    Program,
+    State,
+    TwistRows,
+)
+from loopcal.io import load_robot
 from loopcal.mechanism import Mechanism
 
 Array = NDArray[np.float64]
@@ -300,3 +312,45 @@ def spread_map(
         change = inputs.basis[..., joint, function] * inputs.joints[:, None, y]
         of_q[..., joint, parameter] += change
     return of_e, of_q
+
+
+# --- rows of poses
+# -----------------------------------------------------------
+
+PoseRows = tuple[Program, Array, Array, State, ParameterMap, list[TwistRows]]
+"""The arguments of `fold_poses` behind the factor."""
+
+
+def draw_twist_rows(t: int, n: int) -> list[TwistRows]:
+    """Draw rows of two kinds: six of every pose, whose derivatives trials share, and one of some
+    poses, in descending order.
+    """
+    rng, some = np.random.default_rng(n), np.arange(n)[::-2]
+    return [
+        TwistRows(
+            poses, rng.normal(size=(first, len(poses), m, 6)), rng.normal(size=(t, len(poses), m))
+        )
+        for poses, m, first in ((np.arange(n), 6, 1), (some, 1, t))
+    ]
+
+
+def make_pose_rows(engine: Engine, name: str, t: int, n: int, per_trial: bool = True) -> PoseRows:
+    """Return rows of a shipped robot at solved poses."""
+    case = make_case(load_robot(name), t=t, n=n)
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    inputs = draw_map(case.program, (t, n), per_trial)
+    return case.program, case.e, case.q, state, inputs, draw_twist_rows(t, n)
+
+
+def take_pose_rows(arguments: PoseRows, trials: NDArray[np.int64]) -> PoseRows:
+    """Return the rows of some trials."""
+    program, e, q, state, inputs, observed = arguments
+
+    def take(a: Array) -> Array:
+        return a if len(a) == 1 else a[trials]
+
+    names = ("displacements", "joints", "basis", "readings")
+    own = replace(inputs, **{name: take(getattr(inputs, name)) for name in names})
+    rows = [replace(o, by_twist=take(o.by_twist), residual=o.residual[trials]) for o in observed]
+    moved = replace(state, T=state.T[trials], joints=tuple(a[trials] for a in state.joints))
+    return program, e[trials], q[trials], moved, own, rows

@@ -37,6 +37,7 @@ def make_counting_engine(variant: str) -> Engine:
         own.linearize,
         lambda factor, rows: factor + len(rows),
         own.differentiate,
+        own.fold_poses,
     )
     return Engine(f"counting:{variant}", "1.0", *functions)
 

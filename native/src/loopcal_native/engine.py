@@ -11,9 +11,18 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.engine import Block, ClosureBlocks, Engine, ParameterMap, Program, State, Task
+from loopcal.engine import (
+    Block,
+    ClosureBlocks,
+    Engine,
+    ParameterMap,
+    Program,
+    State,
+    Task,
+    TwistRows,
+)
 from loopcal.engine.numpy_engine.certificate import Begin, has_driven_rods
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal_native.library import (
     TASK_FAILED,
     Strided,
@@ -23,6 +32,7 @@ from loopcal_native.library import (
     load_library,
     require_done,
 )
+from loopcal_native.pose_rows import flatten_rows
 from loopcal_native.programs import flatten_pattern, flatten_program, require
 from loopcal_native.tasks import NO_TASK, TaskCalls
 
@@ -40,8 +50,8 @@ def make_engine(variant: str = "") -> Engine:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
     own = NativeFunctions(sets[name])
     number = version("loopcal-native")
-    functions = own.solve, own.certify, own.linearize, own.fold, own.differentiate
-    return Engine(f"native:{name}", number, *functions)
+    functions = own.solve, own.certify, own.linearize, own.fold
+    return Engine(f"native:{name}", number, *functions, own.differentiate, own.fold_poses)
 
 
 @dataclass(frozen=True)
@@ -204,6 +214,47 @@ class NativeFunctions:
         call = load_library().loopcal_fold
         require_done(call(self.instruction_set, *addresses, t, m, p, stride))
         return out
+
+    def fold_poses(
+        self,
+        factor: FloatArray,
+        program: Program,
+        e: FloatArray,
+        q: FloatArray,
+        state: State,
+        inputs: ParameterMap,
+        observed: Sequence[TwistRows],
+    ) -> tuple[FloatArray, BoolArray]:
+        """Fold the rows of observed poses."""
+        t, n = len(factor), state.T.shape[1]
+        flat = flatten_program(program, False)
+        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
+        joints = [as_reals(a) for a in joints]
+        _require_arrays(program, arrays, joints, (t, n))
+        entries, numbers = _flatten_map(program, inputs, (t, n))
+        width = inputs.pattern.parameters + 1
+        factor, rows = as_reals(factor), flatten_rows(observed, t, n)
+        require(factor.shape == (t, width, width), f"a factor (t, {width}, {width})")
+        out, is_finite = np.empty_like(factor), np.ones((t, n), dtype=bool)
+        if t * n:
+            call = load_library().loopcal_fold_poses
+            require_done(
+                call(
+                    self.instruction_set,
+                    flat.structure.ctypes.data,
+                    flat.numbers.ctypes.data,
+                    entries.ctypes.data,
+                    _describe_all([*arrays, *numbers]),
+                    _describe_all(joints),
+                    ctypes.byref(rows.describe()),
+                    factor.ctypes.data,
+                    out.ctypes.data,
+                    is_finite.ctypes.data,
+                    t,
+                    n,
+                )
+            )
+        return (out if t * n else factor), is_finite
 
 
 def pack_begin(begin: Begin) -> FloatArray:

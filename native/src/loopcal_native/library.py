@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-ABI = 3
+ABI = 4
 """The C interface that this package calls; dispatch.cpp states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""
@@ -23,6 +23,12 @@ class Strided(ctypes.Structure):
     """An array (t | 1, n | 1, ..): strides of its first axes in doubles, 0 for one of length 1."""
 
     _fields_ = (("data", ADDRESS), ("trial", COUNT), ("pose", COUNT))
+
+
+class TwistRows(ctypes.Structure):
+    """Rows of poses, see interface.h."""
+
+    _fields_ = (("count", COUNT), ("pose", ADDRESS), ("by_twist", Strided), ("residual", Strided))
 
 
 class TaskAnswer(ctypes.Structure):
@@ -56,6 +62,8 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_certify.argtypes += (*(COUNT,) * 2, ADDRESS)
     library.loopcal_linearize.argtypes = (INT, *(ADDRESS,) * 5, *(COUNT,) * 2)
     library.loopcal_differentiate.argtypes = (INT, *(ADDRESS,) * 7, *(COUNT,) * 2)
+    library.loopcal_fold_poses.argtypes = (INT, *(ADDRESS,) * 5, ctypes.POINTER(TwistRows))
+    library.loopcal_fold_poses.argtypes += (*(ADDRESS,) * 3, *(COUNT,) * 2)
     library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3, TASK, *(ADDRESS,) * 7)
     return library
 

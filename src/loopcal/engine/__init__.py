@@ -22,10 +22,12 @@ from loopcal.engine.program import Program as Program
 from loopcal.engine.program import Slot as Slot
 from loopcal.engine.program import State as State
 from loopcal.engine.program import Task as Task
+from loopcal.engine.program import TwistRows as TwistRows
 from loopcal.engine.selection import Engine as Engine
 from loopcal.engine.selection import certify as certify
 from loopcal.engine.selection import differentiate as differentiate
 from loopcal.engine.selection import fold as fold
+from loopcal.engine.selection import fold_poses as fold_poses
 from loopcal.engine.selection import get_current_engine as get_current_engine
 from loopcal.engine.selection import linearize as linearize
 from loopcal.engine.selection import select_engine as select_engine

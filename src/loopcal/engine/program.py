@@ -200,3 +200,16 @@ class ParameterMap:
     joints: FloatArray
     basis: FloatArray
     readings: FloatArray
+
+
+@dataclass(frozen=True)
+class TwistRows:
+    """Whitened rows of poses, m of each of r measurements, as the platform's twist changes them.
+
+    poses : (r,) number of the pose of each measurement. by_twist : (t | 1, r, m, 6) derivatives.
+    residual : (t, r, m).
+    """
+
+    poses: IntArray
+    by_twist: FloatArray
+    residual: FloatArray

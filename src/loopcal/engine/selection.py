@@ -10,7 +10,7 @@ installed, and NumPy elsewhere.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine import numpy_engine
-from loopcal.engine.program import ClosureBlocks, ParameterMap, Program, State, Task
+from loopcal.engine.program import ClosureBlocks, ParameterMap, Program, State, Task, TwistRows
 from loopcal.errors import MissingPackageError
 from loopcal.findings import report_finding
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 VARIABLE, GROUP = "LOOPCAL_ENGINE", "loopcal.engines"
 """The environment variable that names an engine, and the entry points that provide engines."""
@@ -45,6 +45,7 @@ class Engine:
     linearize: Callable[..., ClosureBlocks]
     fold: Callable[[FloatArray, FloatArray], FloatArray]
     differentiate: Callable[..., tuple[FloatArray, FloatArray]]
+    fold_poses: Callable[..., tuple[FloatArray, BoolArray]]
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -63,8 +64,8 @@ def select_engine(choice: str = "") -> Engine:
     name, _, variant = choice.partition(":")
     if choice == NUMPY:
         own = numpy_engine
-        functions = own.solve, own.certify, own.linearize, own.fold, own.differentiate
-        return Engine(NUMPY, np.__version__, *functions)
+        functions = own.solve, own.certify, own.linearize, own.fold
+        return Engine(NUMPY, np.__version__, *functions, own.differentiate, own.fold_poses)
     load = _find_loader(choice, name)
     try:
         return load()(variant)
@@ -171,3 +172,26 @@ def differentiate(
         of each, zero outside its freedoms.
     """
     return get_current_engine().differentiate(program, e, q, state, inputs)
+
+
+def fold_poses(
+    factor: FloatArray,
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    state: State,
+    inputs: ParameterMap,
+    observed: Sequence[TwistRows],
+) -> tuple[FloatArray, BoolArray]:
+    """Fold the rows [G D | r] of observed poses, with D of `differentiate` and G = `by_twist`.
+
+    factor : (t, p + 1, p + 1) upper triangular. e, q, state, inputs : as for `differentiate`, of t
+        trials, or of a single one that stands for all.
+
+    Returns
+    -------
+    factor : (t, p + 1, p + 1), see `fold`. is_finite : (t, n) where all derivatives of a pose that
+        was observed are finite. Its rows are zero elsewhere.
+    """
+    arguments = program, e, q, state, inputs, observed
+    return get_current_engine().fold_poses(factor, *arguments)

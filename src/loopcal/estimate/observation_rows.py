@@ -23,6 +23,8 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 BLOCK = 2048
 """Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
 enough for the cache."""
+PLAIN_BLOCK = 8192
+"""The same of rows that the engine folds as it makes them, so that less of them is in memory."""
 
 
 def _no_nuisance() -> IntArray:
@@ -80,17 +82,28 @@ class ObservationRows:
         offset = None if self.offset is None else self.offset[:, rows]
         return ObservationRows(self.kind, place[self.poses[rows]], *parts, factor, offset)
 
+    def cut_trials(self, trials: IntArray) -> ObservationRows:
+        """Return the rows of some trials (a,), which are numbered from 0 then."""
+        arrays = (self.measured, self.whitener, self.offset)
+        cut = (a if a is None or len(a) == 1 else a[trials] for a in arrays)
+        return replace(self, **dict(zip(("measured", "whitener", "offset"), cut, strict=True)))
+
     def take_trials(self, trials: IntArray) -> tuple[MeasuredColumns, FloatArray]:
         """Return measured columns and whiteners of some trials; one set stands for all of them."""
-        if len(self.measured) == 1:
+        t, r = self.measured.shape[:2]
+        if t == 1:
+            columns = self._columns
+        elif t * r > PLAIN_BLOCK:  # too many to keep
+            columns = self.kind.prepare_columns(self.measured[trials])
+        elif np.array_equal(trials, np.arange(t)):
             columns = self._columns
         else:
-            columns = self.kind.prepare_columns(self.measured[trials])
+            columns = self._columns.take(trials)
         return columns, self.whitener if len(self.whitener) == 1 else self.whitener[trials]
 
     @cached_property
     def _columns(self) -> MeasuredColumns:
-        """The measured columns of the only trial; they stay the same in all evaluations."""
+        """The measured columns of all trials; they stay the same in all evaluations."""
         return self.kind.prepare_columns(self.measured)
 
     def whiten(self, whitener: FloatArray, residual: FloatArray, trials: IntArray) -> FloatArray:
@@ -99,6 +112,19 @@ class ObservationRows:
         if self.offset is None:
             return white
         return white + (self.offset if len(self.offset) == 1 else self.offset[trials])
+
+    def whiten_columns(self, whitener: FloatArray, columns: FloatArray) -> FloatArray:
+        """Return whitened derivatives (a, r, m, c)."""
+        if not self._is_diagonal:
+            return np.matmul(whitener, columns)
+        return np.einsum("trmm->trm", whitener)[..., None] * columns
+
+    @cached_property
+    def _is_diagonal(self) -> bool:
+        """Whether the whiteners scale each residual by itself."""
+        return np.count_nonzero(self.whitener) == np.count_nonzero(
+            np.einsum("trmm->trm", self.whitener)
+        )
 
     def weighted(self, weight: FloatArray) -> ObservationRows:
         """Return the rows with a factor (n,) or (t, n) on each pose's squares; linked poses share

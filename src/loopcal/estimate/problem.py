@@ -25,25 +25,24 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import LeverageRows, Linearization, Start
-from loopcal.estimate.nuisance.elimination import NuisanceElimination, fold_node_rows, list_members
+from loopcal.estimate.nuisance.elimination import NuisanceElimination, fold_node_rows
 from loopcal.estimate.observation_rows import (
     BLOCK,
+    PLAIN_BLOCK,
     ObservationRows,
     Residuals,
     count_by_component,
-    divide_poses,
-    find_needed_poses,
 )
-from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
 from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
-from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
+from loopcal.estimate.poses.coordinates import PoseCoordinates
+from loopcal.estimate.poses.division import divide_exact_poses, divide_uncertain_poses
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
 from loopcal.estimate.poses.leverage import spread_rows
 from loopcal.estimate.poses.linearization import LinearizedPoses, evaluate_rows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
-from loopcal.measure import Evaluation, Measurements, list_sensed_joints
+from loopcal.measure import Evaluation, Measurements
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
@@ -89,7 +88,12 @@ class Problem:
     @cached_property
     def poses(self) -> ExactPoses | UncertainPoses:
         """Rows at the poses, which readings determine or which are estimated."""
-        return self._exact_poses() if self.coordinates is None else self._uncertain_poses()
+        free, rows, nuisance = self.free, self.rows, self.nuisance
+        if self.coordinates is None:
+            return divide_exact_poses(free, self.readings[0], rows, nuisance, self.located)
+        assert self.member is not None
+        moved = self.coordinates, self.member
+        return divide_uncertain_poses(free, self.readings[0], rows, nuisance, *moved)
 
     @cached_property
     def component_count(self) -> IntArray:
@@ -137,6 +141,12 @@ class Problem:
         vars(other).update(poses=self.poses, component_count=self.component_count)
         return other
 
+    @property
+    def part_size(self) -> int:
+        """Number of trials whose rows are made together."""
+        size = PLAIN_BLOCK if self.folds_plain_rows else BLOCK
+        return max(1, size // self.poses.block_size)
+
     def weighted(self, weight: FloatArray) -> Problem:
         """Return the problem with a factor (n,) on each pose's squares, its readings included, or
         with factors (t, n) of each trial.
@@ -180,18 +190,19 @@ class Problem:
         Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
         begins at `start`.
         """
-        t, shared = len(self), None
+        t, shared, folds = len(self), None, self.folds_plain_rows
         exact = self.poses if isinstance(self.poses, ExactPoses) else None
+        single = exact if exact is not None and exact.is_single_block else None
         is_equal = t > 1 and bool((deviation == deviation[0]).all())
-        if exact is not None and exact.is_single_block and is_equal:
-            shared = exact.solve_single_block(deviation[:1], self.trials, start)
-        batch = max(1, BLOCK // self.poses.block_size)
-        linearizations = []
+        if single is not None and is_equal:
+            shared = single.solve_single_block(deviation[:1], self.trials, start, not folds)
+        batch, linearizations = self.part_size, []
         for first in range(0, t, batch):
             chosen = np.arange(first, min(first + batch, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
-            if shared is not None and exact is not None:
-                solution = exact.solve(z, trials, begin, self.control, shared=shared)
+            if single is not None and (shared is not None or folds):
+                known = shared or single.solve_single_block(z, trials, begin, not folds)
+                solution = single.solve(z, trials, begin, self.control, shared=known)
             else:
                 solution = self.poses.solve(z, trials, begin, self.control)
             linearizations.append(self.take(chosen).linearize_at(z, begin, solution))
@@ -314,6 +325,12 @@ class Problem:
         """Return the poses that a row needs and that are not reached at deviation (1, p)."""
         return self.poses.find_unreached(deviation, start)
 
+    @property
+    def folds_plain_rows(self) -> bool:
+        """Whether the engine makes the rows of exact poses as it folds them."""
+        exact = isinstance(self.poses, ExactPoses) and self.poses.is_plain
+        return exact and self.consistent is None
+
     def _eliminate(
         self, solution: PoseSolution, z: FloatArray, trials: IntArray, start: Start
     ) -> Linearization:
@@ -322,9 +339,13 @@ class Problem:
         nuisance = None if self.nuisance is None else self.nuisance.take(trials)
         factor, is_lost = empty_factor(a, p), np.zeros(a, dtype=bool)
         factors = None if nuisance is None else NodeFactors(nuisance.tree, a, p)
-        for parts, lost in self.poses.iterate_rows(solution, z, trials):
-            factor = fold_node_rows(factor, factors, parts)
-            is_lost |= lost
+        if self.folds_plain_rows and not solution.has_derivatives:
+            assert isinstance(self.poses, ExactPoses)
+            factor, is_lost = self.poses.fold_rows(factor, solution, z, trials)
+        else:
+            for parts, lost in self.poses.iterate_rows(solution, z, trials):
+                factor = fold_node_rows(factor, factors, parts)
+                is_lost |= lost
         equations = _of_trials(self.component_count.sum(axis=1), trials)
         if solution.estimates is not None:
             equations = equations - solution.estimates.rank.sum(axis=1)
@@ -365,34 +386,6 @@ class Problem:
         total = max(len(self.readings), int(self.trials.max(initial=0)) + 1)
         states = first_poses(self.free.robot, self.readings, self.sigma, self.rows[:-1], total)
         return states if len(self.trials) == total else states.take(self.trials)
-
-    def _exact_poses(self) -> ExactPoses:
-        """Return the rows at poses of exact readings, in blocks of poses."""
-        readings = self.readings[0]
-        is_needed = find_needed_poses(self.rows, len(readings))
-        blocks = divide_poses(readings, self.rows, is_needed, BLOCK)
-        members = tuple(
-            tuple(list_members(self.nuisance, rows) for rows in block.rows) for block in blocks
-        )
-        names = list_sensed_joints(r.kind for r in self.rows)
-        return ExactPoses(
-            self.free, len(readings), names, blocks, members, self.nuisance, self.located
-        )
-
-    def _uncertain_poses(self) -> UncertainPoses:
-        """Return the rows at poses of uncertain readings, in blocks of components."""
-        member, coordinates = self.member, self.coordinates
-        assert member is not None
-        assert coordinates is not None
-        redundant = isinstance(coordinates, TwistCoordinates)
-        is_needed = find_needed_poses(self.rows if redundant else self.rows[:-1], len(member))
-        blocks = divide_components(self.readings[0], self.rows, member, is_needed, BLOCK)
-        nodes, structures = groups_of_nodes(self.rows, member, self.nuisance)
-        groups = tuple(group_components(block, member, nodes, structures) for block in blocks)
-        names = list_sensed_joints(r.kind for r in self.rows)
-        return UncertainPoses(
-            self.free, names, coordinates, member, blocks, groups, self.nuisance, is_needed
-        )
 
 
 def _of_trials(count: IntArray, trials: IntArray) -> IntArray:

@@ -17,6 +17,7 @@ from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinat
 from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.estimate.problem import Problem
 from loopcal.measure import (
+    Kind,
     Measurements,
     NuisanceParameters,
     Sensor,
@@ -29,7 +30,7 @@ from loopcal.measure import (
 from loopcal.measure.whitening import compute_whitener
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import Halving
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
@@ -82,20 +83,33 @@ def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
 
 
 def _compute_whiteners(sensor: Sensor, measured: FloatArray) -> FloatArray:
-    """Return the whiteners (t, r, m, m) of the rows of a sensor, computed for some trials at a time
-    so that what they are computed with stays small.
+    """Return the whiteners (t | 1, r, m, m) of the rows of a sensor, one set where those of all
+    trials are equal.
     """
-    step, parts = max(1, BLOCK // max(1, measured.shape[1])), []
-    for first in range(0, len(measured), step):
-        part = measured[first : first + step]
-        present = sensor.kind.detect_present(part)
-        N = sensor.kind.linearize_noise(part)
+    kind, step = sensor.kind, max(1, BLOCK // max(1, measured.shape[1]))
+    parts = [measured[first : first + step] for first in range(0, len(measured), step)]
+    first = _list_noise(kind, parts[0][:1])
+    if all(_is_equal(_list_noise(kind, part), first) for part in parts):
+        parts = [parts[0][:1]]
+    white = []
+    for part in parts:  # so that what they are computed with stays small
+        N, present = _list_noise(kind, part)
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
-        white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r))
-        parts.append(white.reshape(t, r, m, m))
-    return np.concatenate(parts)
+        whitener = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r))
+        white.append(whitener.reshape(t, r, m, m))
+    return np.concatenate(white)
+
+
+def _list_noise(kind: Kind, measured: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return by what noise changes the columns, and which residuals exist, of trials (t, ..)."""
+    return kind.linearize_noise(measured), kind.detect_present(measured)
+
+
+def _is_equal(noise: tuple[FloatArray, BoolArray], first: tuple[FloatArray, BoolArray]) -> bool:
+    """Return whether all trials have the noise of the first one."""
+    return all(bool((a == b).all()) for a, b in zip(noise, first, strict=True))
 
 
 def make_problem(

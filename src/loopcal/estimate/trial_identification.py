@@ -29,7 +29,6 @@ from loopcal.estimate.minimization.chord_start import (
 )
 from loopcal.estimate.minimization.descent import Descent, descend
 from loopcal.estimate.minimization.linear_model import LinearModel
-from loopcal.estimate.observation_rows import BLOCK
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import problem_of_trials
@@ -137,7 +136,7 @@ def _fit_parts(
     start = None if problem.nuisance is None else problem.start(z)
 
     def fit(part: IntArray) -> _Part:
-        own, begin = problem.take(part), None if start is None else start.take(part)
+        own, begin = _cut_problem(problem, part), None if start is None else start.take(part)
         if shared is None:
             first = descend_once(own, z[part], begin, options)
         else:
@@ -177,6 +176,18 @@ def _descend_from_chords(
 
 def _divide(problem: Problem) -> Iterator[IntArray]:
     """Yield the numbers of the trials of each part."""
-    size, total = max(1, BLOCK // problem.poses.block_size), len(problem)
+    size, total = problem.part_size, len(problem)
     for first in range(0, total, size):
         yield np.arange(first, min(first + size, total))
+
+
+def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
+    """Return the problem of some trials, where rows are plain with arrays of their own.
+
+    The measured columns are then prepared once for all steps of a fit.
+    """
+    if not problem.folds_plain_rows:
+        return problem.take(trials)
+    numbers, data, own = problem.trials[trials], problem.data, np.arange(len(trials))
+    rows = tuple(r.cut_trials(numbers) for r in problem.rows)
+    return replace(problem, rows=rows, trials=own, data=lambda i: data(int(numbers[i])))

@@ -89,6 +89,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism.sensitivity import (
         differentiate_sensed_values as differentiate_sensed_values,
     )
+    from loopcal.mechanism.sensitivity import fold_pose_rows as fold_pose_rows
     from loopcal.mechanism.stages.chain_kinematics import (
         name_platform_entries as name_platform_entries,
     )
@@ -152,7 +153,7 @@ else:
             """,
             "loopcal.mechanism.sensitivity": """
                 PassiveSensitivity PoseSensitivity differentiate_passive_joints
-                differentiate_pose differentiate_sensed_values
+                differentiate_pose differentiate_sensed_values fold_pose_rows
             """,
             "loopcal.mechanism.stages.chain_kinematics": """
                 name_platform_entries select_platform_entries

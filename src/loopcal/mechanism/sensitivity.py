@@ -30,7 +30,7 @@ from loopcal.mechanism.stages.chain_kinematics import (
 )
 from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 BLOCK_ROWS = 1024
 """Rows linearized together."""
@@ -76,6 +76,26 @@ def differentiate_pose(
         for derivative in derivatives:
             derivative[lost] = np.nan
     return PoseSensitivity(*derivatives)
+
+
+def fold_pose_rows(
+    robot: Mechanism,
+    values: FloatArray,
+    q: FloatArray,
+    state: State,
+    columns: ParameterUnits,
+    observed: Sequence[engine.TwistRows],
+    factor: FloatArray,
+) -> tuple[FloatArray, BoolArray]:
+    """Fold rows of observed poses into factors (t, p + 1, p + 1), without writing derivatives.
+
+    They are [G D | r] with D of `differentiate_pose`; see `engine.fold_poses`, also for the second
+    result (t, n). For robots without stages.
+    """
+    e, tau = robot.slots(values)
+    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    inputs = columns.linearize(values, tau, q)
+    return engine.fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.engine import select_engine
-from tests.engine.cases import displacement_units, draw_map, pose_demand
+from tests.engine.cases import displacement_units, draw_map, make_pose_rows, pose_demand
 from tests.engine.native.instruction_sets import ROBOTS, list_arrays, make_engines, make_robot_case
 
 ENGINES = make_engines()
@@ -67,6 +67,19 @@ def test_derivatives_agree_with_numpy_and_between_instruction_sets(name, t, n, p
     calls = [e.differentiate(*arguments) for e in ENGINES.values()]
     for mine, theirs in zip(calls[0], NUMPY.differentiate(*arguments), strict=True):
         assert_allclose(mine, theirs, atol=1e-12 * np.abs(theirs).max())
+    assert_same_bits(calls)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(("t", "n"), [(1, 21), (13, 5)])
+def test_folded_poses_agree_with_numpy_and_between_instruction_sets(name, t, n):
+    arguments = make_pose_rows(NUMPY, name, t, n)
+    zeros = np.zeros((t, *(arguments[4].pattern.parameters + 1,) * 2))
+    calls = [e.fold_poses(zeros, *arguments) for e in ENGINES.values()]
+    expected, is_finite = NUMPY.fold_poses(zeros, *arguments)
+    assert_array_equal(calls[0][1], is_finite)
+    gram, known = (R.swapaxes(1, 2) @ R for R in (calls[0][0], expected))
+    assert_allclose(gram, known, atol=1e-12 * np.abs(known).max())
     assert_same_bits(calls)
 
 

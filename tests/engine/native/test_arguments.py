@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from loopcal.engine import CONVERGED, Engine, Program, Slot, State
+from loopcal.engine import CONVERGED, Engine, Program, Slot, State, TwistRows
 from loopcal.errors import MissingPackageError
-from tests.engine.cases import draw_map
+from tests.engine.cases import draw_map, draw_twist_rows, make_pose_rows
 from tests.engine.native.instruction_sets import ROBOTS, make_engines, make_robot_case
 
 NATIVE = next(iter(make_engines().values()))
@@ -120,6 +120,35 @@ def test_factors_of_wrong_shape_are_refused(factor, rows):
         NATIVE.fold(np.zeros(factor), np.zeros(rows))
 
 
+POSE_ROWS = make_pose_rows(NATIVE, "five-bar", 2, 3)
+ROWS, OTHERS = POSE_ROWS[-1]
+WRONG_ROWS = {
+    "poses": replace(ROWS, poses=ROWS.poses + 1),
+    "negative poses": replace(ROWS, poses=ROWS.poses - 1),
+    "count of poses": replace(ROWS, poses=ROWS.poses[:-1]),
+    "trials of derivatives": replace(ROWS, by_twist=np.repeat(ROWS.by_twist, 3, axis=0)),
+    "columns of derivatives": replace(ROWS, by_twist=ROWS.by_twist[..., :5]),
+    "rows of derivatives": replace(ROWS, by_twist=ROWS.by_twist[:, :, :5]),
+    "trials of residuals": replace(ROWS, residual=np.repeat(ROWS.residual, 2, axis=0)),
+    "axes of residuals": replace(ROWS, residual=ROWS.residual[0]),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_ROWS)
+@pytest.mark.parametrize("has_more", [False, True])
+def test_rows_of_wrong_shape_are_refused(what, has_more):
+    factor = np.zeros((2, *(POSE_ROWS[4].pattern.parameters + 1,) * 2))
+    observed = [WRONG_ROWS[what], OTHERS][: 1 + has_more]
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.fold_poses(factor, *POSE_ROWS[:5], observed)
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 3), (3, 1, 1), (2, 3)])
+def test_factors_of_poses_of_wrong_shape_are_refused(shape):
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.fold_poses(np.zeros(shape), *POSE_ROWS)
+
+
 def test_nothing_is_solved_for_no_trials_no_poses_and_no_rows():
     assert NATIVE.solve(
         PROGRAM, E, Q[:, :0], replace(HOME, T=HOME.T[:, :0], joints=(HOME.joints[0][:, :0],))
@@ -158,6 +187,12 @@ def disturb(rng: np.random.Generator, array: np.ndarray, share: float) -> np.nda
     return np.where(rng.uniform(size=array.shape) < share, draw_any(rng, array.shape), array)
 
 
+def draw_rows(t: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draw derivatives and residuals of the rows of one pose."""
+    rows = draw_twist_rows(t, 1)[0]
+    return np.repeat(rows.by_twist, t, axis=0), rows.residual
+
+
 def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     """Solve, linearize and fold rows with wrong numbers; return how many were solved."""
     rng = np.random.default_rng(seed)
@@ -185,6 +220,9 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     native.differentiate(
         case.program, e, q, state, replace(inputs, displacements=wrong[0], basis=wrong[1])
     )
+    folded = TwistRows(np.zeros(1, int), *(disturb(rng, a[:, :1], share) for a in draw_rows(rows)))
+    zeros = np.zeros((rows, *(inputs.pattern.parameters + 1,) * 2))
+    native.fold_poses(zeros, case.program, e, q, state, inputs, [folded])
     matrix = blocks.closure[0].E.reshape(rows, -1, blocks.closure[0].E.shape[-1])
     factor = native.fold(np.zeros((rows, *matrix.shape[2:] * 2)), matrix)
     assert np.isfinite(

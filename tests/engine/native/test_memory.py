@@ -10,13 +10,15 @@ SCRIPT = """
 import resource
 import numpy as np
 from loopcal.engine import select_engine
-from tests.engine.cases import draw_map, make_case
+from tests.engine.cases import draw_map, make_case, make_pose_rows
 from tests import zoo
 
 engine, case = select_engine("native"), make_case(zoo.five_bar(), n=3)
 arguments = case.program, case.e, case.q
 R, rows = np.zeros((2, 9, 9)), np.ones((2, 12, 9))
 inputs = draw_map(case.program, (1, 3), True)
+rows_of_poses = make_pose_rows(engine, "five-bar", 9, 3)
+zeros = np.zeros((9, *(rows_of_poses[4].pattern.parameters + 1,) * 2))
 
 def call(times):
     for _ in range(times):
@@ -24,6 +26,7 @@ def call(times):
         engine.linearize(*arguments, state)
         engine.differentiate(*arguments, state, inputs)
         engine.fold(R, rows)
+        engine.fold_poses(zeros, *rows_of_poses)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 before = call(1000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -26,10 +27,11 @@ from loopcal.estimate.poses.linearization import (
     linearize_closure,
     linearize_poses,
     linearize_rows,
+    list_twist_rows,
     locate_poses,
 )
 from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_states
-from loopcal.mechanism import forward_trials
+from loopcal.mechanism import fold_pose_rows, forward_trials
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
@@ -67,6 +69,16 @@ class ExactPoses:
     def is_single_block(self) -> bool:
         """Whether all rows belong to one block, so that poses are kept from start to start."""
         return len(self.blocks) == 1 and self.located is None
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether the platform's twist by the parameters determines all rows, so that the engine
+        folds them without writing its derivatives.
+        """
+        kinds = (rows.kind for block in self.blocks for rows in block.rows)
+        is_simple = all(kind.poses_per_row == 1 and not kind.sensed_joints for kind in kinds)
+        has_more = self.nuisance is not None or self.located is not None or self.names
+        return is_simple and not (has_more or self.free.errors or self.free.robot.stages)
 
     def at_readings(self, q: FloatArray) -> ExactPoses:
         """Return these rows at other readings (a, n, actuators) [SI]."""
@@ -133,12 +145,40 @@ class ExactPoses:
             nuisance = self._solve_for_nuisance(located, start.predict_nuisance(z), trials, control)
         return PoseSolution(nuisance, linearized, None if single is None else single.states)
 
-    def solve_single_block(self, z: FloatArray, trials: IntArray, start: Start) -> PoseSolution:
-        """Solve and linearize the poses of the only block at deviations z (a | 1, p)."""
+    def solve_single_block(
+        self, z: FloatArray, trials: IntArray, start: Start, derivatives: bool = True
+    ) -> PoseSolution:
+        """Solve the poses of the only block at deviations z (a | 1, p), and linearize them."""
         first = start.take(np.arange(len(z))) if len(z) < len(start) else start
-        begin, follow = first.states, not first.is_near
-        linearized, state = self._linearize(self.blocks[0], z, trials, begin, follow)
-        return PoseSolution(None, linearized, PoseStates(state, np.zeros(0)))
+        begin, follow, block = first.states, not first.is_near, self.blocks[0]
+        if derivatives:
+            poses, state = self._linearize(block, z, trials, begin, follow)
+        else:
+            values, q = self.free.values(z), block.readings
+            state = forward_trials(self.free.robot, values, q, begin, follow)
+            poses = locate_poses(self.free, q, state, self.names)
+        return PoseSolution(None, poses, PoseStates(state, np.zeros(0)))
+
+    def fold_rows(
+        self, factor: FloatArray, solution: PoseSolution, z: FloatArray, trials: IntArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Fold the rows of all blocks; return also which trials (a,) lack a needed pose.
+
+        For rows that are plain, see `is_plain`.
+        """
+        robot, is_lost = self.free.robot, np.zeros(len(z), dtype=bool)
+        for block in self.blocks:
+            if solution.states is not None and solution.linearized is not None:
+                state, poses = solution.states.state, solution.linearized
+            else:
+                state = forward_trials(robot, self.free.values(z), block.readings)
+                poses = locate_poses(self.free, block.readings, state, self.names)
+            observed = [list_twist_rows(r, poses, trials) for r in block.rows if len(r.poses)]
+            values = self.free.values(z[: len(state.T)])  # one trial may stand for all
+            parts = values, block.readings, state, self.free.columns, observed, factor
+            factor, is_finite = fold_pose_rows(robot, *parts)
+            is_lost |= np.any(~(poses.is_reached & is_finite) & block.is_needed, axis=1)
+        return factor, is_lost
 
     def iterate_rows(
         self, solution: PoseSolution, z: FloatArray, trials: IntArray

@@ -83,3 +83,8 @@ class PoseSolution:
     linearized: LinearizedPoses | None = None
     states: PoseStates | None = None
     estimates: PoseEstimates | None = None
+
+    @property
+    def has_derivatives(self) -> bool:
+        """Whether poses of a single block are linearized."""
+        return self.linearized is not None and self.linearized.by_parameters.shape[-1] > 0

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of a kind: their columns, residuals and derivatives, and rows that are invalid."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.numerics.rounding import without_rounding
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 InvalidRows = tuple[tuple[int, str], ...]
@@ -64,6 +66,11 @@ class MeasuredColumns(NamedTuple):
     reference: FloatArray
     present: BoolArray
     is_complete: bool
+
+    def take(self, trials: IntArray) -> MeasuredColumns:
+        """Return the columns of some trials."""
+        arrays = (self.columns[trials], self.reference[trials], self.present[trials])
+        return MeasuredColumns(*arrays, self.is_complete)
 
 
 def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
