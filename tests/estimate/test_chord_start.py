@@ -16,6 +16,7 @@ from loopcal.estimate import (
     Ridge,
     identify_trials,
 )
+from loopcal.estimate import problem as problem_module
 from loopcal.estimate import trial_identification as module
 from loopcal.estimate.identified_trials import IdentifiedTrials
 from loopcal.estimate.minimization.chord_start import ACCEPTED_STEP
@@ -102,7 +103,7 @@ def test_the_test_of_the_next_step_refuses_trials(monkeypatch):
 def test_numbers_depend_neither_on_threads_nor_on_the_other_trials(monkeypatch):
     trials, options = simulate(HEXAPOD, 9, 20), FitOptions(method=MAP())
     one = identify_trials(HEXAPOD, trials, options=options, chord_start=True)
-    monkeypatch.setattr(module, "BLOCK", 40)  # two trials in each part
+    monkeypatch.setattr(problem_module, "PLAIN_BLOCK", 40)  # two trials in each part
     for threads in (1, 3):
         other = identify_trials(HEXAPOD, trials, options=options, chord_start=True, threads=threads)
         assert np.array_equal(one.values, other.values)

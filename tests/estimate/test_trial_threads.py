@@ -9,6 +9,7 @@ import pytest
 
 from loopcal.errors import ArgumentTypeError, EstimationError
 from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify_trials
+from loopcal.estimate import problem as problem_module
 from loopcal.estimate.observation_rows import BLOCK
 from loopcal.io import load_robot
 from loopcal.measure import (
@@ -26,6 +27,12 @@ from loopcal.mechanism import sample_workspace
 DELTA = load_robot("rotary-delta")
 POSES = BLOCK // 4
 """Poses of a trial, so that a part has four trials."""
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch):
+    """Divide rows that the engine folds into parts as small as those of others."""
+    monkeypatch.setattr(problem_module, "PLAIN_BLOCK", BLOCK)
 
 
 def simulate(trials: int, kind=None, poses: int = POSES) -> Trials:
@@ -87,11 +94,11 @@ def measure_memory(trials: Trials) -> tuple[float, float]:
     return peak, kept
 
 
-def test_memory_of_many_trials_is_that_of_their_whiteners_and_results():
+def test_memory_of_many_trials_is_that_of_their_results():
     few, many = simulate(8), simulate(40)
     measure_memory(few)  # what is made once
     (least, kept_few), (most, kept_many) = measure_memory(few), measure_memory(many)
-    whiteners = 8 * 32 * POSES * len(Pose().noise_columns) ** 2
-    # what the trials of one part are computed with is several times the rest: it does not grow
-    assert most - least < 1.2 * (whiteners + kept_many - kept_few)
+    # what the trials of one part are computed with is several times the rest: it does not grow,
+    # but one of ten parts needs more steps, and so a little more memory, than both of two
+    assert most - least < 1.2 * (kept_many - kept_few) + 0.15 * least
     assert least > 4.0 * kept_few

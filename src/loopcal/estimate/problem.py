@@ -90,9 +90,9 @@ class Problem:
         """Rows at the poses, which readings determine or which are estimated."""
         free, rows, nuisance = self.free, self.rows, self.nuisance
         if self.coordinates is None:
-            return divide_exact_poses(free, self.readings[0], rows, nuisance, self.located)
+            return divide_exact_poses(free, self.readings[0], rows, nuisance, self.located, BLOCK)
         assert self.member is not None
-        moved = self.coordinates, self.member
+        moved = self.coordinates, self.member, BLOCK
         return divide_uncertain_poses(free, self.readings[0], rows, nuisance, *moved)
 
     @cached_property

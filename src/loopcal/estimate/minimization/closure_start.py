@@ -67,7 +67,7 @@ def locate_measured_poses(problem: Problem) -> FloatArray | None:
     if problem.is_uncertain or len(problem.rows) != 1 or problem.nuisance is not None:
         return None
     (rows,) = problem.rows
-    t, r, m = rows.whitener.shape[:3]
+    t, (r, m) = max(len(rows.measured), len(rows.whitener)), rows.whitener.shape[1:3]
     plain = rows.kind.poses_per_row == 1 and not rows.kind.sensed_joints
     n = problem.readings.shape[1]
     if not (m == 6 and plain and rows.is_present.all()):

@@ -7,12 +7,7 @@ from collections.abc import Sequence
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.nuisance.elimination import NuisanceElimination, list_members
-from loopcal.estimate.observation_rows import (
-    BLOCK,
-    ObservationRows,
-    divide_poses,
-    find_needed_poses,
-)
+from loopcal.estimate.observation_rows import ObservationRows, divide_poses, find_needed_poses
 from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
 from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
@@ -27,10 +22,11 @@ def divide_exact_poses(
     rows: Sequence[ObservationRows],
     nuisance: NuisanceElimination | None,
     located: FloatArray | None,
+    size: int,
 ) -> ExactPoses:
-    """Return the rows at poses of exact readings (n, actuators), in blocks of poses."""
+    """Return the rows at poses of exact readings (n, actuators), in blocks of `size` poses."""
     is_needed = find_needed_poses(rows, len(readings))
-    blocks = divide_poses(readings, rows, is_needed, BLOCK)
+    blocks = divide_poses(readings, rows, is_needed, size)
     members = tuple(tuple(list_members(nuisance, own) for own in block.rows) for block in blocks)
     names = list_sensed_joints(r.kind for r in rows)
     return ExactPoses(free, len(readings), names, blocks, members, nuisance, located)
@@ -43,14 +39,15 @@ def divide_uncertain_poses(
     nuisance: NuisanceElimination | None,
     coordinates: PoseCoordinates,
     member: IntArray,
+    size: int,
 ) -> UncertainPoses:
     """Return the rows at poses of uncertain readings, in blocks of components.
 
-    member : (n,) component of each pose.
+    member : (n,) component of each pose. size : of a block, in poses.
     """
     redundant = isinstance(coordinates, TwistCoordinates)
     is_needed = find_needed_poses(rows if redundant else rows[:-1], len(member))
-    blocks = divide_components(readings, rows, member, is_needed, BLOCK)
+    blocks = divide_components(readings, rows, member, is_needed, size)
     nodes, structures = groups_of_nodes(rows, member, nuisance)
     groups = tuple(group_components(block, member, nodes, structures) for block in blocks)
     names = list_sensed_joints(r.kind for r in rows)
