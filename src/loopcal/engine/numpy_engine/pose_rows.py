@@ -61,11 +61,11 @@ def _make_rows(twists: TwistRows, D: FloatArray, ok: BoolArray, part: slice) -> 
     poses, residual = twists.poses, twists.residual[part]
     if not np.array_equal(poses, np.arange(D.shape[1])):
         D, ok = D[:, poses], ok[:, poses]
-    rows = np.empty((*residual.shape, D.shape[3] + 1))
+    rows = np.empty((*residual.shape, D.shape[-1] + 1))
     # one order of the products for any number of trials: each has its bits by itself
     np.matmul(_take(twists.by_twist, part), D, out=rows[..., :-1])
     rows[..., -1] = residual if ok.all() else np.where(ok[..., None], residual, 0.0)
-    return rows.reshape(len(rows), -1, rows.shape[3])
+    return rows.reshape(len(rows), -1, rows.shape[-1])
 
 
 def _take(array: FloatArray, part: slice) -> FloatArray:
