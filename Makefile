@@ -45,6 +45,7 @@ docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evid
 	$(BIN)/python -m tools.findings_reference
 	$(BIN)/python -m tools.api_reference
 	$(BIN)/python -m tools.readme_picture
+	$(BIN)/python -m tools.robot_pictures
 
 site: .venv/dev.stamp  ## build the documentation site, build/site/index.html; warnings and wrong links are errors
 	rm -rf build/site

@@ -65,3 +65,18 @@ def test_unknown_picture_format_is_refused(tmp_path):
         FileError, match=r"written as '.docx'; use a name that ends in .png, .svg, .pdf"
     ):
         save_figure(tmp_path / "robot.docx", draw_robot(zoo.hexapod()), write=write_bytes)
+
+
+def test_a_machine_in_an_upright_plane_is_shown_from_the_side():
+    axes = draw_robot(load_robot("excavator")).axes[1]
+    assert axes.get_title() == "from the side"
+    assert axes.get_ylabel() == "z [mm]"
+    assert draw_robot(zoo.hexapod()).axes[1].get_title() == "from above"
+
+
+def test_links_of_a_spherical_machine_are_arcs_about_its_center():
+    above = draw_robot(load_robot("agile-eye")).axes[1]
+    limbs = [np.array(line.get_data()).T for line in above.lines][:3]
+    for line in limbs:
+        assert len(line) == 26  # two arcs
+        assert 190.0 < np.linalg.norm(line, axis=1).max() < 301.0  # [mm] radii of a 1 m machine

@@ -20,12 +20,13 @@ class Anchors:
     """The anchors of a triangle drive at n poses.
 
     limb : number of the limb whose joint it turns. actuator : its name.
-    points : (n, 2, 3) foot and head in the base [m].
+    points : (n, 2, 3) foot and head in the base [m]. pin : (n, 3) [m] on the axis of the joint.
     """
 
     limb: int
     actuator: str
     points: FloatArray
+    pin: FloatArray
 
 
 def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
@@ -45,5 +46,5 @@ def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
                 foot = np.broadcast_to(triangle[:3], head.shape)
                 own, T = np.stack([foot, head], axis=1), frames[i][0, :, j]
                 points = own @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3]
-                located.append(Anchors(i, joint.actuator, points))
+                located.append(Anchors(i, joint.actuator, points, T[:, :3, 3]))
     return tuple(located)

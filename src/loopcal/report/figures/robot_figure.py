@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of a mechanism: its limbs, joints, rods, platform and tool, in space and from above.
+"""A picture of a mechanism: its limbs, joints, rods, platform and tool, in space and from above;
+a machine in an upright plane is shown from the side.
 
 A limb has the same color in both views. A short line through a point is the axis of a revolute
 joint, a dashed line is the guide of a sliding joint, and a filled point is driven. The parts come
@@ -33,6 +34,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+FLAT = 0.05
+"""Width of an upright plane that contains a machine, as a share of its largest extent."""
+
+VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"}
+"""Directions of the second view, by the axes that it shows."""
+
+
 @dataclass(frozen=True)
 class Stroke:
     """A line or points (n, 3) [m] of the picture, with the arguments of matplotlib's `plot`."""
@@ -50,22 +58,35 @@ def draw_robot(robot: Mechanism, solution: Solution | None = None, row: int = 0)
     everything = np.concatenate([s.points for s in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
 
-    is_flat = is_planar(robot)
+    is_flat, shown = is_planar(robot), choose_view(robot)
     figure = start_figure(7.0 if is_flat else 11.8, 6.4 if is_flat else 6.0)
     space: Any = None if is_flat else figure.add_subplot(1, 2, 1, projection="3d")
     above: Any = figure.add_subplot() if is_flat else figure.add_subplot(1, 2, 2)
     for stroke in strokes:
-        above.plot(*stroke.points.T[:2], **stroke.style)
+        above.plot(*stroke.points.T[[*shown]], **stroke.style)
         if space is not None:
             space.plot(*stroke.points.T, **stroke.style)
     limbs = strokes[: len(robot.assembly.limbs)]
     middle = np.mean([stroke.points[0] for stroke in limbs], axis=0)
     for stroke, limb in zip(limbs, robot.assembly.limbs, strict=True):
-        _label(space, above, stroke, limb.name, middle)
-    _finish(space, above, low, high, length.symbol)
+        _label(space, above, stroke, limb.name, middle, shown)
+    _finish(space, above, low, high, length.symbol, shown)
     where = "at home" if solution is None else f"at row {row}"
     add_legend(figure, _legend(robot))
     return finish_figure(figure, _caption(robot, where, length.symbol))
+
+
+def choose_view(robot: Mechanism) -> tuple[int, int]:
+    """Return the axes of the second view: x and y, or those of the upright plane in which all
+    limbs are at home.
+    """
+    parts = list_parts(robot, robot.home_state)
+    points = np.concatenate([part.points[0] for part in parts if part.role in ("limb", "rod")])
+    extent = np.ptp(points, axis=0)
+    for hidden, axes in ((1, (0, 2)), (0, (1, 2))):
+        if extent[hidden] < FLAT * extent.max():
+            return axes
+    return (0, 1)
 
 
 def _make_stroke(part: Part) -> Stroke:
@@ -94,20 +115,22 @@ def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]
     return {"marker": marker, "ls": "none", "ms": size, "mec": edge, "mfc": face, "mew": 1.2}
 
 
-def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) -> None:
+def _label(
+    space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray, shown: tuple[int, int]
+) -> None:
     """Write the name of a limb beside its foot: away from the center, or diagonally where the limb
     points away from the center, too.
     """
-    foot = limb.points[0]
-    away = foot[:2] - middle[:2]
-    if (limb.points[-1] - foot)[:2] @ away > 0.0:
+    foot, axes = limb.points[0], [*shown]
+    away = (foot - middle)[axes]
+    if (limb.points[-1] - foot)[axes] @ away > 0.0:
         away = np.array([away[0] - away[1], away[0] + away[1]])
     distance = float(np.linalg.norm(away))
     place = tuple(np.array([20.0, 13.0]) * (away / distance if distance > 0 else [1.0, 1.0]))
     back = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7}
     above.annotate(
         name,
-        foot[:2],
+        tuple(foot[axes]),
         xytext=place,
         textcoords="offset points",
         ha="center",
@@ -120,14 +143,17 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) 
         space.text(*foot, f"  {name}", fontsize=SMALL, color=limb.style["color"], zorder=9)
 
 
-def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str) -> None:
+def _finish(
+    space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str, shown: tuple[int, int]
+) -> None:
     """Set equal scales, and units on all axes."""
     above.set_aspect("equal", adjustable="datalim")
     above.margins(0.15 if space is None else 0.1)
+    across, up = (f"{'xyz'[axis]} [{symbol}]" for axis in shown)
     if space is None:
-        label_axes(above, f"x [{symbol}]", f"y [{symbol}]")
+        label_axes(above, across, up)
         return
-    label_axes(above, f"x [{symbol}]", f"y [{symbol}]", "from above")
+    label_axes(above, across, up, VIEWS[shown])
     middle, reach = (low + high) / 2, np.maximum(high - low, 0.15 * (high - low).max()) * 0.55
     for axis, m, r in zip("xyz", middle, reach, strict=True):
         getattr(space, f"set_{axis}lim")(m - r, m + r)

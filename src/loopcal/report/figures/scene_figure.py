@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.report.figures.robot_figure import draw_robot
+from loopcal.report.figures.robot_figure import choose_view, draw_robot
 from loopcal.report.figures.style import ERROR, LABEL, POSE, SEQUENTIAL, SMALL, THIN, finish_figure
 from loopcal.report.scene.scene import PoseErrors, Scene
 from loopcal.typing import FloatArray
@@ -31,7 +31,7 @@ def draw_scene(scene: Scene) -> Figure:
         return figure
     ends = _join_ends(poses) / factor
     for axes in panels:
-        kept = slice(None) if axes.name == "3d" else slice(0, 2)
+        kept = [0, 1, 2] if axes.name == "3d" else [*choose_view(robot)]
         axes.plot(*ends[:, kept].T, color=ERROR, lw=1.0, zorder=8)
         axes.plot(*poses.tool[:, kept].T / factor, "o", color=POSE, ms=2.5, zorder=8)
         if axes.name == "3d" and len(ends):
@@ -58,7 +58,7 @@ def _draw_map(figure: Figure, panels: list[Any], scene: Scene, factor: float) ->
         return
     points, drawn = scene.map_points[known] / factor, []
     for axes in panels:
-        kept = slice(None) if axes.name == "3d" else slice(0, 2)
+        kept = [0, 1, 2] if axes.name == "3d" else [*choose_view(scene.robot)]
         style = {"c": values[known], "cmap": SEQUENTIAL, "s": 9.0, "marker": "s", "lw": 0.0}
         drawn.append(axes.scatter(*points[:, kept].T, alpha=0.45, zorder=0.4, **style))
         if axes.name == "3d":

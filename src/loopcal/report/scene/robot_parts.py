@@ -22,13 +22,19 @@ AXIS, GUIDE = 0.06, 0.12
 as a share of the robot's size.
 """
 
+SPHERE, COINCIDENT = (0.3, 0.2), 1e-9
+"""Distances of the first and the last joint from the point in which all axes of a spherical limb
+meet, and up to which distance points are one, all as shares of the robot's size.
+"""
+
 Role = Literal[
     "limb", "axis", "guide", "joint", "slide", "rod", "rod drive", "end",
     "base", "platform", "arm", "frame", "tool",
 ]  # fmt: skip
 """What a part is: the line along a limb; the axis and the place of a joint; the guide and the place
 of a slide; a rod, where it is driven, the end of a limb; the outlines of base and platform; the
-line from the platform to the tool; an axis of a frame; the tool point.
+line from the platform to the tool, or from the anchors of a triangle drive to its joint; an axis of
+a frame; the tool point.
 """
 
 LINES = ("limb", "axis", "guide", "rod", "base", "platform", "arm", "frame")
@@ -68,12 +74,37 @@ def list_parts(robot: Mechanism, state: State) -> tuple[Part, ...]:
     state : (1, n), of `robot.home_state` or of a solution.
     """
     T = state.T[0]
-    frames = [limb[0] for limb in compute_limb_frames(robot, robot.values[None], state)]
+    limbs = compute_limb_frames(robot, robot.values[None], state)
+    frames, traces = zip(*(_arrange_limb(limb[0], robot.size) for limb in limbs), strict=True)
     foot, top = (np.stack([limb[:, j, :3, 3] for limb in frames], axis=1) for j in (0, -1))
-    lines = (Part("limb", limb[:, :-1, :3, 3], i) for i, limb in enumerate(frames))
+    lines = (Part("limb", trace, i) for i, trace in enumerate(traces))
     joints = (part for i, limb in enumerate(frames) for part in _list_joints(robot, i, limb))
     triangles = (part for part in _list_triangles(robot, state))
     return (*lines, *joints, *triangles, *_list_bodies(robot, foot, top, T))
+
+
+def _arrange_limb(frames: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return the frames (n, J + 2, 4, 4) of a limb as they are drawn, and the line (n, m, 3) along
+    it.
+
+    Where all axes of a limb meet in one point, its links have no lengths. They are drawn as arcs
+    about this point, each joint on its axis, from the motor inwards.
+    """
+    points, n_joints = frames[:, :, :3, 3], frames.shape[1] - 2
+    center = points[:, :1]
+    if n_joints < 2 or np.abs(points - center).max() > COINCIDENT * size:
+        return frames, points[:, :-1]
+    arms = frames[:, :n_joints, :3, 2] * (size * np.linspace(*SPHERE, n_joints))[:, None]
+    arranged = frames.copy()
+    arranged[:, :n_joints, :3, 3] += arms
+    arranged[:, n_joints:, :3, 3] = arranged[:, n_joints - 1, None, :3, 3]
+    share = np.linspace(0.0, 1.0, 13)[:, None]
+    first, second = arms[:, :-1, None], arms[:, 1:, None]
+    chords = (1 - share) * first + share * second
+    lengths = [np.linalg.norm(arm, axis=-1, keepdims=True) for arm in (first, second, chords)]
+    radius = (1 - share) * lengths[0] + share * lengths[1]
+    arcs = chords * (radius / np.maximum(lengths[2], 1e-9 * size))
+    return arranged, center + arcs.reshape(len(frames), -1, 3)
 
 
 def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]:
@@ -103,6 +134,8 @@ def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]
 def _list_triangles(robot: Mechanism, state: State) -> Iterator[Part]:
     """Yield the linear actuators that turn joints through two anchors."""
     for anchors in locate_anchors(robot, state):
+        foot, head = np.moveaxis(anchors.points, 1, 0)
+        yield Part("arm", np.stack([foot, anchors.pin, head], axis=1))
         yield Part("rod", anchors.points, anchors.limb)
         yield Part("rod drive", anchors.points.mean(axis=1, keepdims=True), anchors.limb, True)
         yield Part("end", anchors.points[:, 1:], anchors.limb)
