@@ -111,4 +111,12 @@ inline void gather_platform(const loopcal::Strided &T, const int64_t *trial, con
     }
 }
 
+// The same of one T (4, 4).
+inline void read_platform(const double *T, double *out) {
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) out[3 * i + j] = T[4 * i + j];
+        out[9 + i] = T[4 * i + 3];
+    }
+}
+
 }  // namespace INSTRUCTION_SET

@@ -3,20 +3,88 @@
 // whose words are used here.
 #pragma once
 
-#include "blocks.h"
+#include "newton.h"
 
 namespace INSTRUCTION_SET {
 
 constexpr double CONTRACTION = 0.6, ANGLE = 0.75, DECREASE = 0.99;
+constexpr int SQUARINGS = 30;
 
-// The start of one trial: `Begin` of certificate.py as `pack_begin` writes it.
+// The spectral norm of a matrix, squared: s with G = C'C and s(G)^2 = s(G^2), where the trace of
+// G^(2^i) exceeds its spectral norm by less and less; above it by 2e-9 of itself at most.
+inline double square_norm(const double (&C)[6][6]) {
+    double G[6][6], next[6][6], traces[SQUARINGS];
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++) {
+            G[i][j] = 0.0;
+            for (int k = 0; k < 6; k++) G[i][j] += C[k][i] * C[k][j];
+        }
+    for (int s = 0; s < SQUARINGS; s++) {
+        double trace = 0.0;
+        for (int i = 0; i < 6; i++) trace += G[i][i];
+        traces[s] = trace;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 6; j++) G[i][j] /= trace;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 6; j++) {
+                next[i][j] = 0.0;
+                for (int k = 0; k < 6; k++) next[i][j] += G[i][k] * G[k][j];
+            }
+        std::memcpy(G, next, sizeof G);
+    }
+    double norm = traces[SQUARINGS - 1];
+    for (int s = SQUARINGS - 2; s >= 0; s--) norm = traces[s] * root(norm);
+    return norm;
+}
+
+// The start of one trial: `Begin` of certificate.py.
 struct Begin {
     double T[12], tip[6][3], attachment[6][3], distance[6], inverse[6][6], swing[6], bend[3], unit,
         sign;
+
+    // placed : the links of a program that has driven rods. platform : rotation and position.
+    void prepare(const Program &program, const Equations &equations, const double *placed,
+                 const double *platform) {
+        double square[6], sum = 0.0;
+        Lanes lanes[12];
+        for (int i = 0; i < 12; i++) T[i] = platform[i], lanes[i] = splat(platform[i]);
+        for (int k = 0; k < 6; k++, placed += ROD) {
+            for (int i = 0; i < 3; i++) tip[k][i] = placed[18 + i], attachment[k][i] = placed[LINK + 18 + i];
+            const double *a = attachment[k];
+            square[k] = a[0] * a[0] + a[1] * a[1] + a[2] * a[2];
+            sum += square[k];
+        }
+        unit = root(sum / 3.0);
+        SharedFactor factor;
+        equations.factorize(placed - 6 * ROD, lanes, factor);
+        sign = factor.sign[0];
+        for (int k = 0; k < 6; k++) {
+            Lanes column[6] = {}, y[6];
+            column[k] = splat(-1.0);
+            factor.solve(column, y);
+            distance[k] = factor.distance[k][0];
+            // a turn is measured by `unit`, see certificate.py
+            for (int i = 0; i < 6; i++) {
+                int f = program.freedom[i];
+                inverse[f][k] = f < 3 ? y[i][0] * unit : y[i][0];
+            }
+        }
+        bend[0] = bend[1] = bend[2] = 0.0;
+        for (int k = 0; k < 6; k++) {
+            double ratio = root(square[k]) / unit, s2 = 1.0 + square[k] / (unit * unit);
+            swing[k] = root(s2);
+            bend[0] += ratio / unit * (ratio / unit);
+            bend[1] += 2.0 * (ratio * ratio) * swing[k] / unit;
+            bend[2] += s2 * s2;
+        }
+        double norm = square_norm(inverse);
+        for (int i = 0; i < 3; i++) bend[i] = norm * bend[i];
+    }
 };
 
-INLINE Mask reaches(const Begin &begin, double size, const Lanes *T) {
-    Lanes rows[6][6], distance[6], stretch[6], stretched{};
+// Whether the platforms T are proven; `distance` of the ends of the rods there.
+INLINE Mask reaches(const Begin &begin, double size, const Lanes *T, Lanes *distance) {
+    Lanes rows[6][6], stretch[6], stretched{};
     double inverse_unit = 1.0 / begin.unit, swings = 0.0;
     for (int k = 0; k < 6; k++) {
         Lanes arm[3], gap[3];
@@ -73,23 +141,36 @@ INLINE Mask reaches(const Begin &begin, double size, const Lanes *T) {
            (root(bend) * error <= CONTRACTION * (1.0 - deviation));
 }
 
-// begin : (t | 1) starts, `stride` doubles apart. goal : (t, n, 4, 4). sign : (t, n).
-inline int certify(const double *begin, int64_t stride, const double *goal, double size, int64_t t,
-                   int64_t n, int8_t *sign) {
+// arrays : e, start, goal (t, n, 4, 4). sign : (t, n).
+inline int certify(const int64_t *structure, const double *numbers, const loopcal::Strided *arrays,
+                   int64_t t, int64_t n, int8_t *sign) {
+    Arena memory(Arena::need<Group>((size_t)structure[0]));
+    if (!memory.ok()) return loopcal::NO_MEMORY;
+    Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
+    Division division(t, n, false);
+    Arena arena(Frames::need(0) + PlacedUnit::need(program));
+    if (!arena.ok()) return loopcal::NO_MEMORY;
+    Frames frames(arena, 0);
+    NewtonWork work{frames, nullptr, nullptr};
+    Equations equations(program, work);
+    PlacedUnit placed;
+    placed.prepare(program, division, arena);
+    Begin begin;
     for (int64_t i = 0; i < t; i++) {
-        Begin own;
-        std::memcpy(&own, begin + i * stride, sizeof own);
+        if (!i || arrays[0].trial || arrays[1].trial) {
+            double platform[12];
+            read_platform(locate(arrays[1], i, 0), platform);
+            placed.place(i, arrays[0]);
+            begin.prepare(program, equations, placed.numbers(), platform);
+        }
         for (int64_t first = 0; first < n; first += W) {
             int64_t trial[W], pose[W];
-            for (int lane = 0; lane < W; lane++) {
-                trial[lane] = i;
-                pose[lane] = first + lane < n ? first + lane : n - 1;
-            }
-            Lanes T[12];
-            gather_platform({goal, 16 * n, 16}, trial, pose, T);
-            Mask is = reaches(own, size, T);
-            for (int lane = 0; lane < W && first + lane < n; lane++)
-                sign[i * n + first + lane] = is[lane] ? (int8_t)own.sign : 0;
+            int used = division.locate(i * division.blocks_of_unit() + first / W, trial, pose);
+            Lanes T[12], distance[6];
+            gather_platform(arrays[2], trial, pose, T);
+            Mask is = reaches(begin, program.size, T, distance);
+            for (int lane = 0; lane < used; lane++)
+                sign[i * n + first + lane] = is[lane] ? (int8_t)begin.sign : 0;
         }
     }
     return loopcal::DONE;

@@ -23,6 +23,10 @@ int loopcal_differentiate(int, const int64_t *, const double *, const int64_t *,
 int loopcal_fold_poses(int, const int64_t *, const double *, const int64_t *, const loopcal::Strided *,
                        const loopcal::Strided *, const loopcal::TwistRows *, const double *,
                        double *, int8_t *, int64_t, int64_t);
+int loopcal_certify(int, const int64_t *, const double *, const loopcal::Strided *, int64_t, int64_t,
+                    int8_t *);
+int loopcal_reach(int, const int64_t *, const double *, const loopcal::Strided *, const int64_t *,
+                  const double *, int64_t, int64_t, const loopcal::ReachOutput *);
 int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
                   const loopcal::Strided *, int64_t, int64_t, int64_t, loopcal::Task, void *,
                   double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
@@ -63,6 +67,7 @@ struct GroupShape {
 
 const GroupShape SHAPES[] = {{"RRPRRR", 0, 6, 2}, {"RRP", 1, 3, 2}, {"", 2, 1, 0}};
 const GroupShape RODS[] = {{"P", 2, 1, 0}, {"", 2, 1, 0}, {"", 2, 1, 0}};  // with a closed form each
+const GroupShape DRIVEN[] = {{"", 2, 1, 0}, {"", 2, 1, 0}, {"", 2, 1, 0}};
 constexpr int GROUPS = 3, LIMBS = 2, DRIVES = GROUPS * LIMBS;
 
 void add_rotation(Random &random, Reals &to) {  // of a quaternion, by operations of IEEE 754 alone
@@ -214,6 +219,34 @@ void add_kinematics(int set, bool free, int freedoms, int64_t t, int64_t n, Dige
     for (size_t g = 0; g < GROUPS; g++) digest.add(joints[g]), digest.add(rows[g]);
 }
 
+// Poses of driven rods, of which a part is proven, and a part is solved for.
+void add_targets(int set, int64_t t, int64_t n, bool torsion, Digest &digest) {
+    Random random;
+    Machine machine(random, false, 6, DRIVEN);
+    Reals e = random.reals((size_t)(t * machine.displacements), 1e-3), begin, sign = {1.0};
+    add_rotation(random, begin);
+    begin = {begin[0], begin[1], begin[2], 0.1, begin[3], begin[4], begin[5], 0.2,
+             begin[6], begin[7], begin[8], 0.4, 0, 0, 0, 1};
+    Reals values = random.reals((size_t)(t * n * 6), 0.4), T((size_t)(16 * t * n)), residual((size_t)(t * n));
+    values[7] = INFINITY, values[20] = 1e17;
+    std::vector<Reals> joints(GROUPS, Reals((size_t)(t * n) * LIMBS));
+    double *joints_out[] = {joints[0].data(), joints[1].data(), joints[2].data()};
+    std::vector<int8_t> status((size_t)(t * n)), signs(status), arrives(status), proven(status);
+    const int64_t columns[] = {0, 1, -1, 3, 4, 5, torsion};
+    loopcal::Strided arrays[] = {{e.data(), machine.displacements, 0},
+                                 {begin.data(), 0, 0}, {values.data(), 6 * n, 6}, {sign.data(), 0, 0}};
+    for (double value : {1.0, -1.0}) {
+        sign[0] = value;
+        loopcal::ReachOutput out{T.data(), joints_out, residual.data(), status.data(), signs.data(), arrives.data()};
+        loopcal_reach(set, machine.structure.data(), machine.numbers.data(), arrays, columns, begin.data(), t, n, &out);
+        digest.add(T), digest.add(residual), digest.add(status), digest.add(signs), digest.add(arrives);
+        for (const Reals &of_group : joints) digest.add(of_group);
+    }
+    loopcal::Strided goal[] = {arrays[0], arrays[1], {T.data(), 16 * n, 16}};
+    loopcal_certify(set, machine.structure.data(), machine.numbers.data(), goal, t, n, proven.data());
+    digest.add(proven);
+}
+
 void add_factors(int set, int64_t t, int64_t m, int64_t p, Digest &digest) {
     Random random;
     Reals factor((size_t)(t * p * p)), rows = random.reals((size_t)(t * m * p), 10.0);
@@ -234,6 +267,7 @@ int main() {
             for (int64_t n : {1, 3, 21}) add_kinematics(set, free, 6, 13, n, digest);
         add_kinematics(set, false, 6, 1, 50, digest);
         for (const GroupShape *shapes : {SHAPES, RODS}) add_kinematics(set, true, 0, 5, 21, digest, shapes);
+        for (bool torsion : {false, true}) add_targets(set, 5, 45, torsion, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
         add_factors(set, 3, 1000, 7, digest);
         std::printf("%016llx %s\n", (unsigned long long)digest.value, name);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 4;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 5;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -66,9 +66,16 @@ EXPORT int loopcal_fold(int set, const double *factor, const double *rows, doubl
     return list_sets()[set].kernels->fold(factor, rows, out, t, m, p, stride);
 }
 
-EXPORT int loopcal_certify(int set, const double *begin, int64_t stride, const double *goal,
-                           double size, int64_t t, int64_t n, int8_t *sign) {
-    return list_sets()[set].kernels->certify(begin, stride, goal, size, t, n, sign);
+EXPORT int loopcal_certify(int set, const int64_t *structure, const double *numbers,
+                           const loopcal::Strided *arrays, int64_t t, int64_t n, int8_t *sign) {
+    return list_sets()[set].kernels->certify(structure, numbers, arrays, t, n, sign);
+}
+
+EXPORT int loopcal_reach(int set, const int64_t *structure, const double *numbers,
+                         const loopcal::Strided *arrays, const int64_t *columns,
+                         const double *base, int64_t t, int64_t n,
+                         const loopcal::ReachOutput *out) {
+    return list_sets()[set].kernels->reach(structure, numbers, arrays, columns, base, t, n, out);
 }
 
 EXPORT int loopcal_linearize(int set, const int64_t *structure, const double *numbers,

@@ -34,15 +34,26 @@ struct TwistRows {
     Strided by_twist, residual;
 };
 
+// T (t, n, 4, 4), joints of each group, and (t, n): residual, status, sign, whether the joints lead
+// there.
+struct ReachOutput {
+    double *T, *const *joints, *residual;
+    int8_t *status, *sign, *arrives;
+};
+
 struct Kernels {
     int (*fold)(const double *factor, const double *rows, double *out, int64_t t, int64_t m,
                 int64_t p, int64_t stride);
-    // see certify.h
-    int (*certify)(const double *begin, int64_t stride, const double *goal, double size, int64_t t,
-                   int64_t n, int8_t *sign);
     // structure, numbers : see library.py. joints, out : one for each group.
     int (*linearize)(const int64_t *structure, const double *numbers, const Strided *arrays,
                      const Strided *joints, double *const *out, int64_t t, int64_t n);
+    // arrays : see certify.h
+    int (*certify)(const int64_t *structure, const double *numbers, const Strided *arrays, int64_t t,
+                   int64_t n, int8_t *sign);
+    // arrays, columns, base : see targets.h
+    int (*reach)(const int64_t *structure, const double *numbers, const Strided *arrays,
+                 const int64_t *columns, const double *base, int64_t t, int64_t n,
+                 const ReachOutput *out);
     // arrays : see sensitivity.h
     int (*differentiate)(const int64_t *structure, const double *numbers, const int64_t *entries,
                          const Strided *arrays, const Strided *joints, double *by_parameter,

@@ -8,6 +8,7 @@
 #include "linearize.h"
 #include "sensitivity.h"
 #include "solve.h"
+#include "targets.h"
 
 namespace INSTRUCTION_SET {
 
@@ -31,7 +32,7 @@ static int call_solve(const int64_t *structure, const double *numbers,
 }
 
 extern const loopcal::Kernels kernels;
-const loopcal::Kernels kernels = {fold,          certify,    call_linearize,
-                                   differentiate, fold_poses, call_solve};
+const loopcal::Kernels kernels = {fold,          call_linearize, certify,   reach,
+                                   differentiate, fold_poses,     call_solve};
 
 }  // namespace INSTRUCTION_SET

@@ -19,6 +19,12 @@ inline bool have_closed_form(const Program &program) {
     return true;
 }
 
+// The status of limbs that are closed to this residual.
+INLINE Lanes judge_closed(Lanes residual, double size) {
+    Lanes closed = select(residual <= OPEN * size, splat(CONVERGED), splat(STALLED));
+    return select(residual * 0.0 == 0.0, closed, splat(NOT_FINITE));
+}
+
 class LimbCloser {
   public:
     LimbCloser(const Program &program, const Frames &frames) : program_(program), frames_(frames) {}
@@ -37,11 +43,6 @@ class LimbCloser {
             }
         }
         residual = root(square);
-    }
-
-    Lanes judge(Lanes residual) const {
-        Lanes closed = select(residual <= OPEN * program_.size, splat(CONVERGED), splat(STALLED));
-        return select(residual * 0.0 == 0.0, closed, splat(NOT_FINITE));
     }
 
   private:

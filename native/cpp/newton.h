@@ -9,6 +9,7 @@
 namespace INSTRUCTION_SET {
 
 enum Status { CONVERGED = 0, STALLED = 1, EXHAUSTED = 2, NOT_FINITE = 3, NEAR_GOAL = 8 };
+constexpr int64_t ITERATIONS = 60;  // unless a caller states them
 constexpr double RESIDUAL = 1e-13, STEP = 1e-7, NEAR = 1e-2, NEARER = 0.1, SINGULAR = 1e-11;
 
 // What one evaluation gives beside the step.
@@ -42,6 +43,16 @@ struct TaskRows {
 // its factor by columns, and what `evaluate` derives from them.
 struct SharedFactor {
     Lanes factor[36], v[5][6], beta[5], inverse[6], distance[6], sign;
+
+    // y with factor . y = -right, both in the order of rows and freedoms; right becomes Q' right.
+    INLINE void solve(Lanes *right, Lanes *y) const {
+        for (int j = 0; j < 5; j++) reflect_column(v[j] + j, beta[j], right + j, 6 - j);
+        for (int f = 5; f >= 0; f--) {
+            Lanes known{};
+            for (int c = f + 1; c < 6; c++) known = known + factor[6 * c + f] * y[c];
+            y[f] = (-right[f] - known) * inverse[f];
+        }
+    }
 };
 
 class Equations {
@@ -101,13 +112,8 @@ class Equations {
                 placed += program_.group[g].placed();
             }
         measures.residual = root(square);
-        for (int j = 0; j < 5; j++) reflect_column(at.v[j] + j, at.beta[j], right + j, 6 - j);
-        for (int f = 5; f >= 0; f--) {
-            Lanes known{};
-            for (int c = f + 1; c < 6; c++) known = known + at.factor[6 * c + f] * y[c];
-            y[f] = (-right[f] - known) * at.inverse[f];
-            step[program_.freedom[f]] = y[f];
-        }
+        at.solve(right, y);
+        for (int f = 0; f < 6; f++) step[program_.freedom[f]] = y[f];
         for (int i = 0; i < 6; i++) left = left + right[i] * right[i];
         measures.reducible = root(left);
         measures.length = measure_step(step);

@@ -10,6 +10,7 @@ namespace INSTRUCTION_SET {
 enum Ending { RIGID = 0, BALL = 1, DISTANCE = 2 };
 constexpr int PITCH = 6, LENGTH = 7;  // values of Slot.axis beside those of a twist
 constexpr int LINK = 21;              // numbers of a placed link: rotation, slope, origin
+constexpr int ROD = 2 * LINK + 1;     // numbers of a placed limb that is a rod alone
 
 // Limbs of one structure; see loopcal.engine.Group. Arrays belong to the caller.
 struct Group {

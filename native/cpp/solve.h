@@ -32,29 +32,91 @@ struct SolveOutput {
     int8_t *status, *sign;
 };
 
+// The memory of a solver: blocks that are solved together, and the links placed for their units.
+struct Workspace {
+    RowBlock *block = nullptr;
+    PlacedUnit *unit = nullptr;
+    int64_t *rows = nullptr, blocks, units;
+    double *poses = nullptr;
+    Lanes *reduced = nullptr, *low = nullptr, *trial_step = nullptr;
+
+    static int most_joints(const Program &program) {
+        int most = 0;
+        for (int g = 0; g < program.groups; g++)
+            if (program.group[g].joints > most) most = program.group[g].joints;
+        return most;
+    }
+
+    Workspace(const Program &program, const Division &division, int most_conditions,
+              int64_t block_count, int64_t unit_count)
+        : blocks(block_count), units(unit_count), reduced_(NewtonWork::reduced_of(program)),
+          low_((size_t)Equations::low_rows(program, most_conditions) * (program.freedoms + 1)),
+          steps_(6 + (size_t)program.unknown_joints()),
+          values_(12 + (size_t)program.joint_values()), joints_(most_joints(program)),
+          arena_(need(program)) {
+        if (!arena_.ok()) return;
+        reduced = arena_.take<Lanes>(reduced_);
+        low = arena_.take<Lanes>(low_);
+        trial_step = arena_.take<Lanes>(steps_);
+        block = arena_.take<RowBlock>(blocks);
+        unit = arena_.take<PlacedUnit>(units);
+        rows = arena_.take<int64_t>(blocks * W);
+        poses = arena_.take<double>(12 * blocks * W);
+        for (int64_t u = 0; u < units; u++) unit[u].prepare(program, division, arena_);
+        for (int64_t b = 0; b < blocks; b++) {
+            block[b].now = arena_.take<Lanes>(values_);
+            block[b].next = arena_.take<Lanes>(values_);
+            block[b].step = arena_.take<Lanes>(steps_);
+        }
+    }
+
+    bool ok() const { return arena_.ok(); }
+
+    NewtonWork take_work() { return {Frames(arena_, joints_), reduced, low}; }
+
+  private:
+    size_t need(const Program &program) const {
+        return Frames::need(joints_) + Arena::need<Lanes>(reduced_) + Arena::need<Lanes>(low_) +
+               Arena::need<Lanes>(steps_) + Arena::need<RowBlock>(blocks) +
+               Arena::need<PlacedUnit>(units) + Arena::need<int64_t>(blocks * W) +
+               Arena::need<double>(12 * blocks * W) + units * PlacedUnit::need(program) +
+               blocks * (2 * Arena::need<Lanes>(values_) + Arena::need<Lanes>(steps_));
+    }
+
+    size_t reduced_, low_, steps_, values_;
+    int joints_;
+    Arena arena_;
+};
+
 class Solver {
   public:
     Solver(const Program &program, const SolveInput &input, const SolveOutput &output,
-           const Division &division, const Equations &equations)
-        : program_(program), in_(input), out_(output), division_(division), equations_(equations) {}
+           const Division &division, const Equations &equations, const Workspace &space)
+        : program_(program), in_(input), out_(output), division_(division), equations_(equations),
+          space_(space) {}
 
     // Rows solved together where a task is asked, which is called once for all of them.
     static constexpr int64_t ROWS_OF_TASK = 2048;
 
-    int64_t blocks_of_chunk() const {
-        if (!in_.task) return 1;
-        int64_t count = ROWS_OF_TASK / W;
-        return count < division_.blocks() ? count : division_.blocks();
-    }
-
-    int run(RowBlock *blocks, int64_t *rows, double *poses) {
-        int64_t most = blocks_of_chunk();
-        for (int64_t first = 0; first < division_.blocks(); first += most) {
+    int run() {
+        for (int64_t first = 0; first < division_.blocks(); first += space_.blocks) {
             int64_t left = division_.blocks() - first;
-            int outcome = solve_chunk(blocks, left < most ? left : most, first, rows, poses);
+            int outcome = solve_chunk(left < space_.blocks ? left : space_.blocks, first);
             if (outcome) return outcome;
         }
         return 0;
+    }
+
+    // Which of up to W poses of a trial come close to their goals, of which `count` matter.
+    Mask come_near(RowBlock &block, int64_t trial, const int64_t *poses, int count) {
+        for (int lane = 0; lane < W; lane++) {
+            block.trial[lane] = trial;
+            block.pose[lane] = poses[lane < count ? lane : count - 1];
+        }
+        block.used = count;
+        start(block, trial);
+        iterate(&block, 1);
+        return block.status == double(NEAR_GOAL);
     }
 
     int close_limbs(RowBlock &block, const Frames &frames) {
@@ -64,9 +126,17 @@ class Solver {
     }
 
   private:
-    int solve_chunk(RowBlock *blocks, int64_t count, int64_t first, int64_t *rows, double *poses) {
+    int solve_chunk(int64_t count, int64_t first) {
+        RowBlock *blocks = space_.block;
         for (int64_t b = 0; b < count; b++) begin(blocks[b], first + b);
-        if (int outcome = evaluate_all(blocks, count, true, rows, poses)) return outcome;
+        if (int outcome = iterate(blocks, count)) return outcome;
+        for (int64_t b = 0; b < count; b++) write(blocks[b]);
+        return 0;
+    }
+
+    // Iterate until every row of these blocks has ended, or is out of iterations.
+    int iterate(RowBlock *blocks, int64_t count) {
+        if (int outcome = evaluate_all(blocks, count, true)) return outcome;
         for (int64_t i = 0; i < in_.max_iterations; i++) {
             bool is_left = false;
             for (int64_t b = 0; b < count; b++) {
@@ -77,18 +147,21 @@ class Solver {
                 try_step(blocks[b]);
             }
             if (!is_left) break;
-            if (int outcome = evaluate_all(blocks, count, false, rows, poses)) return outcome;
+            if (int outcome = evaluate_all(blocks, count, false)) return outcome;
         }
-        for (int64_t b = 0; b < count; b++) write(blocks[b]);
         return 0;
     }
 
     void begin(RowBlock &block, int64_t number) {
         block.used = division_.locate(number, block.trial, block.pose);
+        start(block, number / division_.blocks_of_unit());
+    }
+
+    // Begin with the rows that a block has located in a unit.
+    void start(RowBlock &block, int64_t unit) {
         // blocks of one chunk belong to fewer than `unit_count` units
-        int64_t unit = number / division_.blocks_of_unit();
         block.unit = unit;
-        block.placed = units + unit % unit_count;
+        block.placed = space_.unit + unit % space_.units;
         block.placed->place(unit, in_.e);
         gather_platform(in_.T, block.trial, block.pose, block.now);
         gather_joints(program_, in_.joints, in_.q, block.trial, block.pose, block.now + 12);
@@ -101,7 +174,7 @@ class Solver {
 
     // The first evaluation of all blocks, or that of the coordinates tried, by which better ones
     // replace the present ones.
-    int evaluate_all(RowBlock *blocks, int64_t count, bool first, int64_t *rows, double *poses) {
+    int evaluate_all(RowBlock *blocks, int64_t count, bool first) {
         loopcal::TaskAnswer answer{};
         if (in_.task) {
             int64_t asked = 0;
@@ -110,15 +183,15 @@ class Solver {
                 const Lanes *T = first ? block.now : block.next;
                 for (int lane = 0; lane < W; lane++) {
                     if (!block.alive[lane]) continue;
-                    double *pose = poses + 12 * asked;
+                    double *pose = space_.poses + 12 * asked;
                     for (int i = 0; i < 3; i++) {
                         for (int j = 0; j < 3; j++) pose[4 * i + j] = T[3 * i + j][lane];
                         pose[4 * i + 3] = T[9 + i][lane];
                     }
-                    rows[asked++] = block.trial[lane] * division_.n + block.pose[lane];
+                    space_.rows[asked++] = block.trial[lane] * division_.n + block.pose[lane];
                 }
             }
-            if (in_.task(in_.context, asked, poses, rows, &answer)) return loopcal::TASK_FAILED;
+            if (in_.task(in_.context, asked, space_.poses, space_.rows, &answer)) return loopcal::TASK_FAILED;
         }
         int64_t asked = 0;
         for (int64_t b = 0; b < count; b++) {
@@ -201,7 +274,7 @@ class Solver {
         double size = program_.size;
         Mask tiny = block.length <= STEP * size;
         Measures trial = block.measures;
-        Lanes *step = trial_step;
+        Lanes *step = space_.trial_step;
         evaluate(block, block.next, task, tiny, step, trial);
         const Measures &now = block.measures;
         Mask low = trial.reducible <= RESIDUAL * size;
@@ -231,7 +304,7 @@ class Solver {
             limbs.close(block.placed->lanes(), block.now, block.now + 12, now.residual, now.sign);
         else
             limbs.close(block.placed->numbers(), block.now, block.now + 12, now.residual, now.sign);
-        block.status = limbs.judge(now.residual);
+        block.status = judge_closed(now.residual, program_.size);
         write(block);
     }
 
@@ -260,17 +333,13 @@ class Solver {
         }
     }
 
-  public:
-    Lanes *trial_step = nullptr;    // memory of one evaluation
-    PlacedUnit *units = nullptr;    // memory of placed links, used in turns
-    int64_t unit_count = 1;
-
   private:
     const Program &program_;
     const SolveInput &in_;
     const SolveOutput &out_;
     const Division &division_;
     const Equations &equations_;
+    const Workspace &space_;
     SharedFactor shared_;
     int64_t shared_unit_ = -1;
 };
@@ -281,44 +350,19 @@ inline int solve(const int64_t *structure, const double *numbers, const SolveInp
     if (!memory.ok()) return loopcal::NO_MEMORY;
     Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
     Division division(input.t, input.n);
-    int joints = 0, m = program.freedoms, most_conditions = 0;
-    for (int g = 0; g < program.groups; g++)
-        if (program.group[g].joints > joints) joints = program.group[g].joints;
-    if (input.task) most_conditions = loopcal::MOST_CONDITIONS;
-    size_t low = (size_t)Equations::low_rows(program, most_conditions) * (m + 1);
-    size_t reduced = NewtonWork::reduced_of(program);
-    size_t steps = 6 + (size_t)program.unknown_joints(), values = 12 + (size_t)program.joint_values();
     int64_t blocks = 1, units = 1;
     if (input.task) {
         blocks = Solver::ROWS_OF_TASK / W < division.blocks() ? Solver::ROWS_OF_TASK / W : division.blocks();
         units = blocks / division.blocks_of_unit() + 2;
     }
-    size_t size = Frames::need(joints) + Arena::need<Lanes>(reduced) + Arena::need<Lanes>(low) +
-                  Arena::need<Lanes>(steps) + Arena::need<RowBlock>(blocks) +
-                  Arena::need<PlacedUnit>(units) + Arena::need<int64_t>(blocks * W) +
-                  Arena::need<double>(12 * blocks * W) + units * PlacedUnit::need(program) +
-                  blocks * (2 * Arena::need<Lanes>(values) + Arena::need<Lanes>(steps));
-    Arena arena(size);
-    if (!arena.ok()) return loopcal::NO_MEMORY;
-    Frames frames(arena, joints);
-    Lanes *of_limbs = arena.take<Lanes>(reduced), *of_platform = arena.take<Lanes>(low);
-    NewtonWork work{frames, of_limbs, of_platform};
+    Workspace space(program, division, input.task ? loopcal::MOST_CONDITIONS : 0, blocks, units);
+    if (!space.ok()) return loopcal::NO_MEMORY;
+    NewtonWork work = space.take_work();
     Equations equations(program, work);
-    Solver solver(program, input, output, division, equations);
-    solver.trial_step = arena.take<Lanes>(steps);
-    RowBlock *block = arena.take<RowBlock>(blocks);
-    PlacedUnit *placed = arena.take<PlacedUnit>(units);
-    int64_t *rows = arena.take<int64_t>(blocks * W);
-    double *poses = arena.take<double>(12 * blocks * W);
-    for (int64_t u = 0; u < units; u++) placed[u].prepare(program, division, arena);
-    for (int64_t b = 0; b < blocks; b++) {
-        block[b].now = arena.take<Lanes>(values);
-        block[b].next = arena.take<Lanes>(values);
-        block[b].step = arena.take<Lanes>(steps);
-    }
-    solver.units = placed, solver.unit_count = units;
-    if (!m && program.free && have_closed_form(program)) return solver.close_limbs(*block, frames);
-    return solver.run(block, rows, poses);
+    Solver solver(program, input, output, division, equations, space);
+    if (!program.freedoms && program.free && have_closed_form(program))
+        return solver.close_limbs(*space.block, work.frames);
+    return solver.run();
 }
 
 }  // namespace INSTRUCTION_SET

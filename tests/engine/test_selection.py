@@ -34,6 +34,7 @@ def make_counting_engine(variant: str) -> Engine:
     functions = (
         own.solve,
         own.certify,
+        own.reach,
         own.linearize,
         lambda factor, rows: factor + len(rows),
         own.differentiate,

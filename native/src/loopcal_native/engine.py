@@ -17,15 +17,20 @@ from loopcal.engine import (
     Engine,
     ParameterMap,
     Program,
+    Reached,
     State,
+    Target,
     Task,
     TwistRows,
 )
-from loopcal.engine.numpy_engine.certificate import Begin, has_driven_rods
+from loopcal.engine.numpy_engine.certificate import has_driven_rods
+from loopcal.engine.numpy_engine.targets import reach_by
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal_native.library import (
     TASK_FAILED,
+    ReachOutput,
     Strided,
+    allocate,
     as_reals,
     describe,
     list_instruction_sets,
@@ -50,7 +55,7 @@ def make_engine(variant: str = "") -> Engine:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
     own = NativeFunctions(sets[name])
     number = version("loopcal-native")
-    functions = own.solve, own.certify, own.linearize, own.fold
+    functions = own.solve, own.certify, own.reach, own.linearize, own.fold
     return Engine(f"native:{name}", number, *functions, own.differentiate, own.fold_poses)
 
 
@@ -80,10 +85,14 @@ class NativeFunctions:
         if goal is not None:
             arrays.append(as_reals(goal.T))
             require(arrays[-1].shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
-        T, residual = np.empty((t, n, 4, 4)), np.empty(shape)
-        out = [np.empty((t, n, *a.shape[2:])) for a in joints]
-        iterations = np.empty(shape, np.int64)
-        status, sign = np.empty(shape, np.int8), np.empty(shape, np.int8)
+        T, residual, iterations, status, sign, *out = allocate(
+            ((t, n, 4, 4), float),
+            (shape, float),
+            (shape, np.int64),
+            (shape, np.int8),
+            (shape, np.int8),
+            *(((t, n, *a.shape[2:]), float) for a in joints),
+        )
         if t * n:
             calls = TaskCalls(task) if task is not None else None
             outcome = load_library().loopcal_solve(
@@ -114,24 +123,64 @@ class NativeFunctions:
         sign = np.zeros((t, n), np.int8)
         if not (has_driven_rods(program) and start.T.shape[1] == 1 and t * n):
             return sign
+        flat, arrays = flatten_program(program, False), [as_reals(a) for a in (e, start.T, goal.T)]
         require(goal.T.shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
-        require(len(e) in (1, t) and e.shape[1:] == (program.n_displacements,), f"e ({t} | 1, ..)")
-        require(start.T.shape == (len(start.T), 1, 4, 4), "a start (t | 1, 1, 4, 4)")
-        require(len(start.T) in (1, len(e)), "a start for each trial, or one")
-        begin, T = pack_begin(Begin.prepare(program, e, start)), as_reals(goal.T)
-        stride = begin.shape[1] if len(begin) > 1 else 0
+        _require_start(program, arrays[0], arrays[1], t)
         outcome = load_library().loopcal_certify(
             self.instruction_set,
-            begin.ctypes.data,
-            stride,
-            T.ctypes.data,
-            program.size,
+            flat.structure.ctypes.data,
+            flat.numbers.ctypes.data,
+            _describe_all(arrays),
             t,
             n,
             sign.ctypes.data,
         )
         require_done(outcome)
         return sign
+
+    def reach(self, program: Program, e: FloatArray, target: Target, start: State) -> Reached:
+        """Close the loops at target poses, and find which of them the start leads to."""
+        values = as_reals(target.values)
+        require(values.ndim == 3, "values (t | 1, n, c)")
+        if not (is_closed_at_once(program) and start.T.shape[1] == 1 and values.shape[1]):
+            return reach_by(self.solve, self.certify, program, e, target, start)
+        t, n = shape = max(len(e), len(values), len(start.T)), values.shape[1]
+        flat = flatten_program(program, False)
+        sign = np.broadcast_to(start.closure_sign, (len(start.T), 1)).astype(np.float64)
+        arrays = [as_reals(e), as_reals(start.T), values, sign[..., None]]
+        _require_start(program, arrays[0], arrays[1], t)
+        require(len(values) in (1, t), f"values ({t} | 1, {n}, c)")
+        _require_joints(program, start.joints, (t, 1))
+        columns = np.array([*target.columns, target.torsion], np.int64)
+        base = as_reals(target.base)
+        require(len(columns) == 7 and max(target.columns) < values.shape[2], "columns of values")
+        require(base.shape == (4, 4), "a base (4, 4)")
+        T, residual, iterations, status, closure_sign, arrives, *out = allocate(
+            ((t, n, 4, 4), float),
+            (shape, float),
+            (shape, np.int64),
+            (shape, np.int8),
+            (shape, np.int8),
+            (shape, np.bool_),
+            *(((t, n, *a.shape[2:]), float) for a in start.joints),
+        )
+        iterations[:] = 0
+        listed = _list_addresses(out)
+        addresses = [a.ctypes.data for a in (residual, status, closure_sign, arrives)]
+        outcome = load_library().loopcal_reach(
+            self.instruction_set,
+            flat.structure.ctypes.data,
+            flat.numbers.ctypes.data,
+            _describe_all(arrays),
+            columns.ctypes.data,
+            base.ctypes.data,
+            t,
+            n,
+            ReachOutput(T.ctypes.data, ctypes.addressof(listed), *addresses),
+        )
+        require_done(outcome)
+        state = State(T, tuple(out), status, residual, iterations, closure_sign)
+        return Reached(state, arrives)
 
     def linearize(
         self, program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
@@ -257,12 +306,17 @@ class NativeFunctions:
         return (out if t * n else factor), is_finite
 
 
-def pack_begin(begin: Begin) -> FloatArray:
-    """Return the starts of trials (t, numbers) in the order of certify.h."""
-    t, T = len(begin.unit), begin.T
-    parts = [T[:, :3], T[:, 3], begin.tip.swapaxes(0, 1), begin.attachment.swapaxes(0, 1)]
-    parts += [begin.distance, begin.inverse, begin.swing, begin.bend, begin.unit, begin.sign]
-    return as_reals(np.concatenate([a.reshape(-1, t) for a in parts]).T)
+def is_closed_at_once(program: Program) -> bool:
+    """Return whether `reach` of the library takes it: driven rods alone, an actuator for each."""
+    driven = [column for group in program.groups for column in group.actuator.ravel().tolist()]
+    return has_driven_rods(program) and sorted(driven) == list(range(program.n_joints))
+
+
+def _require_start(program: Program, e: FloatArray, T: FloatArray, t: int) -> None:
+    """Raise ValueError unless e and T are those of t trials that begin at one pose each."""
+    require(len(e) in (1, t) and e.shape[1:] == (program.n_displacements,), f"e ({t} | 1, ..)")
+    require(T.shape == (len(T), 1, 4, 4), "a start (t | 1, 1, 4, 4)")
+    require(len(T) in (1, len(e)), "a start for each trial, or one")
 
 
 def _require_arrays(
@@ -272,19 +326,31 @@ def _require_arrays(
     shape: tuple[int, int],
 ) -> None:
     """Raise ValueError unless e, q, T and joints are arrays of t trials and n poses."""
-    t, n = shape
-    e, q, T = arrays
+    t, e, q, T = shape[0], *arrays
     expected = f"e ({t} | 1, {program.n_displacements}), not {e.shape}"
     require(e.ndim == 2 and e.shape[1] == program.n_displacements, expected)
     require(len(e) in (1, t), expected)
     named = [("q", q, (program.n_joints,)), ("T", T, (4, 4))]
+    for name, array, end in named:
+        _require_rows(name, array, end, shape)
+    _require_joints(program, joints, shape)
+
+
+def _require_joints(program: Program, joints: Sequence[FloatArray], shape: tuple[int, int]) -> None:
+    """Raise ValueError unless joints are those of all groups for t trials and n poses."""
     require(len(joints) == len(program.groups), f"joints of {len(program.groups)} groups")
     for group, values in zip(program.groups, joints, strict=True):
-        named.append(("joints", values, (len(group.limbs), len(group.joints) + 1)))
-    for name, array, end in named:
-        is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
-        is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
-        require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
+        _require_rows("joints", values, (len(group.limbs), len(group.joints) + 1), shape)
+
+
+def _require_rows(
+    name: str, array: FloatArray, end: tuple[int, ...], shape: tuple[int, int]
+) -> None:
+    """Raise ValueError unless an array is (t | 1, n | 1, ..) with this end."""
+    t, n = shape
+    is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
+    is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
+    require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
 
 
 def _flatten_map(

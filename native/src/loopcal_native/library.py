@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-ABI = 4
+ABI = 5
 """The C interface that this package calls; dispatch.cpp states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""
 MOST_CONDITIONS = 64
 """Conditions of a task for each row; interface.h states it, too."""
+
+LINE = 64
+"""Bytes of a line of the cache, at which arrays begin."""
 
 ADDRESS, COUNT, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int
 
@@ -29,6 +33,14 @@ class TwistRows(ctypes.Structure):
     """Rows of poses, see interface.h."""
 
     _fields_ = (("count", COUNT), ("pose", ADDRESS), ("by_twist", Strided), ("residual", Strided))
+
+
+class ReachOutput(ctypes.Structure):
+    """Addresses of what `loopcal_reach` returns, in the order of interface.h."""
+
+    _fields_ = tuple(
+        (name, ADDRESS) for name in ("T", "joints", "residual", "status", "sign", "arrives")
+    )
 
 
 class TaskAnswer(ctypes.Structure):
@@ -58,8 +70,9 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_instruction_set.argtypes = (INT, ctypes.POINTER(INT))
     library.loopcal_instruction_set.restype = ctypes.c_char_p
     library.loopcal_fold.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 4)
-    library.loopcal_certify.argtypes = (INT, ADDRESS, COUNT, ADDRESS, ctypes.c_double)
-    library.loopcal_certify.argtypes += (*(COUNT,) * 2, ADDRESS)
+    library.loopcal_certify.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 2, ADDRESS)
+    library.loopcal_reach.argtypes = (INT, *(ADDRESS,) * 5, *(COUNT,) * 2)
+    library.loopcal_reach.argtypes += (ctypes.POINTER(ReachOutput),)
     library.loopcal_linearize.argtypes = (INT, *(ADDRESS,) * 5, *(COUNT,) * 2)
     library.loopcal_differentiate.argtypes = (INT, *(ADDRESS,) * 7, *(COUNT,) * 2)
     library.loopcal_fold_poses.argtypes = (INT, *(ADDRESS,) * 5, ctypes.POINTER(TwistRows))
@@ -91,6 +104,19 @@ def require_done(outcome: int) -> None:
 def as_reals(array: np.ndarray) -> np.ndarray:
     """Return an array of doubles in one piece of memory; most arrays stay as they are."""
     return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def allocate(*parts: tuple[tuple[int, ...], type]) -> list[np.ndarray]:
+    """Return arrays of these shapes and types, with any content, in one piece of memory.
+
+    The C library keeps the memory of a freed array for the next one of its size. Several arrays
+    would exceed what it keeps: new pages from the system cost as much as the kinematics.
+    """
+    sizes = [math.prod(shape) * np.dtype(kind).itemsize for shape, kind in parts]
+    ends = np.cumsum([-(-size // LINE) * LINE for size in sizes])
+    memory = np.empty(int(ends[-1]) // 8)
+    offsets = [0, *ends[:-1].tolist()]
+    return [np.ndarray(*part, memory, at) for part, at in zip(parts, offsets, strict=True)]
 
 
 def describe(array: np.ndarray) -> Strided:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine: solve closed loops, certify solutions, linearize and differentiate, fold rows.
+"""The engine: solve closed loops, certify solutions, reach poses, linearize, differentiate, fold.
 
 Nothing outside this package depends on how these functions work or on which engine computes:
 another engine is accepted when it passes tests/engine. All functions are pure; threads may call
@@ -19,8 +19,10 @@ from loopcal.engine.program import Group as Group
 from loopcal.engine.program import MapPattern as MapPattern
 from loopcal.engine.program import ParameterMap as ParameterMap
 from loopcal.engine.program import Program as Program
+from loopcal.engine.program import Reached as Reached
 from loopcal.engine.program import Slot as Slot
 from loopcal.engine.program import State as State
+from loopcal.engine.program import Target as Target
 from loopcal.engine.program import Task as Task
 from loopcal.engine.program import TwistRows as TwistRows
 from loopcal.engine.selection import Engine as Engine
@@ -30,6 +32,7 @@ from loopcal.engine.selection import fold as fold
 from loopcal.engine.selection import fold_poses as fold_poses
 from loopcal.engine.selection import get_current_engine as get_current_engine
 from loopcal.engine.selection import linearize as linearize
+from loopcal.engine.selection import reach as reach
 from loopcal.engine.selection import select_engine as select_engine
 from loopcal.engine.selection import solve as solve
 from loopcal.engine.versions import collect_versions as collect_versions

@@ -43,6 +43,13 @@ class Slot:
     axis: int
 
 
+def _as_slice(columns: IntArray) -> IntArray | slice:
+    """Return columns as a slice where each is the next one, which indexes faster."""
+    first = int(columns[0])
+    is_run = bool((columns == np.arange(first, first + len(columns))).all())
+    return slice(first, first + len(columns)) if is_run else columns
+
+
 @dataclass(frozen=True)
 class Group:
     """Limbs of one structure: k limbs with J joints each.
@@ -108,6 +115,23 @@ class Program:
     n_joints: int
     sigma: tuple[float, ...] | None = None
 
+    def list_drives(self, joints: tuple[FloatArray, ...]) -> FloatArray:
+        """Return values (t, n, a) of the actuated joints, of those of groups (t, n, k, J + 1)."""
+        out = np.zeros((*joints[0].shape[:2], self.n_joints))
+        for group, j, columns in self._drives:
+            out[..., columns] = joints[group][..., j]
+        return out
+
+    @cached_property
+    def _drives(self) -> list[tuple[int, int, IntArray | slice]]:
+        """Return the group, the joint and the columns of q of all driven joints."""
+        return [
+            (g, j, _as_slice(columns))
+            for g, group in enumerate(self.groups)
+            for j, columns in enumerate(group.actuator)
+            if columns[0] >= 0
+        ]
+
     @cached_property
     def with_fixed_platform(self) -> Program:
         """The same limbs with a platform that stays where the start has it."""
@@ -142,6 +166,53 @@ class State:
     residual: FloatArray
     iterations: IntArray
     closure_sign: NDArray[np.int8]
+
+    def select(self, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
+        """Return rows (trial, pose) of a state that broadcasts to a shape (t, n), as (rows, 1)."""
+
+        def chosen(a: np.ndarray) -> np.ndarray:
+            return np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None]
+
+        T, *rest = (
+            chosen(a)
+            for a in (self.T, self.status, self.residual, self.iterations, self.closure_sign)
+        )
+        return State(T, tuple(chosen(a) for a in self.joints), *rest)
+
+
+@dataclass(frozen=True)
+class Target:
+    """Poses of the platform, stated by coordinates: a position and R = Rz(a) Ry(b) Rx(c).
+
+    With `torsion`, R = Rz(a) Ry(b) Rz(c - a). What is not stated are the position of `base`, angles
+    of zero, and without any angle the rotation of `base`.
+
+    values : (t | 1, n, c) coordinates [m, rad]. columns : those of x, y, z, a, b, c; -1 for none.
+    base : (4, 4) [m].
+    """
+
+    values: FloatArray
+    columns: tuple[int, ...]
+    torsion: bool
+    base: FloatArray
+
+    @property
+    def has_turns(self) -> bool:
+        """Whether an angle is stated."""
+        return max(self.columns[3:]) >= 0
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Closed loops at target poses.
+
+    state : (t, n); `closure_sign` is that with locked actuators.
+    arrives : (t, n) whether its actuated joints lead from the start to the pose: `solve` converges
+        to it, on the start's side of every singularity. Where it is False, nothing is known.
+    """
+
+    state: State
+    arrives: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine import numpy_engine
-from loopcal.engine.program import ClosureBlocks, ParameterMap, Program, State, Task, TwistRows
+from loopcal.engine.program import (
+    ClosureBlocks,
+    ParameterMap,
+    Program,
+    Reached,
+    State,
+    Target,
+    Task,
+    TwistRows,
+)
 from loopcal.errors import MissingPackageError
 from loopcal.findings import report_finding
 from loopcal.typing import BoolArray, FloatArray
@@ -42,6 +51,7 @@ class Engine:
     version: str
     solve: Callable[..., State]
     certify: Callable[..., NDArray[np.int8]]
+    reach: Callable[..., Reached]
     linearize: Callable[..., ClosureBlocks]
     fold: Callable[[FloatArray, FloatArray], FloatArray]
     differentiate: Callable[..., tuple[FloatArray, FloatArray]]
@@ -64,7 +74,7 @@ def select_engine(choice: str = "") -> Engine:
     name, _, variant = choice.partition(":")
     if choice == NUMPY:
         own = numpy_engine
-        functions = own.solve, own.certify, own.linearize, own.fold
+        functions = own.solve, own.certify, own.reach, own.linearize, own.fold
         return Engine(NUMPY, np.__version__, *functions, own.differentiate, own.fold_poses)
     load = _find_loader(choice, name)
     try:
@@ -132,6 +142,17 @@ def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArr
     e : (t | 1, n_displacements) [m, rad]. start : (t | 1, 1). goal : solutions (t, n).
     """
     return get_current_engine().certify(program, e, start, goal)
+
+
+def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reached:
+    """Close the loops at target poses, and find which of them the start leads to.
+
+    e : (t | 1, n_displacements) [m, rad]. target : n poses, n > 0. start : (t | 1, n | 1).
+
+    All actuators are free, and the platform has six freedoms or the poses keep the others. Limbs
+    begin at the start's joint values. Closure with locked actuators is square.
+    """
+    return get_current_engine().reach(program, e, target, start)
 
 
 def linearize(

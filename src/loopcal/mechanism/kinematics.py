@@ -9,6 +9,7 @@ linearized with every actuator free. Source: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from loopcal.mechanism.sensitivity import (
     name_passive_joints,
     stack_platform_rows,
 )
-from loopcal.mechanism.solution_modes import solve_in_mode
+from loopcal.mechanism.solution_modes import reach_coordinates, solve_in_mode
 from loopcal.mechanism.states import Status, is_closed, select_poses
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -179,16 +180,10 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     if is_pose:
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
-        state = solve_in_mode(
-            robot, lambda T, start: find_nearest_reachable(robot, values, T[None], start), T, begin
-        )
+        state = solve_in_mode(robot, partial(_reach_pose, robot), T, begin)
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
-        state = solve_in_mode(
-            robot,
-            lambda x, start: close_at_coordinates(robot, values, x[None], start),
-            np.atleast_2d(wanted),
-            begin,
-        )
+        coordinates = np.atleast_2d(wanted)
+        state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
     else:
         raise DataError(f"a target of shape {wanted.shape} was given; allowed are {shapes}")
     return make_solution(robot, state, compute_readings(robot, values, state)[0])
@@ -286,8 +281,7 @@ def find_nearest_reachable(
 ) -> State:
     """Return states (t, n) with the reachable pose nearest to T (t | 1, n, 4, 4), without signs."""
     state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
-    is_full = len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms)
-    if is_full or not state.T.size:
+    if _controls_all(robot) or not state.T.size:
         return state
     for _ in range(PROJECTION_STEPS):
         gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))
@@ -301,6 +295,20 @@ def find_nearest_reachable(
         if np.abs(step).max(initial=0.0) < 1e-12 * robot.size:
             break
     return state
+
+
+def _reach_pose(
+    robot: Mechanism, T: FloatArray, start: State | None
+) -> tuple[State, BoolArray | None]:
+    """Return what `reach_coordinates` returns, for poses (n, 4, 4)."""
+    if _controls_all(robot):
+        return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
+    return find_nearest_reachable(robot, robot.values[None], T[None], start), None
+
+
+def _controls_all(robot: Mechanism) -> bool:
+    """Return whether the controlled coordinates state each freedom of the platform."""
+    return len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms)
 
 
 def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal import geometry
+from loopcal.engine import Target
 from loopcal.errors import MechanismError
 from loopcal.typing import FloatArray
 
@@ -68,6 +69,14 @@ def pose_from_coordinates(
         angles = np.stack([given.get(name, zero) for name in EULER], axis=-1)
         T[..., :3, :3] = geometry.euler_to_matrix(angles, "xyz")
     return T
+
+
+def state_target(values: FloatArray, names: tuple[str, ...], base: FloatArray) -> Target:
+    """Return the poses of `pose_from_coordinates` (t | 1, n, c) as the engine states them."""
+    turns = ("phi", "theta", "psi") if set(names) & set(TILT) else ("yaw", "pitch", "roll")
+    places = {name: i for i, name in enumerate(names)}
+    columns = tuple(places.get(name, -1) for name in (*POSITION, *turns))
+    return Target(values, columns, turns[0] == "phi", base)
 
 
 def compare_coordinates(

@@ -22,9 +22,11 @@ from loopcal.mechanism.batch_kinematics import (
     close_at_coordinates,
     close_at_joints,
     compute_closure_sign,
+    count_shared_drives,
+    determine_platform,
 )
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
 from loopcal.mechanism.stages.chain_kinematics import judge_stage_modes
 from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_poses
 from loopcal.numerics.trial_batch import map_arrays
@@ -38,8 +40,9 @@ Rounding grows close to a singularity, up to the square root of the machine prec
 STEPS = 8
 """Steps of the path from the start's pose to a target."""
 
-Solver = Callable[[FloatArray, State | None], State]
-"""Solves inverse kinematics for targets (n, ..) from a start: (1, n) states."""
+Solver = Callable[[FloatArray, State | None], tuple[State, BoolArray | None]]
+"""Solves inverse kinematics for targets (n, ..) from a start: states (1, n), and where the engine
+tells, which of them their readings are known to lead to, see `reach_coordinates`."""
 
 
 def solve_in_mode(
@@ -50,7 +53,8 @@ def solve_in_mode(
     A row whose loops close in another mode only is marked `OTHER_MODE`.
     """
     begin = start or robot.home_state
-    state, is_other = judge_modes(robot, solve(target, start), begin)
+    state, arrives = solve(target, start)
+    state, is_other = judge_modes(robot, state, begin, arrives)
     rows = np.flatnonzero(is_other)
     if not len(rows):
         return state
@@ -59,15 +63,39 @@ def solve_in_mode(
     near, arrived = _follow_poses(robot, first, state.T[0, rows])
     if not len(arrived):
         return state
-    again = solve(target[rows[arrived]], near)
+    again, _ = solve(target[rows[arrived]], near)
     again, still_other = judge_modes(robot, again, select_poses(first, arrived))
     good = (again.status[0] == Status.CONVERGED) & ~still_other
     rows, new = rows[arrived[good]], select_poses(again, good)
     return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
 
 
-def judge_modes(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
+def reach_coordinates(
+    robot: Mechanism, target: FloatArray, start: State | None = None
+) -> tuple[State, BoolArray | None]:
+    """Solve inverse kinematics like `close_at_coordinates`, for coordinates (n, c).
+
+    Returns
+    -------
+    state : (1, n), also with the closure signs of `inverse_trials` where the next is not None.
+    arrives : (n,) rows whose readings are known to lead from the start to their pose.
+    """
+    values, target = robot.values[None], target[None]
+    is_plain = not (robot.stages or robot.is_serial or count_shared_drives(robot.program))
+    if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
+        return close_at_coordinates(robot, values, target, start), None
+    e, _ = robot.slots(values)
+    goal = state_target(target, robot.controlled, robot.home)
+    reached = engine.reach(robot.program, e, goal, start or robot.home_state)
+    return reached.state, reached.arrives[0]
+
+
+def judge_modes(
+    robot: Mechanism, state: State, begin: State, arrives: BoolArray | None = None
+) -> tuple[State, BoolArray]:
     """Return a state (1, n) with closure signs, and its closed rows that `begin` does not lead to.
+
+    arrives : as of `reach_coordinates`, where the state has its closure signs already.
 
     The engine proves for most rows that their readings lead to their pose, which gives their sign,
     too. For the others the sign is computed. Forward kinematics accepts no solution of another
@@ -82,12 +110,15 @@ def judge_modes(robot: Mechanism, state: State, begin: State) -> tuple[State, Bo
     e, _ = robot.slots(robot.values[None])
     begin, n = clear_sign(robot, begin), state.T.shape[1]
     closed = state.status[0] == Status.CONVERGED
-    sign = engine.certify(robot.program, e, begin, state)[0]
-    is_sure = sign != 0
-    if not is_sure.all():
-        unsure = select_poses(state, ~is_sure)
-        sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
-    state = replace(state, closure_sign=sign[None])
+    if arrives is not None:
+        sign, is_sure = state.closure_sign[0], arrives
+    else:
+        sign = engine.certify(robot.program, e, begin, state)[0]
+        is_sure = sign != 0
+        if not is_sure.all():
+            unsure = select_poses(state, ~is_sure)
+            sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
+        state = replace(state, closure_sign=sign[None])
     is_other = closed & (sign != begin.closure_sign[0])
     rows = np.flatnonzero(closed & ~is_other & ~is_sure)
     if len(rows):

@@ -96,12 +96,7 @@ def reshape_rows(state: State, t: int, n: int) -> State:
 
 def driven_values(program: Program, state: State) -> FloatArray:
     """Return the values of the actuated joints (t, n, a) [m or rad]."""
-    out = np.zeros((*state.T.shape[:2], program.n_joints))
-    for group, joints in zip(program.groups, state.joints, strict=True):
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                out[..., columns] = joints[..., j]
-    return out
+    return program.list_drives(state.joints)
 
 
 def compute_limb_frames(

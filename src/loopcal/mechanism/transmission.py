@@ -141,7 +141,8 @@ def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
 def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """Return the readings (t, n, a) of joint values, without backlash.
 
-    The linear terms are inverted exactly; Newton's method adds the others.
+    The linear terms are inverted exactly; Newton's method adds the others. Joints that read their
+    own values are returned as they are.
     """
     triangles = find_triangles(tau)
     if len(triangles):
@@ -150,7 +151,10 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> 
         joints[..., triangles] = compute_length(
             joints[..., triangles], _select_triangles(tau, triangles)
         )
-    readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
+    if len(tau) == 1 and not tau[..., 0].any() and bool((tau[..., 1] == 1.0).all()):
+        readings = joints
+    else:
+        readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
     if not tau[..., 2:7].any():
         return readings
     for _ in range(20):

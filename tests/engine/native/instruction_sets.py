@@ -4,7 +4,7 @@
 import numpy as np
 from loopcal_native import list_instruction_sets
 
-from loopcal.engine import ClosureBlocks, Engine, State, select_engine
+from loopcal.engine import ClosureBlocks, Engine, Reached, State, select_engine
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from tests.engine.cases import Case, make_case
@@ -22,12 +22,16 @@ def make_robot_case(name: str, t: int, n: int) -> Case:
     return make_case(load_robot(name), t=t, n=n)
 
 
-def list_arrays(result: State | ClosureBlocks | tuple | np.ndarray) -> dict[str, np.ndarray]:
+def list_arrays(
+    result: State | Reached | ClosureBlocks | tuple | np.ndarray,
+) -> dict[str, np.ndarray]:
     """Return the arrays of a result by name."""
     if isinstance(result, np.ndarray):
         return {"R": result}
     if isinstance(result, tuple):
         return {f"part {i}": array for i, array in enumerate(result)}
+    if isinstance(result, Reached):
+        return list_arrays(result.state) | {"arrives": result.arrives}
     if isinstance(result, State):
         named = {"joints": np.concatenate([a.ravel() for a in result.joints])}
         fields = ("T", "status", "residual", "iterations", "closure_sign")

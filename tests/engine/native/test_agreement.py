@@ -10,6 +10,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.engine import select_engine
+from loopcal.io import load_robot
+from loopcal.mechanism import read_coordinates
+from loopcal.mechanism.platform_coordinates import state_target
 from tests.engine.cases import displacement_units, draw_map, make_pose_rows, pose_demand
 from tests.engine.native.instruction_sets import ROBOTS, list_arrays, make_engines, make_robot_case
 
@@ -135,6 +138,25 @@ def test_proofs_agree_with_numpy_and_between_instruction_sets(name, t, n):
     assert (proven[0] != 0).any()
     for other in proven[1:]:
         assert_array_equal(other, proven[0])
+
+
+@pytest.mark.parametrize("name", ["hexapod-42", "hexapod-nategh-agheli", "linear-delta"])
+@pytest.mark.parametrize(("t", "n"), [(1, 300), (7, 5)])
+def test_reached_poses_agree_with_numpy_and_between_instruction_sets(name, t, n):
+    robot, case = load_robot(name), make_robot_case(name, t, n)
+    step = 0.4 * np.random.default_rng(n).uniform(-1, 1, (t, n, len(robot.controlled)))
+    values = read_coordinates(robot.home, robot.controlled) + step
+    target = state_target(values, robot.controlled, robot.home)
+    arguments = case.program, case.e, target, case.home
+    calls, expected = [e.reach(*arguments) for e in ENGINES.values()], NUMPY.reach(*arguments)
+    assert_array_equal(calls[0].arrives, expected.arrives)
+    assert expected.arrives.any()
+    mine, theirs = list_arrays(calls[0]), list_arrays(expected)
+    for field in ("status", "iterations", "closure_sign"):
+        assert_array_equal(mine[field], theirs[field], err_msg=field)
+    for field in ("T", "joints"):
+        assert_allclose(mine[field], theirs[field], atol=2 * ROUNDING, err_msg=field)
+    assert_same_bits(calls)
 
 
 @pytest.mark.parametrize("columns", [1, 2, 7, 43])

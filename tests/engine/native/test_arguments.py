@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from loopcal.engine import CONVERGED, Engine, Program, Slot, State, TwistRows
+from loopcal.engine import CONVERGED, Engine, Program, Slot, State, Target, TwistRows
 from loopcal.errors import MissingPackageError
 from tests.engine.cases import draw_map, draw_twist_rows, make_pose_rows
 from tests.engine.native.instruction_sets import ROBOTS, make_engines, make_robot_case
@@ -103,6 +103,27 @@ def test_starts_and_goals_of_wrong_shape_are_refused(e, start, goal):
     begin, end = replace(RODS.home, T=start), replace(RODS_GOAL, T=goal)
     with pytest.raises((ValueError, IndexError)):
         NATIVE.certify(RODS.program, e, begin, end)
+
+
+TARGET = Target(np.zeros((2, 3, 6)), (0, 1, 2, 3, 4, 5), False, np.eye(4))
+WRONG_TARGETS = {
+    "axes of the values": (RODS.e, replace(TARGET, values=np.zeros((2, 6))), RODS.home),
+    "trials of the values": (RODS.e, replace(TARGET, values=np.zeros((3, 3, 6))), RODS.home),
+    "columns of the values": (RODS.e, replace(TARGET, values=np.zeros((2, 3, 5))), RODS.home),
+    "number of columns": (RODS.e, replace(TARGET, columns=(0, 1, 2)), RODS.home),
+    "base": (RODS.e, replace(TARGET, base=np.eye(3)), RODS.home),
+    "columns of e": (RODS.e[:, 1:], TARGET, RODS.home),
+    "trials of e": (np.repeat(RODS.e, 2, axis=0), TARGET, RODS.home),
+    "start": (RODS.e, TARGET, replace(RODS.home, T=RODS.home.T[..., :3, :])),
+    "sign": (RODS.e, TARGET, replace(RODS.home, closure_sign=np.ones((3, 2), np.int8))),
+    "joints of the start": (RODS.e, TARGET, replace(RODS.home, joints=())),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_TARGETS)
+def test_targets_of_wrong_shape_are_refused(what):
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.reach(RODS.program, *WRONG_TARGETS[what])
 
 
 @pytest.mark.parametrize(
@@ -213,6 +234,9 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
     assert set(np.unique(state.status)) <= {0, 1, 2, 3}
     sign = native.certify(case.program, e, case.home, state)
     assert set(np.unique(sign)) <= {-1, 0, 1}
+    target = Target(disturb(rng, np.zeros((rows, 2, 6)), share), tuple(range(6)), False, np.eye(4))
+    reached = native.reach(case.program, e, target, case.home)
+    assert not (reached.arrives & (reached.state.status != CONVERGED)).any()
     blocks = native.linearize(case.program, e, q, state)
     native.linearize(case.program, e, q, state, free=True)
     inputs = draw_map(case.program, (rows, 1), True)

@@ -12,6 +12,8 @@ import numpy as np
 from loopcal.engine import select_engine
 from tests.engine.cases import draw_map, make_case, make_pose_rows
 from tests import zoo
+from loopcal.engine import Target
+from loopcal.io import load_robot
 
 engine, case = select_engine("native"), make_case(zoo.five_bar(), n=3)
 arguments = case.program, case.e, case.q
@@ -20,6 +22,9 @@ inputs = draw_map(case.program, (1, 3), True)
 rows_of_poses = make_pose_rows(engine, "five-bar", 9, 3)
 zeros = np.zeros((9, *(rows_of_poses[4].pattern.parameters + 1,) * 2))
 
+rods = make_case(load_robot("hexapod-42"), n=3)
+target = Target(rods.q, (0, 1, -1, 3, 4, 5), False, rods.home.T[0, 0])
+
 def call(times):
     for _ in range(times):
         state = engine.solve(*arguments, case.home)
@@ -27,10 +32,11 @@ def call(times):
         engine.differentiate(*arguments, state, inputs)
         engine.fold(R, rows)
         engine.fold_poses(zeros, *rows_of_poses)
+        engine.reach(rods.program, rods.e, target, rods.home)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 before = call(1000)
-print(call(25_000) - before)
+print(call(20_000) - before)
 """
 
 ALLOWED = 512

@@ -7,3 +7,4 @@ from loopcal.engine.numpy_engine.householder import fold as fold
 from loopcal.engine.numpy_engine.newton import solve as solve
 from loopcal.engine.numpy_engine.pose_rows import fold_poses as fold_poses
 from loopcal.engine.numpy_engine.sensitivity import differentiate as differentiate
+from loopcal.engine.numpy_engine.targets import reach as reach
