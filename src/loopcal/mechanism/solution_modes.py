@@ -3,9 +3,9 @@
 
 Loops that close at a target do not say that the machine gets there: the same readings may close the
 loops elsewhere, and the same pose may have several readings. A solution is in the mode of its start
-if its closure sign is the start's and forward kinematics from the start returns its pose. A
-solution in another mode is solved again along the straight path of poses from the start. Source:
-docs/theory/kinematics.md.
+if its closure sign is the start's, forward kinematics from the start returns its pose, and a path
+of small steps leads there (`mode_paths`). A solution in another mode is solved again along the
+straight path of poses from the start. Source: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from loopcal.mechanism.batch_kinematics import (
     count_shared_drives,
     determine_platform,
 )
+from loopcal.mechanism.mode_paths import SAME_JOINTS, connect_states, measure_distance, repeat_poses
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
 from loopcal.mechanism.stages.chain_kinematics import judge_stage_modes
 from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_poses
-from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SAME_POSE = 1e-7
@@ -59,11 +59,14 @@ def solve_in_mode(
     if not len(rows):
         return state
     state = replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
-    first = select_poses(_repeat_poses(begin, len(is_other)), rows)
+    first = select_poses(repeat_poses(begin, len(is_other)), rows)
     near, arrived = _follow_poses(robot, first, state.T[0, rows])
     if not len(arrived):
         return state
     again, _ = solve(target[rows[arrived]], near)
+    if not robot.stages:  # what was judged is not judged again
+        is_new = measure_distance(robot, again, select_poses(state, rows[arrived])) > SAME_JOINTS
+        again, arrived = select_poses(again, is_new), arrived[is_new]
     again, still_other = judge_modes(robot, again, select_poses(first, arrived))
     good = (again.status[0] == Status.CONVERGED) & ~still_other
     rows, new = rows[arrived[good]], select_poses(again, good)
@@ -121,21 +124,47 @@ def judge_modes(
         state = replace(state, closure_sign=sign[None])
     is_other = closed & (sign != begin.closure_sign[0])
     rows = np.flatnonzero(closed & ~is_other & ~is_sure)
-    if len(rows):
-        chosen = select_poses(state, rows)
-        first = select_poses(begin, rows) if begin.T.shape[1] == n > 1 else begin
-        joints = driven_values(robot.program, chosen)
-        back = close_at_joints(robot, e, joints, first, goal=chosen)
-        is_other[rows] = back.status[0] != NEAR_GOAL
-        ended = back.status[0] == Status.CONVERGED
-        gap = geometry.pose_difference(back.T[0, ended], chosen.T[0, ended]) * robot.twist_scale
-        is_other[rows[ended]] = np.abs(gap).max(axis=1, initial=0.0) > SAME_POSE * robot.size
+    if not len(rows):
+        return state, is_other
+    first = select_poses(begin, rows) if begin.T.shape[1] == n > 1 else begin
+    judged, is_other[rows] = _judge_paths(robot, first, select_poses(state, rows))
+    new = reshape_rows(judged, len(rows), 1)
+    return replace_rows(state, np.zeros_like(rows), rows, new), is_other
+
+
+def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
+    """Return goals (1, k) of the right sign, and which of them `first` (1, k | 1) does not lead to.
+
+    Newton's method must lead to the pose of a goal from its readings, and a safe path too. Where it
+    needs a path of readings, this is the same path.
+    """
+    returns, needs_path = _solve_from(robot, first, goal)
+    is_other = ~(returns | needs_path)
+    rows = np.flatnonzero(~is_other)
+    if not len(rows):
+        return goal, is_other
+    start = select_poses(repeat_poses(first, len(is_other)), rows)
+    found = connect_states(robot, start, select_poses(goal, rows))
+    is_other[rows] = ~(found.by_readings | found.by_poses)
+    state = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(found.state, len(rows), 1))
+    unsure = found.by_poses & needs_path[rows]
+    if unsure.any():
+        start, rows = select_poses(start, unsure), rows[unsure]
+        is_other[rows] = ~_solve_from(robot, start, select_poses(goal, rows), follow=True)[0]
     return state, is_other
 
 
-def _repeat_poses(state: State, n: int) -> State:
-    """Return a state (1, 1) or (1, n) as (1, n)."""
-    return map_arrays(lambda a: np.broadcast_to(a, (1, n, *a.shape[2:])), state)
+def _solve_from(
+    robot: Mechanism, first: State, goal: State, follow: bool = False
+) -> tuple[BoolArray, BoolArray]:
+    """Return which readings of goals (1, k) lead to their poses from `first`, and which to none."""
+    e, _ = robot.slots(robot.values[None])
+    joints = driven_values(robot.program, goal)
+    back = close_at_joints(robot, e, joints, first, follow, goal)
+    closed = back.status[0] == Status.CONVERGED
+    gap = np.abs(geometry.pose_difference(back.T[0], goal.T[0]) * robot.twist_scale).max(axis=1)
+    is_near = back.status[0] == NEAR_GOAL
+    return is_near | closed & (gap <= SAME_POSE * robot.size), ~(is_near | closed)
 
 
 def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
