@@ -108,7 +108,7 @@ class ObservationRows:
 
     def whiten(self, whitener: FloatArray, residual: FloatArray, trials: IntArray) -> FloatArray:
         """Return whitened residuals (a, r, m) of some trials (a,), with their offset."""
-        white = whiten(whitener, residual)
+        white = self.whiten_columns(whitener, residual[..., None])[..., 0]
         if self.offset is None:
             return white
         return white + (self.offset if len(self.offset) == 1 else self.offset[trials])

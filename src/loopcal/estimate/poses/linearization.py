@@ -295,9 +295,8 @@ def linearize_rows(
     a, r, m = residual.shape
     by_nuisance = None
     if evaluated.nuisance is not None:
-        by_nuisance = np.matmul(
-            white, np.broadcast_to(evaluated.nuisance, (a, r, m, evaluated.nuisance.shape[-1]))
-        )
+        whole = np.broadcast_to(evaluated.nuisance, (a, r, m, evaluated.nuisance.shape[-1]))
+        by_nuisance = rows.whiten_columns(white, whole)
     machine = np.empty((a, r, m, 1 + (poses.by_parameters.shape[-1] if by_parameters else 0)))
     machine[..., -1] = rows.whiten(white, residual, trials)
     if by_parameters:
@@ -350,7 +349,7 @@ def _write_parameter_columns(
     if not _is_every_pose(rows, D.shape[1]):
         D = D[:, rows.poses]
     # one order of the products for any number of trials: each trial equals its own fit bit for bit
-    np.matmul(np.matmul(white, evaluated.jacobian), D, out=out)
+    np.matmul(rows.whiten_columns(white, evaluated.jacobian), D, out=out)
     for j, name in enumerate(rows.kind.sensed_joints):
         if name in poses.joints_by_parameters and evaluated.joints is not None:
             slope = poses.joints_by_parameters[name][:, rows.poses, None, :]

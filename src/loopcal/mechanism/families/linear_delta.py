@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import MechanismError
+from loopcal.geometry.rotations import stack_matrix
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, LinearMap, Link
 from loopcal.mechanism.families.error_models import ErrorModel, single_error
 from loopcal.mechanism.families.limb_placement import translate
@@ -54,20 +55,20 @@ class TowerMap:
     def value(self, inputs: FloatArray) -> FloatArray:
         """Map (t, 4) [m, rad, m, m] to (t, 3) [m]."""
         radius, angle, arm, stop = inputs.T
-        height = _compute_rise(arm, radius)
-        return np.stack([radius * np.cos(angle), radius * np.sin(angle), stop + height], axis=1)
+        x, y, height = radius * np.cos(angle), radius * np.sin(angle), _compute_rise(arm, radius)
+        return stack_matrix(((x, y, stop + height),))[:, 0]
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
         """Return the derivative (t, 3, 4) at (t, 4)."""
         radius, angle, arm, _ = inputs.T
-        c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(radius)
-        height = _compute_rise(arm, radius)
-        rows = [
-            [c, -radius * s, zero, zero],
-            [s, radius * c, zero, zero],
-            [-radius / height, zero, arm / height, zero + 1.0],
-        ]
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+        c, s, height = np.cos(angle), np.sin(angle), _compute_rise(arm, radius)
+        return stack_matrix(
+            (
+                (c, -radius * s, 0.0, 0.0),
+                (s, radius * c, 0.0, 0.0),
+                (-radius / height, 0.0, arm / height, 1.0),
+            )
+        )
 
 
 def _compute_rise(arm: FloatArray, radius: FloatArray) -> FloatArray:
