@@ -44,7 +44,7 @@ def descend_once(
     fit = descend(with_prior, z, method, control, tolerance, start, progress)
     if first is None:
         return fit
-    is_exhausted = bool((first.status == DescentStatus.OUT_OF_ITERATIONS).any())
+    is_exhausted = bool((first.status == DescentStatus.OUT_OF_ITERATIONS.value).any())
     return replace(fit.after(first), is_start_exhausted=is_exhausted)
 
 
@@ -86,7 +86,7 @@ def descend_to_prior(
         again, new_weights, new_problem = descend_weighted(
             problem, data, fit.deviation, other, progress
         )
-        if again.status[0] != DescentStatus.CONVERGED:
+        if again.status[0] != DescentStatus.CONVERGED.value:
             break
         fit, weights, weighted, options = again.after(fit), new_weights, new_problem, other
     return fit, weights, weighted, options
@@ -106,7 +106,7 @@ def repeat_trials(
                 break
             chosen = replace(options, method=other)
             again = descend_once(own, again.deviation, None, chosen)
-        if again.status[0] == DescentStatus.CONVERGED:
+        if again.status[0] == DescentStatus.CONVERGED.value:
             fit = fit.put(alone, again)
     return fit
 

@@ -121,10 +121,10 @@ def identify(
     values = robot.values if options.start is None else np.asarray(options.start)
     z = free.deviation(robot.with_values(values).values[None])
     fit, weights, weighted, options = descend_to_prior(problem, data, z, options, free, progress)
-    if fit.status[0] == DescentStatus.BAD_START:
+    if fit.status[0] == DescentStatus.BAD_START.value:
         check_start(problem, data, z, fit.cost)
     open_poses = find_open_poses(robot.with_values(values), data)
-    if fit.status[0] != DescentStatus.CONVERGED and open_poses.are_most:
+    if fit.status[0] != DescentStatus.CONVERGED.value and open_poses.are_most:
         raise EstimationError(open_poses.report("fit.poses-open"))
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
     result = add_factor_uncertainty(result, fit)
@@ -183,7 +183,7 @@ def _assemble(
     weighted: Problem,
 ) -> Identification:
     """Return the result of a fit with all diagnostics."""
-    converged = bool(fit.status[0] == DescentStatus.CONVERGED)
+    converged = bool(fit.status[0] == DescentStatus.CONVERGED.value)
     d, penalty, method = fit.decomposition, fit.penalty, get_method(options)
     test, sources = _test_noise(free, fit, options, data)
     estimate = _examine_estimate(problem, weighted, fit)
@@ -248,7 +248,7 @@ def _test_noise(
 ) -> tuple[ResidualTest, VarianceSources]:
     """Return the test of the residuals, and what the variances of the fit are made of."""
     d, penalty, noise = fit.decomposition, fit.penalty, name_noise(options, data)
-    converged = bool(fit.status[0] == DescentStatus.CONVERGED)
+    converged = bool(fit.status[0] == DescentStatus.CONVERGED.value)
     is_weighted = options.loss is not None
     test = run_residual_test(d, penalty, noise, options.sigma_uncertainty, is_weighted, converged)
     sources = find_variance_sources(d, penalty, test, get_method(options), free)

@@ -69,7 +69,7 @@ def choose_methods(
     if not (isinstance(method, MAP) and isinstance(method.inflation, InflatedTolerances)):
         return {}
     candidates = list_components(free, method.inflation.by)
-    converged = np.flatnonzero(fit.status == DescentStatus.CONVERGED)
+    converged = np.flatnonzero(fit.status == DescentStatus.CONVERGED.value)
     if not candidates or not len(converged):
         return {}
     chosen: dict[int, MAP] = {}
@@ -100,7 +100,7 @@ def run_prior_tests(
     rows = _divide(_restate_as_stated(free, fit, method), method)
     inflation = float(method.read_inflation(fit.decomposition, fit.penalty)[0])
     conflict = assess_prior_conflict(free, rows, inflation, fit.deviation[0], method.components)
-    if fit.status[0] != DescentStatus.CONVERGED:
+    if fit.status[0] != DescentStatus.CONVERGED.value:
         return conflict, []
     return conflict, [*conflict.report(), *report_undetectable(free, rows)]
 

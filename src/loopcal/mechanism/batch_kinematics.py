@@ -96,7 +96,7 @@ def forward_trials(
 def _mark_out_of_reach(robot: Mechanism, state: State, q: FloatArray, tau: FloatArray) -> State:
     """Return a state (t, n) whose rows with a length that no angle reaches are unreachable."""
     excess = np.broadcast_to(measure_excess(q, tau, robot.slots.frequency), state.status.shape)
-    is_beyond = (state.status == Status.NOT_FINITE) & (excess > 0.0) & np.isfinite(excess)
+    is_beyond = (state.status == Status.NOT_FINITE.value) & (excess > 0.0) & np.isfinite(excess)
     return replace(
         state,
         status=np.where(is_beyond, np.int8(Status.UNREACHABLE), state.status),
@@ -124,7 +124,7 @@ def close_at_joints(
     if not wrong.any():
         return state
     if not follow:
-        beyond = wrong & (state.status == Status.CONVERGED)
+        beyond = wrong & (state.status == Status.CONVERGED.value)
         return replace(state, status=np.where(beyond, np.int8(Status.OTHER_MODE), state.status))
     return _follow_path(robot, e, joints, begin, state, wrong)
 
@@ -135,7 +135,7 @@ def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray)
     These solutions lie on home's side of every singularity. The test takes a fraction of the time
     of following.
     """
-    return forward_trials(robot, values, q, follow=False).status == Status.CONVERGED
+    return forward_trials(robot, values, q, follow=False).status == Status.CONVERGED.value
 
 
 def inverse_trials(
@@ -243,14 +243,16 @@ def clear_sign(robot: Mechanism, state: State) -> State:
 
 def _find_open_rows(robot: Mechanism, state: State) -> BoolArray:
     """Return the rows that failed or left a wide gap."""
-    return (state.status != Status.CONVERGED) | (state.residual > WIDE * robot.size)
+    return (state.status != Status.CONVERGED.value) | (state.residual > WIDE * robot.size)
 
 
 def _find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
     """Return the rows that failed, ended beyond a singularity or left a wide gap."""
-    closed = state.status == Status.CONVERGED
+    closed = state.status == Status.CONVERGED.value
     beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
-    failed = ~closed & (state.status != Status.NOT_FINITE) & (state.status != engine.NEAR_GOAL)
+    failed = (
+        ~closed & (state.status != Status.NOT_FINITE.value) & (state.status != engine.NEAR_GOAL)
+    )
     return failed | closed & beyond
 
 
@@ -283,7 +285,7 @@ def _follow_path(
         alive = alive[_find_wrong_rows(robot, current, begun)[:, 0]]
         if not len(alive):
             break
-    closed = result.status == Status.CONVERGED
+    closed = result.status == Status.CONVERGED.value
     status = np.where(
         closed & (result.residual > WIDE * robot.size), np.int8(Status.UNREACHABLE), result.status
     )
@@ -340,7 +342,7 @@ def _inverse_with_shared_drives(
     values = np.broadcast_to(values, (t, values.shape[1]))[trial]
     state = _solve_as_commanded(robot, values, wanted, select_rows(begin, (t, n), trial, pose))
     q = compute_readings(robot, values, state)
-    alive, zero = np.flatnonzero(state.status[:, 0] == Status.CONVERGED), np.zeros(t * n, int)
+    alive, zero = np.flatnonzero(state.status[:, 0] == Status.CONVERGED.value), np.zeros(t * n, int)
     for _ in range(SHARED_DRIVE_STEPS):
         if not len(alive):
             break
@@ -350,7 +352,7 @@ def _inverse_with_shared_drives(
         current = engine.solve(robot.program, e, joints, previous)
         state = replace_rows(state, alive, zero[alive], current)
         gap, step = _step_readings(robot, values[alive], q[alive], wanted[alive], current)
-        going = current.status[:, 0] == Status.CONVERGED
+        going = current.status[:, 0] == Status.CONVERGED.value
         going &= np.abs(gap).max(axis=1) > CLOSE * robot.size
         alive = alive[going]
         q[alive, 0] -= step[going]

@@ -387,5 +387,5 @@ class _FilteredDescent:
         met_rounding = good & (step.full_length <= ROUNDING_STEP * spread)
         is_stuck = ~accepted & (met_rounding | (step.length <= SHORTEST_STEP * spread))
         converged = good & (step.full_length <= SMALL_STEP * spread)
-        ending = np.where(converged, DescentStatus.CONVERGED, DescentStatus.NO_DESCENT)
-        return np.where(is_stuck, ending, DescentStatus.RUNNING)
+        ending = np.where(converged, DescentStatus.CONVERGED.value, DescentStatus.NO_DESCENT.value)
+        return np.where(is_stuck, ending, DescentStatus.RUNNING.value)

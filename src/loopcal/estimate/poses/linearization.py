@@ -174,7 +174,7 @@ def mask_unreached(
     Y, slopes, turns = poses.by_coordinates, poses.joints_by_parameters, poses.joints_by_coordinates
     derivatives = [poses.by_parameters, *slopes.values(), *turns.values()]
     derivatives += [] if Y is None else [Y, q]
-    ok = np.asarray(state.status == Status.CONVERGED)
+    ok = np.asarray(state.status == Status.CONVERGED.value)
     for array in derivatives:
         if not np.isfinite(array.sum()):  # else no entry is infinite or NaN
             ok = ok & np.isfinite(array).all(axis=tuple(range(2, array.ndim)))
