@@ -5,10 +5,8 @@ Arrays are (t, n, ..), where t or n may be 1 and then broadcast. The layers abov
 functions; `loopcal.forward` and `loopcal.inverse` wrap them for a single robot.
 
 Where one actuator drives joints of several limbs, as a carriage with two rods does, the inverse
-solution cannot free each joint: they would part. It solves for the readings instead, by Newton's
-method on the coordinates of the forward solution, c(T(q)) = c*. It begins with the platform exactly
-as commanded in all its freedoms, which the limbs can reach one by one. Source:
-docs/theory/kinematics.md.
+solution cannot free each joint: they would part. It solves for the readings instead, as that of
+chains does. Source: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -28,23 +26,17 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.stages.chain_inverse import inverse_stages
+from loopcal.mechanism.stages.chain_inverse import solve_readings
 from loopcal.mechanism.stages.chain_kinematics import multiply_signs, solve_stages
 from loopcal.mechanism.stages.serial_limb import solve_serial
-from loopcal.mechanism.states import (
-    Status,
-    driven_values,
-    replace_rows,
-    reshape_rows,
-    select_rows,
-    without_poses,
-)
+from loopcal.mechanism.states import Status, driven_values, replace_rows, select_rows, without_poses
 from loopcal.mechanism.transmission import (
     find_triangles,
     joints_from_readings,
     measure_excess,
     readings_from_joints,
 )
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
 PATH_STEPS = (8, 64)
@@ -53,13 +45,6 @@ WIDE = 1e-2
 """Gap, relative to the robot's size, that the errors of redundant readings do not explain.
 
 A pose that they leave open by more is a wrong minimum.
-"""
-SHARED_DRIVE_STEPS = 20
-"""Newton steps on the readings where drives are shared."""
-CLOSE = 1e-12
-"""Distance from the target coordinates, relative to the robot's size, at which these steps end.
-
-A forward solution is known to 1e-13 of the size.
 """
 ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
 
@@ -159,7 +144,7 @@ def close_at_coordinates(
     if not target.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(target)))
     if robot.stages:
-        return inverse_stages(robot, values, target, begin, forward_trials, differentiate_pose)
+        return solve_readings(robot, values, target, begin, forward_trials, differentiate_pose)
     if count_shared_drives(robot.program):
         return _inverse_with_shared_drives(robot, values, target, begin)
     e, _ = robot.slots(values)
@@ -332,59 +317,44 @@ def _take_steps(
 def _inverse_with_shared_drives(
     robot: Mechanism, values: FloatArray, target: FloatArray, begin: State
 ) -> State:
-    """Return states (t, n) at controlled coordinates (t | 1, n, c); marks rows that fail.
+    """Return states (t, n) at controlled coordinates (t | 1, n, c) by their readings.
 
-    Rows are independent of each other.
+    Newton's method begins with each joint free and the platform as commanded in all its freedoms,
+    which the limbs of many machines can reach one by one; elsewhere, such as where the platform's
+    orientation follows its position, at the start.
     """
-    t, n = max(len(values), len(target)), target.shape[1]
-    trial, pose = (a.ravel() for a in np.indices((t, n)))
-    wanted = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
-    values = np.broadcast_to(values, (t, values.shape[1]))[trial]
-    state = _solve_as_commanded(robot, values, wanted, select_rows(begin, (t, n), trial, pose))
-    q = compute_readings(robot, values, state)
-    alive, zero = np.flatnonzero(state.status[:, 0] == Status.CONVERGED.value), np.zeros(t * n, int)
-    for _ in range(SHARED_DRIVE_STEPS):
-        if not len(alive):
-            break
-        e, tau = robot.slots(values[alive])
-        joints = joints_from_readings(q[alive], tau, robot.slots.frequency)
-        previous = select_rows(state, (t * n, 1), alive, zero[alive])
-        current = engine.solve(robot.program, e, joints, previous)
-        state = replace_rows(state, alive, zero[alive], current)
-        gap, step = _step_readings(robot, values[alive], q[alive], wanted[alive], current)
-        going = current.status[:, 0] == Status.CONVERGED.value
-        going &= np.abs(gap).max(axis=1) > CLOSE * robot.size
-        alive = alive[going]
-        q[alive, 0] -= step[going]
-    status = state.status.copy()
-    status[alive] = Status.NOT_CONVERGED
-    return reshape_rows(replace(state, status=status), t, n)
+    if not begin.closure_sign.any():
+        # the guess of a home that is searched for has no sign yet
+        t, n = max(len(values), len(begin.T)), begin.T.shape[1]
+        whole = map_arrays(lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])), begin)
+        begin = replace(whole, closure_sign=compute_closure_sign(robot, values, whole))
+    return solve_readings(
+        robot,
+        values,
+        target,
+        begin,
+        forward_trials,
+        differentiate_pose,
+        partial(_solve_as_commanded, robot),
+    )
 
 
 def _solve_as_commanded(
-    robot: Mechanism, values: FloatArray, wanted: FloatArray, begin: State
+    robot: Mechanism, values: FloatArray, target: FloatArray, start: State
 ) -> State:
-    """Return states (rows, 1) with every joint free and the platform as commanded.
+    """Return states with every joint free and the platform as commanded; all are (1, R) or (R, 1).
 
-    Coordinates that are not controlled are those of home.
+    Coordinates that are not controlled are those of the start.
     """
     e, _ = robot.slots(values)
     names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
-    T = pose_from_coordinates(wanted, robot.controlled, robot.home)
+    T = pose_from_coordinates(target, robot.controlled, start.T.reshape(-1, 4, 4))
     whole = read_coordinates(T, names)
 
     def command(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         return compare_coordinates(current, whole[rows], names, robot.size)
 
-    guess, start = driven_values(robot.program, begin), replace(begin, T=T[:, None])
-    return engine.solve(robot.program, e, guess, start, command, free=True)
-
-
-def _step_readings(
-    robot: Mechanism, values: FloatArray, q: FloatArray, wanted: FloatArray, state: State
-) -> tuple[FloatArray, FloatArray]:
-    """Return the distance from the target (rows, c) [m] and the Newton step of readings."""
-    gap, columns = compare_coordinates(state.T[:, 0], wanted, robot.controlled, robot.size)
-    D = differentiate_pose(robot, values, q, state).readings[:, 0]
-    slope = np.nan_to_num(np.matmul(columns, D))
-    return gap, np.matmul(np.linalg.pinv(slope), gap[..., None])[..., 0]
+    begin = replace(start, T=T.reshape(start.T.shape))
+    return engine.solve(
+        robot.program, e, driven_values(robot.program, begin), begin, command, free=True
+    )

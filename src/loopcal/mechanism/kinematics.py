@@ -34,7 +34,7 @@ from loopcal.mechanism.sensitivity import (
     stack_platform_rows,
 )
 from loopcal.mechanism.solution_modes import reach_coordinates, solve_in_mode
-from loopcal.mechanism.states import Status, is_closed, select_poses
+from loopcal.mechanism.states import Status, is_closed, replace_rows, select_poses, select_rows
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
@@ -283,16 +283,20 @@ def find_nearest_reachable(
     state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
     if _controls_all(robot) or not state.T.size:
         return state
+    alive = is_closed(state.status)
     for _ in range(PROJECTION_STEPS):
         gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))
-        slope = differentiate_by_coordinates(robot, values, state)
+        slope = np.nan_to_num(differentiate_by_coordinates(robot, values, state))  # of open rows
         inverse_slope = np.linalg.pinv(slope * robot.twist_scale[:, None])
-        step = np.matmul(inverse_slope, (-gap * robot.twist_scale)[..., None])[..., 0]
-        step = np.where(np.isfinite(step), step, 0.0)
+        step = np.nan_to_num(inverse_slope @ (-gap * robot.twist_scale)[..., None])[..., 0]
         moved = geometry.apply_twist(state.T, np.matmul(slope, step[..., None])[..., 0])
         target = read_coordinates(moved, robot.controlled)
-        state = close_at_coordinates(robot, values, target, state)
-        if np.abs(step).max(initial=0.0) < 1e-12 * robot.size:
+        target[~alive] = np.nan
+        new = close_at_coordinates(robot, values, target, state)
+        alive &= is_closed(new.status)
+        rows = np.nonzero(alive)
+        state = replace_rows(state, *rows, select_rows(new, alive.shape, *rows))
+        if np.abs(step[alive]).max(initial=0.0) < 1e-12 * robot.size:
             break
     return state
 

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse kinematics of chains: Newton's method on the readings, c(T(q)) = c*.
+"""Inverse kinematics by the forward one: Newton's method on the readings, c(T(q)) = c*.
 
-Each step solves C D dq = c* - c with the derivative C of the coordinates by the platform's twist
-and D of the twist by the readings. Steps are limited and shortened until the distance from the
-target decreases. Readings of stages that do not carry the end platform stay as they are. det(C D)
-changes its sign where the chain passes a position in which its joints cannot move the platform in
-some direction, such as a stretched arm: a solution with another sign than the start is in another
-working mode. Rows that fail, or arrive in another mode, are solved again along the straight path of
-poses from the start. Derivation: docs/theory/stages.md.
+Chains have no other way, nor do machines in which one actuator drives joints of several limbs, such
+as a carriage with two rods or the cranks of a parallelogram: if each joint were free, they would
+part. Each step solves C D dq = c* - c with the derivative C of the coordinates by the platform's
+twist and D of the twist by the readings. Steps are limited and shortened until the distance from
+the target decreases. Readings of stages that do not carry the end platform stay as they are.
+det(C D) changes its sign where the machine passes a position in which its actuators cannot move the
+platform in some direction, such as a stretched arm: a solution with another sign than the start is
+in another working mode. Rows that fail, or arrive in another mode, are solved again along the
+straight path of poses from the start. Derivation: docs/theory/stages.md, docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from loopcal.mechanism.platform_coordinates import (
     pose_from_coordinates,
     read_coordinates,
 )
-from loopcal.mechanism.stages.chain_kinematics import PoseDerivative, differentiate_end
+from loopcal.mechanism.stages.chain_kinematics import PoseDerivative
 from loopcal.mechanism.stages.chain_state import find_carrying_actuators
 from loopcal.mechanism.states import Status, driven_values
 from loopcal.mechanism.transmission import joint_slopes, readings_from_joints
@@ -51,7 +53,7 @@ PATH_STEPS = 8
 
 
 class ForwardSolver(Protocol):
-    """Solves forward kinematics of a chain, as `forward_trials` does."""
+    """Solves forward kinematics, as `forward_trials` does."""
 
     def __call__(
         self,
@@ -62,6 +64,14 @@ class ForwardSolver(Protocol):
         follow: bool = True,
     ) -> State:
         """Return the state (t, n) at readings q (t | 1, n, a) and values (t | 1, p)."""
+        ...
+
+
+class Proposal(Protocol):
+    """Proposes states near targets, whose readings are only almost right."""
+
+    def __call__(self, values: FloatArray, target: FloatArray, start: State) -> State:
+        """Return states for targets (R, c); all three are (1, R) or (R, 1), like the start."""
         ...
 
 
@@ -82,7 +92,7 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _Rows:
-    """R rows of a chain: the parameter values of each, and their targets.
+    """R rows of a robot: the parameter values of each, and their targets.
 
     values : (1, p) of all rows, or (R, p). target : (R, c) controlled coordinates.
     """
@@ -130,7 +140,7 @@ class _Rows:
         state = self.solve(robot, self.values, shown, begin, follow=False)
         ok = (state.status == CONVERGED).ravel()
         none = ParameterUnits(robot.slots, np.zeros(0, np.int64), np.zeros(0))
-        D = differentiate_end(robot, self.values, shown, state, self.differentiate, none).readings
+        D = self.differentiate(robot, self.values, shown, state, none).readings
         T = state.T.reshape(-1, 4, 4)
         residual, columns = compare_coordinates(T, self.target, robot.controlled, robot.size)
         moving = find_carrying_actuators(robot)
@@ -195,19 +205,20 @@ class _Rows:
         return replace(done, state=state)
 
 
-def inverse_stages(
+def solve_readings(
     robot: Mechanism,
     values: FloatArray,
     target: FloatArray,
     begin: State,
     solve: ForwardSolver,
     differentiate: PoseDerivative,
+    propose: Proposal | None = None,
 ) -> State:
-    """Return states (t, n) of a chain at controlled coordinates (t | 1, n, c); marks rows that
-    fail.
+    """Return states (t, n) at controlled coordinates (t | 1, n, c); marks rows that fail.
 
     Rows are independent of each other. `solve` and `differentiate` are the forward kinematics and
-    the derivatives of any robot.
+    the derivatives of any robot. With `propose`, rows begin at the states that it returns, if these
+    converged.
     """
     t, n = max(len(values), len(target)), target.shape[1]
     if not n:
@@ -222,15 +233,17 @@ def inverse_stages(
     _, tau = robot.slots(own)
     joints = driven_values(robot.program, first)
     q = readings_from_joints(joints, tau, robot.slots.frequency).reshape(t * n, -1)
-    found = rows.iterate(q, first)
     start = rows.evaluate(q, first)
+    found = rows.iterate(*_begin_near_targets(rows, q, first, propose))
     wrong = np.flatnonzero(_is_wrong(found, start.sign) & np.isfinite(wanted).all(axis=1))
     if len(wrong):
         again = _follow_path(rows.select(wrong), rows.take(start, wrong))
         found = rows.put(found, wrong, again)
     status = found.state.status.ravel()
     status = np.where(
-        (status == CONVERGED) & (found.sign != start.sign), np.int8(Status.OTHER_MODE), status
+        (status == CONVERGED) & _is_in_other_mode(found, start.sign),
+        np.int8(Status.OTHER_MODE),
+        status,
     )
     status = np.where(np.isfinite(wanted).all(axis=1), status, np.int8(NOT_FINITE))
     T = found.state.T.reshape(-1, 4, 4)
@@ -243,9 +256,36 @@ def inverse_stages(
     return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
 
 
+def _begin_near_targets(
+    rows: _Rows, q: FloatArray, first: State, propose: Proposal | None
+) -> tuple[FloatArray, State]:
+    """Return readings (R, a) and states at which rows begin: the proposed ones, or the first."""
+    if propose is None:
+        return q, first
+    robot = rows.robot
+    near = propose(rows.values, rows.target, first)
+    good = (near.status == CONVERGED).ravel()
+    _, tau = robot.slots(rows.values)
+    joints = driven_values(robot.program, near)
+    own = readings_from_joints(joints, tau, robot.slots.frequency).reshape(q.shape)
+    # the start selects the side of the singularities
+    near = replace(near, closure_sign=first.closure_sign)
+
+    def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+        chosen = good.reshape(new.shape[:2])
+        return np.where(chosen.reshape(*chosen.shape, *[1] * (new.ndim - 2)), new, old)
+
+    return np.where(good[:, None], own, q), map_arrays(choose, near, first)
+
+
 def _is_wrong(found: _Iterate, sign: FloatArray) -> BoolArray:
     """Return the rows (R,) that failed, or are in another mode than the start with this sign."""
-    return (found.state.status.ravel() != CONVERGED) | (found.sign != sign)
+    return (found.state.status.ravel() != CONVERGED) | _is_in_other_mode(found, sign)
+
+
+def _is_in_other_mode(found: _Iterate, sign: FloatArray) -> BoolArray:
+    """Return the rows (R,) whose sign is not that of the start; a start that is open has none."""
+    return (found.sign != sign) & (sign != 0.0)
 
 
 def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:

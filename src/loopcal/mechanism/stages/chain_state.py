@@ -145,6 +145,8 @@ def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
     """Return the places of the actuators that move the end platform."""
     every = np.arange(len(robot.actuators))
+    if not robot.stages:
+        return every
     stages = [robot.stages[i] for i in list_carrying_stages(robot)]
     return np.concatenate([every[stage.actuators] for stage in stages])
 
