@@ -274,6 +274,38 @@ def test_simulate_keeps_the_names_of_poses(run, tmp_path) -> None:
     assert not (tmp_path / "other.csv").exists()
 
 
+def test_simulate_skips_and_names_unreachable_poses(run, tmp_path) -> None:
+    rows = ["pose,x [mm],y [mm],z [mm]", "a,0,0,20", "far,900,0,20", "b,9,5,20", ""]
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    words = "simulate linear-delta --poses p.csv -o d.csv"
+    assert run(words)[0] == 1  # without the option the pose is refused
+    code, out, _ = run(f"{words} --skip-unreachable")
+    assert code == 0
+    assert "1 of 3 poses are outside its reach or strokes and are skipped: far" in " ".join(
+        out.split()
+    )
+    data = load_measurements(tmp_path / "d.csv", load_robot("linear-delta"))
+    assert data.labels == ("a", "b")
+    (tmp_path / "p.csv").write_text("\n".join([rows[0], rows[2], ""]))
+    code, _, err = run(f"{words} --skip-unreachable --force")
+    assert code == 1
+    assert "reaches none of 1 poses" in err
+
+
+def test_check_shows_a_robot_without_unknowns(run, tmp_path) -> None:
+    lines = list_shipped_robots()["five-bar"].read_text("utf-8").split("\n")
+    kept = [line for line in lines if "errors" not in line and "{of:" not in line]
+    bare = "\n".join(line.split(", unknown:")[0] + "}" * (", unknown:" in line) for line in kept)
+    (tmp_path / "bare.yaml").write_text(bare)
+    for words in ("check bare.yaml", "check bare.yaml --expand"):
+        code, out, _ = run(words)
+        assert code == 0
+        assert "names no unknown" in out
+    code, _, err = run("identifiability bare.yaml")
+    assert code == 1
+    assert "no free parameter" in err
+
+
 def test_simulate_draws_uniform_noise_with_the_stated_sigma(run, tmp_path) -> None:
     words = "simulate hexapod-42 --draw 200 --kind position --sigma-position 1um --seed 4"
     for name in ("normal", "uniform"):

@@ -33,7 +33,7 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
         *format_list([(f.severity.value, str(f)) for f in inspection.findings]),
         _build_actuator_table(inspection),
         *([_build_triangle_table(robot)] if any(a.is_triangle for a in robot.actuators) else []),
-        _build_parameter_table(robot),
+        *([_build_parameter_table(robot)] if len(robot.parameters) else []),
         *([_build_common_error_table(robot)] if robot.parameters.common else []),
     ]
 

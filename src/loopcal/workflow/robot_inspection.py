@@ -71,4 +71,6 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
     findings = list(robot.findings)
     if exceeded:
         findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
+    if not len(robot.parameters):
+        findings.append(report_finding("workflow.no-unknowns"))
     return RobotInspection(robot, solution.q[0], tuple(findings))

@@ -6,8 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.errors import DataError
 from loopcal.measure import (
     Instrument,
     Measurements,
@@ -17,15 +19,17 @@ from loopcal.measure import (
     simulate,
     simulate_contacts,
 )
-from loopcal.mechanism import Mechanism, resolve_poses
+from loopcal.mechanism import Mechanism, forward, inverse, resolve_poses
+from loopcal.typing import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedMeasurements:
-    """Measurements of a simulated machine, and that machine."""
+    """Measurements of a simulated machine, that machine, and names of poses that were skipped."""
 
     data: Measurements
     truth: Mechanism
+    skipped: tuple[str, ...] = ()
 
 
 def simulate_measurements(
@@ -38,6 +42,7 @@ def simulate_measurements(
     labels: Sequence[str] = (),
     places: Sequence[str] = (),
     seed: int = 1,
+    skip_unreachable: bool = False,
 ) -> SimulatedMeasurements:
     """Command a robot to poses by its nominal geometry, and measure where the true machine goes.
 
@@ -50,20 +55,45 @@ def simulate_measurements(
     labels : (n,) names of the poses, which are numbered without them.
     places : (n,) places of the poses such as `poses.csv:12`, for messages.
     seed : of poses, errors and noise.
+    skip_unreachable : leave out poses outside the reach or the strokes of the nominal or the true
+        machine, and name them in the result. Poses without names keep their numbers.
 
     Raises
     ------
     MechanismError, DataError : the robot states no workspace, or a pose is outside its reach or
-        strokes.
+        strokes, with `skip_unreachable` every pose.
     """
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     targets = resolve_poses(truth.nominal, poses, seed)
+    skipped: tuple[str, ...] = ()
+    if skip_unreachable:
+        is_kept = find_reachable_poses(truth, targets)
+        numbers = labels or tuple(str(i + 1) for i in range(len(targets)))
+        skipped = tuple(name for name, keep in zip(numbers, is_kept, strict=True) if not keep)
+        if len(skipped) == len(targets):
+            raise DataError(
+                f"{robot.name} reaches none of {len(targets)} poses; correct the poses or the "
+                "strokes in the robot file"
+            )
+        if skipped:
+            targets, kept = targets[is_kept], np.flatnonzero(is_kept).tolist()
+            labels, places = [numbers[i] for i in kept], [places[i] for i in kept if places]
     names = (labels, places)
     data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma, pose_names=names)
     if labels:
         data = replace(data, labels=tuple(labels))
     check_strokes(data, truth, places=dict(enumerate(places)))
-    return SimulatedMeasurements(data, truth)
+    return SimulatedMeasurements(data, truth, skipped)
+
+
+def find_reachable_poses(truth: Mechanism, targets: FloatArray) -> BoolArray:
+    """Return which coordinates (n, c) nominal and true machine reach, inside the strokes (n,)."""
+    commanded = inverse(truth.nominal, targets)
+    reached = forward(truth, commanded.q, commanded).converged
+    strokes = [a.stroke or (-np.inf, np.inf) for a in truth.actuators]
+    low, high = np.transpose(strokes)
+    inside = ((low <= commanded.q) & (commanded.q <= high)).all(axis=1)
+    return commanded.converged & reached & inside
 
 
 def fill_in_measurements(

@@ -290,10 +290,6 @@ INVALID_RECORDS = {
         change_limb(to="elbow"),
         "limb 'rod' ends on 'elbow': loopcal has no limbs that branch",
     ),
-    "nothing unknown": (
-        replace(SLIDER, limbs=(replace(SLIDER.limbs[0], errors=()),), actuators={}),
-        "names no unknown",
-    ),
     "idle drive": (
         replace(SLIDER, actuators={**SLIDER.actuators, "z": LengthDrive("length")}),
         "'z' drives no joint",

@@ -240,6 +240,7 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
     "--draw-errors",
     help="Draw the errors of the true machine from the tolerances of the robot file.",
 )
+@flag_option("--skip-unreachable", help="Leave out poses that the machine does not reach.")
 @file_option("--truth", help="Also write the true machine, as a robot file.")
 @seed_option("poses, errors and noise")
 @force_option("an output file")
@@ -252,6 +253,7 @@ def simulate(
     output: Path,
     sigma_reading: str | None,
     draw_errors: bool,
+    skip_unreachable: bool,
     truth: Path | None,
     seed: int,
     force: bool,
@@ -290,6 +292,7 @@ def simulate(
             draw_errors=draw_errors,
             reading_sigma=parse_reading_sigma(sigma_reading, machine),
             seed=seed,
+            skip_unreachable=skip_unreachable,
         )
         drawn = _name_drawn_poses(machine, draw, seed)
         source = drawn if poses is None else f"{poses.name}, seed {seed}"
@@ -300,11 +303,18 @@ def simulate(
             save_robot(result.truth, truth)
     counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
     if as_json:
-        terminal.print_json({"output": output, "truth": truth, **counts})
+        terminal.print_json({"output": output, "truth": truth, **counts, "skipped": result.skipped})
         return
     n_poses, n_rows = counts["n_poses"], counts["n_rows"]
     summary = f"{n_poses} poses of {machine.name}, {n_rows} measured values, seed {seed}"
-    terminal.print_page([f"{output}: {summary}"])
+    page = [f"{output}: {summary}"]
+    if result.skipped:
+        count, names = len(result.skipped), ", ".join(result.skipped)
+        page.append(
+            f"{count} of {count + n_poses} poses are outside its reach or strokes and are skipped: "
+            f"{names}"
+        )
+    terminal.print_page(page)
 
 
 def _fill_in(

@@ -120,7 +120,7 @@ class Limbs(LimbsFile, RobotRecord):
         )
         if self.error_model == "complete":
             errors = self._complete(copies, drives).without_effects_of(errors) + errors
-        self._check(errors, tuple(drives))
+        self._check(tuple(drives))
         return self.assemble(
             (member.placed.limb for member in copies),
             (build_actuator(name, drive) for name, drive in drives.items()),
@@ -129,7 +129,7 @@ class Limbs(LimbsFile, RobotRecord):
             controlled=self.controlled,
         )
 
-    def _check(self, errors: ErrorModel, drives: tuple[str, ...]) -> None:
+    def _check(self, drives: tuple[str, ...]) -> None:
         idle = [
             name
             for name in self.actuators
@@ -139,11 +139,6 @@ class Limbs(LimbsFile, RobotRecord):
             raise MechanismError(
                 f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or "
                 "leave it out" + (f"; joints are driven by {', '.join(drives)}" if drives else "")
-            )
-        if not errors.parameters:
-            raise MechanismError(
-                f"{self.name} names no unknown; give a limb 'errors:', a drive 'unknown:', or "
-                "state error_model: complete"
             )
 
     def _drives(self, member: _Member) -> Iterator[tuple[str, PlacedDrive]]:

@@ -192,11 +192,6 @@ class PlacedStages(Stages):
             workspace=dict(self.workspace.ranges),
             source=self.source,
         )
-        if not assembly.parameters:
-            raise MechanismError(
-                f"{self.name} names no unknown; give a joint 'errors:', or a stage unknowns of its "
-                "family"
-            )
         return assembly
 
     def _expand_stage(self, i: int) -> Assembly:
