@@ -115,7 +115,7 @@ def bench_stacked_fits() -> list[Metric]:
 def bench_chord_fits() -> list[Metric]:
     """The same fits as in studies: the first step of all by one factor."""
     robot = load_robot("hexapod-42")
-    trials = _simulate(TRIALS)
+    trials = simulate_hexapods(TRIALS)
     rows = np.random.default_rng(0).normal(size=(TRIALS, 300, 43))
     fit = partial(identify_trials, robot, trials, LeastSquares(), chord_start=True)
     return _of_each("chord_fits", lambda: (fit, lambda: np.linalg.qr(rows, mode="r")), 3)
@@ -125,7 +125,7 @@ def bench_threads() -> list[Metric]:
     """How many times as fast two threads are as one, in wall time: 10 000 fits of studies. It needs
     two idle processors.
     """
-    robot, trials = load_robot("hexapod-42"), _simulate(MANY)
+    robot, trials = load_robot("hexapod-42"), simulate_hexapods(MANY)
     fit = partial(identify_trials, robot, trials, LeastSquares(), chord_start=True)
     metrics = []
     for engine in ENGINES:
@@ -137,7 +137,7 @@ def bench_threads() -> list[Metric]:
     return metrics
 
 
-def _simulate(count: int) -> Trials:
+def simulate_hexapods(count: int) -> Trials:
     """Return measurements of 50 poses of so many hexapods."""
     robot = load_robot("hexapod-42")
     truth = sample_truth(robot, count, 0)

@@ -109,7 +109,10 @@ def _list_noise(kind: Kind, measured: FloatArray) -> tuple[FloatArray, BoolArray
 
 def _is_equal(noise: tuple[FloatArray, BoolArray], first: tuple[FloatArray, BoolArray]) -> bool:
     """Return whether all trials have the noise of the first one."""
-    return all(bool((a == b).all()) for a, b in zip(noise, first, strict=True))
+    return all(
+        np.array_equal(a[:1], b) and (not a.strides[0] or bool((a == b).all()))
+        for a, b in zip(noise, first, strict=True)
+    )
 
 
 def make_problem(

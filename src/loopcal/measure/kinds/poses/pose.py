@@ -137,7 +137,10 @@ class Pose(ToolKind):
         R_measured = measured[..., :9].reshape(*measured.shape[:-1], 3, 3)
         rotation = geometry.log_so3(tool[..., :3, :3] @ np.swapaxes(R_measured, -1, -2))
         residual = np.concatenate([rotation, tool[..., :3, 3] - measured[..., -3:]], axis=-1)
-        by_rotation = geometry.left_jacobian_inverse_so3(rotation) @ rows[..., :3, :]
+        inverse = geometry.left_jacobian_inverse_so3(rotation)
+        if self.measures_platform:
+            return Evaluation(residual, setup.stack_diagonally(inverse, np.eye(3)))
+        by_rotation = inverse @ rows[..., :3, :]
         return self.split_columns(
             residual, np.concatenate([by_rotation, rows[..., 3:, :]], axis=-2)
         )
@@ -180,6 +183,8 @@ class Pose(ToolKind):
         """Return the matrix (..., 6, 6): E of the angles (or the identity, see the class) for the
         rotation, the identity for x y z.
         """
+        if not self.form.angles:
+            return np.broadcast_to(np.eye(6), (*measured.shape[:-1], 6, 6))
         rates = self.form.rates(self._fill_orientation(measured))
         rates = np.where(_is_singular(rates), np.eye(3), rates)
         return setup.stack_diagonally(rates, np.eye(3))

@@ -77,6 +77,8 @@ class ToolKind(Kind):
         """Return T_frame_tool (.., 4, 4) at platform poses T (.., 4, 4), and the derivative
         (.., 6, 6 + u) of its twist, in axes of the frame, by the platform twist and the values.
         """
+        if self.measures_platform:
+            return T, np.broadcast_to(np.eye(6), (*T.shape[:-2], 6, 6))
         of_frame, of_tool = (self.item_values(values, name) for name in ("frame", "tool"))
         frame = setup.place_frame(self.T_base_frame, of_frame)
         tool = setup.place_frame(self.stated_tool, of_tool)
@@ -93,6 +95,12 @@ class ToolKind(Kind):
             by_twist = geometry.transport_matrix(np.zeros(3), Q @ R)
             blocks["tool"] = by_twist @ setup.linearize_frame(of_tool)
         return inverse @ (T @ tool), self.join_columns(blocks, (*T.shape[:-2], 6))
+
+    @cached_property
+    def measures_platform(self) -> bool:
+        """Whether the tool and the frame are those of platform and base, and known to be."""
+        same = all(np.array_equal(a, np.eye(4)) for a in (self.T_base_frame, self.stated_tool))
+        return same and not self.own_items
 
     @cached_property
     def _stated_inverse(self) -> FloatArray:
