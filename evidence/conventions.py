@@ -75,8 +75,9 @@ def list_cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
             kind
             for cls in KINDS.values()
             for kind in (cls.examples()[:1] + cls.examples()[1:][-1:])
+            if kind.columns
         ]
-        first = [cls.examples()[0] for cls in KINDS.values()]
+        first = [cls.examples()[0] for cls in KINDS.values() if cls.examples()[0].columns]
         if robot.assembly.workspace:
             yield from (
                 (robot, k)

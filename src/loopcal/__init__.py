@@ -98,6 +98,7 @@ if TYPE_CHECKING:
     from loopcal.measure import KINDS as KINDS
     from loopcal.measure import Autocollimation as Autocollimation
     from loopcal.measure import Bearing as Bearing
+    from loopcal.measure import Closure as Closure
     from loopcal.measure import Component as Component
     from loopcal.measure import Direction as Direction
     from loopcal.measure import Distance as Distance
@@ -198,10 +199,10 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
             save_robot save_run
         """,
         "loopcal.measure": """
-            Autocollimation Bearing Component Direction Distance Gaussian Inclination Instrument
-            InstrumentRecord JointSensor KINDS Line Locked Measurements Observations Plane Pose
-            Position Sensor Separation Sphere StatedValue Trials Uniform sample_truth simulate
-            simulate_trials
+            Autocollimation Bearing Closure Component Direction Distance Gaussian Inclination
+            Instrument InstrumentRecord JointSensor KINDS Line Locked Measurements Observations
+            Plane Pose Position Sensor Separation Sphere StatedValue Trials Uniform sample_truth
+            simulate simulate_trials
         """,
         "loopcal.mechanism": """
             Jacobian Mechanism Solution Status find_assembly_modes find_working_modes forward

@@ -529,7 +529,7 @@ def test_every_interpretation_changes_the_values_and_keeps_their_shape() -> None
                     rows.measured, data.observations[0].measured, rtol=1e-12, atol=0.0
                 )
             seen.add(kind.name)
-    assert seen == set(KINDS)
+    assert seen == set(KINDS) - {"closure"}, "a hexapod has no redundant readings"
     data, robot = simulate_data("linear-delta", Position(), n=5), load_cached_robot("linear-delta")
     ways = [
         (way.slip, *way.details.items())

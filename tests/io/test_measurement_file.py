@@ -22,7 +22,7 @@ from loopcal.measure import (
 )
 from loopcal.mechanism import inverse
 
-EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples()]
+EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples() if kind.columns]
 IDS = [f"{kind.name}-{i}" for i, kind in enumerate(EXAMPLES)]
 
 

@@ -19,6 +19,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.information import ObservedPoses, observe_poses
+from loopcal.estimate.poses.states import spread_states
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import (
@@ -28,6 +29,7 @@ from loopcal.mechanism import (
     differentiate_pose,
     find_directly_reachable,
     forward_trials,
+    solve_at_pose,
 )
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -89,17 +91,19 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
         return FrameMotions(null, (), 0, np.zeros((12, 0)))
     twists = D[usable][:, :, posterior.places] * posterior.unit
     motions, base, platform = _weigh_motions(robot, state.T[0, usable], twists)
-    limit = NO_MOTION * float(np.linalg.norm(motions))
+    every = float(np.linalg.norm(motions))
     moved = motions @ null
     _, s, vt = np.linalg.svd(_without_span([base, platform], moved), full_matrices=False)
-    gauge = vt[s <= limit].T
+    # directions are those of the last linearization, motions those after the last step of the fit
+    gauge = vt[s <= SAME_MOTION * every].T
     moving = moved @ gauge
     _, s, combine = np.linalg.svd(moving, full_matrices=False)
-    moving = moving @ combine[s > limit].T
+    moving = moving @ combine[s > NO_MOTION * every].T
     count = moving.shape[1]
     frames: tuple[str, ...] = ("base", "platform") if count else ()
     for name, frame in (("base", base), ("platform", platform)):
-        if len(frames) == 2 and np.linalg.norm(_without_span([frame], moving)) <= limit:
+        rest = float(np.linalg.norm(_without_span([frame], moving)))
+        if len(frames) == 2 and rest <= SAME_MOTION * every:
             frames = (name,)  # only one where it suffices
     infinite = np.isinf(posterior.variance[~posterior.determined])
     kept = null @ _gauge_projector(gauge, infinite)
@@ -178,6 +182,8 @@ def probe_readings(robot: Mechanism) -> FloatArray:
     The range shrinks until half of them are reached. Those that Newton's method does not reach from
     home are left out: following a path to each of them would take longer than all the rest.
     """
+    if robot.program.sigma is not None:
+        return _probe_redundant(robot)
     home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     spread = [
         SPREAD_LENGTH * robot.size if a.dimension is Dimension.LENGTH else SPREAD_ANGLE
@@ -191,6 +197,24 @@ def probe_readings(robot: Mechanism) -> FloatArray:
         if reached.mean() >= 0.5:
             break
     return readings[reached]
+
+
+def _probe_redundant(robot: Mechanism) -> FloatArray:
+    """Return readings (n, a) of redundant actuators at poses about home.
+
+    Drawn readings would contradict each other, and those of home do so where the values are not
+    those that home was computed with.
+    """
+    scale = np.array([SPREAD_ANGLE] * 3 + [SPREAD_LENGTH * robot.size] * 3)
+    twists = np.zeros((1, PROBES, 6))
+    places = list(robot.program.freedoms)
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (PROBES, len(places)))
+    twists[0][:, places] = drawn * scale[places]
+    T = geometry.apply_twist(robot.home_state.T[0, 0], twists)
+    begin = spread_states(robot.home_state, 1, PROBES)
+    state, readings = solve_at_pose(robot, robot.values[None], T, begin)
+    readings = readings[0][(state.status[0] == Status.CONVERGED)]
+    return readings[find_directly_reachable(robot, robot.values[None], readings[None])[0]]
 
 
 def _weigh_motions(

@@ -27,6 +27,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import list_names
 from loopcal.measure import (
     KINDS,
+    Closure,
     Component,
     Gaussian,
     JointSensor,
@@ -209,7 +210,9 @@ def _list_candidates(robot: Mechanism, joints: list[tuple[str, str]]) -> Iterato
     coordinates, other kinds, joints.
     """
     # examples of Component and JointSensor belong to one robot; both are made for this one
-    known = [kind for kind in KINDS.values() if not issubclass(kind, (Component, JointSensor))]
+    known = [
+        kind for kind in KINDS.values() if not issubclass(kind, (Closure, Component, JointSensor))
+    ]
     yield from _list_examples([kind for kind in known if kind.poses_per_row > 1])
     for names in SINGLE:
         yield " and ".join(names), Component(names, None if names[0] in "xyz" else TILT)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 from loopcal.lazy_names import import_lazily
 
 if TYPE_CHECKING:
+    from loopcal.measure.closure_checks import check_closure as check_closure
+    from loopcal.measure.closure_checks import check_redundancy as check_redundancy
     from loopcal.measure.contact_simulation import simulate_contacts as simulate_contacts
     from loopcal.measure.data_checks import check_actuators as check_actuators
     from loopcal.measure.data_checks import check_duplicates as check_duplicates
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from loopcal.measure.kinds import ActuatorReadings as ActuatorReadings
     from loopcal.measure.kinds import Autocollimation as Autocollimation
     from loopcal.measure.kinds import Bearing as Bearing
+    from loopcal.measure.kinds import Closure as Closure
     from loopcal.measure.kinds import Column as Column
     from loopcal.measure.kinds import Component as Component
     from loopcal.measure.kinds import Direction as Direction
@@ -76,6 +79,7 @@ else:
     __getattr__ = import_lazily(
         __name__,
         {
+            "loopcal.measure.closure_checks": "check_closure check_redundancy",
             "loopcal.measure.contact_simulation": "simulate_contacts",
             "loopcal.measure.data_checks": """
                 check_actuators check_duplicates check_strokes check_targets_move
@@ -89,7 +93,7 @@ else:
                 BlockStream Gaussian Instrument Noise Seed Sensor Uniform make_random_stream
             """,
             "loopcal.measure.kinds": """
-                KINDS ActuatorReadings Autocollimation Bearing Column Component Direction
+                KINDS ActuatorReadings Autocollimation Bearing Closure Column Component Direction
                 Distance Evaluation Inclination JointSensor Kind Line Locked Plane Pose
                 Position Separation Sphere
             """,

@@ -14,6 +14,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.findings import Quantity, report_finding
+from loopcal.measure.closure_checks import check_closure
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, TextArray
@@ -40,25 +41,26 @@ count as constant by design. End stops that are wrong by millimeters tilt the be
 
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
-    """Refuse readings that do not have one column for each actuator.
+    """Refuse readings without a column for each actuator, and readings alone without information.
 
     Raises
     ------
     DataError
-        `data.wrong-actuator-count`.
+        `data.wrong-actuator-count`, or those of `check_closure`.
     """
     columns = measurements.readings.shape[1]
-    names = [actuator.name for actuator in robot.actuators]
-    if columns != len(names):
+    if columns != len(robot.actuators):
         raise DataError(
             report_finding(
                 "data.wrong-actuator-count",
                 columns=columns,
                 robot=robot.name,
-                actuators_count=len(names),
-                actuators=tuple(names),
+                actuators_count=len(robot.actuators),
+                actuators=tuple(actuator.name for actuator in robot.actuators),
             )
         )
+    kinds = [rows.kind for rows in measurements.observations]
+    check_closure(robot, kinds, measurements.reading_sigma, measurements.n_poses)
 
 
 def find_outside_strokes(readings: FloatArray, robot: Mechanism) -> FloatArray:
@@ -170,7 +172,7 @@ def check_duplicates(
         if not len(poses):
             continue
         measured = np.concatenate([rows.measured for rows in alike])
-        is_empty = ~np.concatenate([rows.present.any(axis=1) for rows in alike])
+        is_empty = ~np.concatenate([rows.is_measured for rows in alike])
         own = np.where(is_empty, np.arange(1, len(poses) + 1), 0)[:, None]  # equal to no other row
         content = np.concatenate(
             [measurements.readings[poses].reshape(len(poses), -1), measured, own], axis=1

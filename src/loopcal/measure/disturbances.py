@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from loopcal.engine import State
-from loopcal.mechanism import Mechanism, forward_trials, solve_at_pose
+from loopcal.mechanism import Mechanism, Status, forward_trials, solve_at_pose
 from loopcal.numerics.trial_batch import map_arrays
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +68,22 @@ def reach_poses(
         start = _reshape_state(start, shape, (-1, 1))
     state = forward_trials(robot, values, true, start)
     # Redundant actuators of a wrong geometry contradict each other: their true readings are those
-    # of the reached pose.
+    # of the reached pose. Where they contradict each other so widely that they lead to none, the
+    # machine is moved to the commanded pose, with all but the needed actuators following it.
     if robot.program.sigma is not None:
-        closed = solve_at_pose(robot, values, state.T, state)[1]
+        lost = (state.status != Status.CONVERGED)[..., None, None]
+        begin = replace(state, T=np.where(lost, start.T, state.T))
+        placed, closed = solve_at_pose(robot, values, begin.T, begin)
+        state = map_arrays(partial(_select_lost, lost[..., 0, 0]), placed, state)
         true = np.where(np.isfinite(closed), closed, true)
     if disturbance.values is not None:
         true, state = true.reshape(*shape, -1), _reshape_state(state, (len(values), 1), shape)
     return true, state
+
+
+def _select_lost(lost: BoolArray, placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Return the arrays of poses (t, n, ..), those of lost ones (t, n) as they are placed."""
+    return np.where(lost.reshape(*lost.shape, *[1] * (reached.ndim - 2)), placed, reached)
 
 
 def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]) -> State:

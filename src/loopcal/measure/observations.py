@@ -204,6 +204,11 @@ class Observations:
         return int(np.count_nonzero(self.present & (self.weight > 0.0)[:, None]))
 
     @property
+    def is_measured(self) -> BoolArray:
+        """(r,) rows of which a component is present, or whose kind has none (`closure`)."""
+        return self.present.any(axis=1) | (self.present.shape[1] == 0)
+
+    @property
     def drift_part(self) -> FloatArray:
         """(r,) the part of its session's drift that each row takes. Some rows of a session, such as
         held-out ones, keep the parts that they have among all rows.

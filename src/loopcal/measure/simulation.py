@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
+from loopcal.measure.closure_checks import check_closure, check_redundancy
 from loopcal.measure.disturbances import NO_DISTURBANCE, Disturbance, reach_poses
 from loopcal.measure.instrument import Distribution, Instrument, Seed, Sensor, make_random_stream
 from loopcal.measure.measurements import Measurements
@@ -181,15 +182,20 @@ def simulate_trials(
     Raises
     ------
     DataError
-        If the controller cannot reach a pose, a setup parameter does not exist, or `truth` has
-        another shape.
+        If the controller cannot reach a pose, a setup parameter does not exist, `truth` has another
+        shape; or the kind `closure` is asked of a robot without redundant actuators or of exact
+        readings.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
     check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
+    kinds = [sensor.kind for sensor in instrument.sensors]
+    check_redundancy(robot, kinds)
     values = _check_truth(robot, truth)
     geometry = robot.nominal if controller is None else controller
     commanded = solve_commanded_poses(geometry, poses, *pose_names)
     readings, n = commanded.q, len(commanded.q)
+    given = None if reading_sigma is None else broadcast_reading_sigma(reading_sigma, readings)
+    check_closure(robot, kinds, given, n)
     assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))
     labels = tuple(str(i + 1) for i in range(n))
     nuisance = collect_nuisance_parameters(assigned.sensors, labels)
@@ -269,7 +275,8 @@ def simulate(
 def replace_measured_values(
     robot: Mechanism, data: Measurements, instrument: Instrument, seed: int
 ) -> Measurements:
-    """Return measurements with simulated values in place of theirs, at their readings.
+    """Return measurements with simulated values in place of theirs, at their readings; those of
+    redundant actuators are simulated, too.
 
     Parameters
     ----------
@@ -299,8 +306,13 @@ def replace_measured_values(
         replace(sensor, rows=rows.rows, session=rows.session, group=rows.group)
         for sensor, rows in zip(instrument.sensors, data.observations, strict=True)
     )
-    measured = simulate(robot, nominal.T, Instrument(sensors), seed, controller=robot.nominal)
-    return replace(data, observations=measured.observations)
+    how = {"controller": robot.nominal, "reading_sigma": data.reading_sigma}
+    measured = simulate(robot, nominal.T, Instrument(sensors), seed, **how)
+    filled = replace(data, observations=measured.observations)
+    if robot.program.sigma is None:
+        return filled
+    # redundant actuators of the true machine cannot all have the readings of the controller
+    return replace(filled, readings=measured.readings, reading_sigma=measured.reading_sigma)
 
 
 def _check_truth(robot: Mechanism, truth: ArrayLike) -> FloatArray:

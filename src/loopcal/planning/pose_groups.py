@@ -40,6 +40,11 @@ from loopcal.measure import (
 from loopcal.numerics.column_elimination import eliminate_from_factor
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.planning.design import PriorInformation, divide_by_factor, factor_rows, is_allowed
+from loopcal.planning.redundant_rows import (
+    add_redundant_readings,
+    eliminate_freedoms,
+    observe_groups,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BLOCK = 256
@@ -213,11 +218,16 @@ def _linearize_block(
     by_frames: bool,
 ) -> FloatArray:
     """Return the rows (b, r, o + p) of some groups."""
-    poses, places = np.unique(members, return_inverse=True)
-    places = places.reshape(members.shape)
-    observed = observe_poses(
-        free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors)
-    )
+    joints = list_sensed_joints(sensor.kind for sensor in mounted.sensors)
+    size = members.shape[1]
+    redundant = None if by_frames else add_redundant_readings(mounted, free.robot)
+    if redundant is None:
+        poses, places = np.unique(members, return_inverse=True)
+        places = places.reshape(members.shape)
+        observed = observe_poses(free, readings[poses], joints)
+    else:
+        mounted, places = redundant, np.arange(members.size).reshape(members.shape)
+        observed = observe_groups(free, readings[members.ravel()], joints, size)
     nuisance = _list_nuisance(mounted, places)
     observations, unusable = [], np.zeros(len(members), dtype=bool)
     for i, (sensor, rows) in enumerate(_assign_poses(mounted, places)):
@@ -241,10 +251,14 @@ def _linearize_block(
     counts = [len(part) * len(part.kind.noise_columns) for part in observations]
     pieces = np.split(whitened, np.cumsum(counts)[:-1])
     rows = np.concatenate(
-        [piece.reshape(len(members), -1, whitened.shape[1]) for piece in pieces], axis=1
+        [
+            piece.reshape(len(members), len(piece) // len(members), whitened.shape[1])
+            for piece in pieces
+        ],
+        axis=1,
     )
     rows[unusable | ~observed.is_reached[places].all(axis=1)] = np.nan
-    return rows
+    return rows if redundant is None else eliminate_freedoms(rows, size * len(free.robot.freedoms))
 
 
 def count_poses_per_group(instrument: Instrument) -> int:

@@ -17,7 +17,7 @@ from loopcal.estimate.inference.measured_frames import intersect_motions
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.estimate.problem_construction import problem_of
 from loopcal.findings import report_finding
-from loopcal.measure import Instrument, Measurements, check_actuators
+from loopcal.measure import Instrument, Measurements, check_actuators, check_closure
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
 from loopcal.numerics.decomposition import Decomposition
@@ -225,7 +225,7 @@ def prepare_problem(
     EstimationError
         The robot has no free parameter, or the instrument determines none of them.
     MechanismError, DataError
-        See `draw_candidates`, `linearize_candidate_groups`.
+        See `draw_candidates`, `linearize_candidate_groups`, `check_closure`.
     """
     check_argument(robot, "robot", Mechanism)
     check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
@@ -235,6 +235,7 @@ def prepare_problem(
     if not len(free):
         raise EstimationError(report_finding("plan.no-free-parameter", robot=robot.name))
     _require_plain_sensors(instrument)
+    check_closure(robot, [sensor.kind for sensor in instrument.sensors], None, 1)
     rng = np.random.default_rng(options.seed)
     candidates = _list_candidates(robot, options, rng)
     mounted = instrument.with_tool(robot)
@@ -308,7 +309,7 @@ def _fold_measured(
         return None, 0, ()
     robot = free.robot
     check_actuators(measured, robot)
-    if not measured.n_rows:
+    if not any(rows.is_measured.any() for rows in measured.observations):
         raise DataError(report_finding("plan.measured-empty"))
     factor, reached = collect_information(free, measured)
     if not reached.all():

@@ -37,6 +37,7 @@ EXAMPLES = [
     pytest.param(kind, id=f"{name}-{i}")
     for name, cls in KINDS.items()
     for i, kind in enumerate(cls.examples())
+    if kind.columns
 ]
 
 

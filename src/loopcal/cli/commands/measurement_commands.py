@@ -328,6 +328,7 @@ def _fill_in(
         load_instrument,
     )
     from loopcal.io.runs.plan_folder import find_plan_sheet
+    from loopcal.measure import Closure
     from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(
@@ -337,7 +338,9 @@ def _fill_in(
     instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}
     if has_empty_readings(sheet, robot):
         planned = load_contact_sheet(sheet, find_plan_sheet(sheet), robot)
-        result = fill_in_contacts(robot, planned, instrument, **how)
+        is_closure = any(isinstance(rows.kind, Closure) for rows in planned.observations)
+        fill_in = fill_in_measurements if is_closure else fill_in_contacts
+        result = fill_in(robot, planned, instrument, **how)
     else:
         result = fill_in_measurements(robot, load_measurements(sheet, robot), instrument, **how)
     return result, f"simulated by loopcal: {sheet.name}, seed {seed}"

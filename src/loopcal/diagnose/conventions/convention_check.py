@@ -29,6 +29,7 @@ from loopcal.diagnose.conventions.judgement import BETTER, list_rms_residuals
 from loopcal.diagnose.conventions.misfit import (
     Comparison,
     compare_with_robot,
+    compute_fitted_misfit,
     compute_quick_misfit,
     exclude_far_rows,
     is_redundant,
@@ -201,6 +202,20 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     if not misfit > ALLOWED:
         return ConventionCheck(misfit, finding=_report_equals(free, known, misfit))
     thinned = _thin_out(known)
+    fitted = compute_fitted_misfit(robot, thinned) if np.isinf(misfit) else np.inf
+    if not fitted > ALLOWED:
+        return ConventionCheck(fitted)
+    has_errors = not is_redundant(free) and _has_uncertain_readings(data)
+    return _compare_interpretations(free, thinned, has_errors)
+
+
+def _compare_interpretations(
+    free: FreeParameters, thinned: Measurements, has_errors: bool
+) -> ConventionCheck:
+    """Return the check of data that the robot does not explain in one step.
+
+    `has_errors` : readings that count as exact here have errors, which may explain a misfit.
+    """
     reach = select_reached(free, thinned, follow=True)
     stated, against, misfit = None, None, np.inf
     if reach.is_enough:
@@ -219,7 +234,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
         if misfit > IMPLAUSIBLE:
             against = find_contradiction(stated, misfit, BETTER)
     description = {
-        "robot": robot.name,
+        "robot": free.robot.name,
         "misfit": misfit,
         "residuals": () if stated is None else list_rms_residuals(stated),
         "reached": reach.n_reached if stated is None else None,
@@ -233,7 +248,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
         return _refuse(description, misfit, search.selection)
     if against is not None:
         return _contradict(misfit, against)
-    if not misfit > IMPLAUSIBLE or (not is_redundant(free) and _has_uncertain_readings(data)):
+    if not misfit > IMPLAUSIBLE or has_errors:
         return ConventionCheck(misfit)
     return _report_unexplained(description, misfit, search, equations)
 

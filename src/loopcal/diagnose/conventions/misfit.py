@@ -17,8 +17,9 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.diagnose.conventions.interpretations import Interpretation
-from loopcal.errors import DataError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
@@ -26,7 +27,7 @@ from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import make_problem, problem_of
 from loopcal.measure import Measurements, NuisanceParameters
 from loopcal.measure.initial_values import guess_nuisance_values_batch
-from loopcal.mechanism import find_directly_reachable, forward, forward_trials
+from loopcal.mechanism import Mechanism, find_directly_reachable, forward, forward_trials
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
 
@@ -268,6 +269,23 @@ def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
         return float(
             compute_misfit(compute_smallest_cost(linearization.factor), linearization.equations)[0]
         )
+
+
+def compute_fitted_misfit(robot: Mechanism, data: Measurements) -> float:
+    """Return the misfit that a fit of redundant readings leaves, with tolerances as prior.
+
+    Redundant readings of a machine far from its file lead to no pose, so that nothing can be
+    compared there. The result is infinite where the fit does not converge, and for other robots.
+    """
+    if robot.program.sigma is None:
+        return np.inf
+    try:
+        fit = identify(robot, data.fitted)
+    except (DataError, EstimationError):
+        return np.inf
+    if not fit.converged or fit.residual_test.dof <= 0:
+        return np.inf
+    return float(np.sqrt(fit.residual_test.chi_square / fit.residual_test.dof))
 
 
 def _linearize(

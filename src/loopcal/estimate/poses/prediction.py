@@ -38,6 +38,8 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
     DataError
         A redundant reading is stated to be exact.
     """
+    if robot.program.sigma is not None:
+        data = fill_in_reading_sigma(robot, data)
     sigma = data.reading_sigma
     if robot.program.sigma is None or sigma is None:
         known = np.ones(data.n_poses, dtype=bool)
@@ -46,7 +48,10 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
         return forward(robot, data.readings), known
     ratio = sigma / np.array(robot.program.sigma)
     if np.isfinite(ratio).all() and np.ptp(ratio, axis=1).max() <= SAME_RATIO * ratio.min():
-        return forward(robot, data.readings), np.ones(data.n_poses, dtype=bool)
+        solution = forward(robot, data.readings)
+        if solution.converged.all():
+            return solution, np.ones(data.n_poses, dtype=bool)
+    # also readings that contradict each other by more than forward kinematics accept
     located = fit_poses(robot, data)
     return located.solution, located.is_determined
 

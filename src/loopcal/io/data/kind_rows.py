@@ -6,15 +6,16 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.text_file import name_files
-from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
+from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.data.columns import (
     SIGMA,
     list_columns,
@@ -165,7 +166,7 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     several = content.get("kinds")
     instrument = read_instrument(file, content, ())
     if several is None:
-        kind = read_kind(file, content, ()).with_tool(robot.tool)
+        kind = _read_robot_kind(file, content, robot, ())
         refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
         rows = np.arange(len(table))
         noise, is_assumed = (
@@ -189,7 +190,7 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
             raise table.row_error(row, sentence)
     for label, node in several.items():
         place = ("kinds", label)
-        kind = read_kind(file, node, place).with_tool(robot.tool)
+        kind = _read_robot_kind(file, node, robot, place)
         allowed = ["kind", *KIND_SETTINGS, *list_kind_settings(type(kind))]
         refuse_unknown_keys(file, list(node), allowed, place)
         noise, rows = read_noise(file, node, kind, place), np.flatnonzero(cells == label)
@@ -198,6 +199,20 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
         own = read_instrument(file, node, place) or instrument
         kinds.append(KindRows(kind, noise, rows, place, is_assumed, shared, own))
     return tuple(kinds)
+
+
+def _read_robot_kind(
+    file: YamlFile, node: Mapping[str, Any], robot: Mechanism, place: Location
+) -> Kind:
+    """Return a kind of the settings, mounted on the robot's tool; refuse what it cannot measure."""
+    from loopcal.measure import check_redundancy
+
+    kind = read_kind(file, node, place).with_tool(robot.tool)
+    try:
+        check_redundancy(robot, (kind,))
+    except DataError as error:
+        raise file.error(error.finding, (*place, "kind")) from None
+    return kind
 
 
 def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...]]) -> KindRows:
@@ -220,14 +235,15 @@ def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[Float
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]
     require_columns(table, names, f"which the kind {kind.name!r} measures")
-    measured = np.column_stack([known[name].parse(table) for name in names])[rows]
+    measured = _stack_columns([known[name].parse(table)[rows] for name in names], len(rows))
     for i, doubt in kind.find_invalid_rows(measured):
         raise table.row_error(int(rows[i]), f"this row {doubt}")
     absent = np.zeros((len(rows), len(kind.noise_columns)), bool)
     if kind.noise_columns == kind.columns:  # then a value that was not measured needs no sigma
         absent = np.isnan(measured)
-    sigma = np.column_stack(
-        [_read_sigma(table, robot, entry, i, absent[:, i]) for i in range(absent.shape[1])]
+    sigma = _stack_columns(
+        [_read_sigma(table, robot, entry, i, absent[:, i]) for i in range(absent.shape[1])],
+        len(rows),
     )
     covariance = sigma[:, :, None] * np.eye(sigma.shape[1]) * sigma[:, None, :]
     for i, a in enumerate(kind.noise_columns):
@@ -237,6 +253,11 @@ def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[Float
                 covariance[:, i, j] = covariance[:, j, i] = known[name].parse(table)[rows]
     N = kind.linearize_noise(measured)
     return measured, N @ covariance @ np.swapaxes(N, -1, -2)
+
+
+def _stack_columns(columns: Sequence[FloatArray], rows: int) -> FloatArray:
+    """Return (rows, c) of c columns, of which there may be none."""
+    return np.column_stack(columns) if columns else np.zeros((rows, 0))
 
 
 def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:

@@ -84,8 +84,8 @@ def load_contact_sheet(sheet: str | Path, plan: str | Path, robot: Mechanism) ->
 
     Parameters
     ----------
-    sheet : data file of a plan of planes and lines. plan : the operator's sheet beside it, with the
-        nominal reading of each pose.
+    sheet : data file of a plan of planes and lines, or of readings alone.
+    plan : the operator's sheet beside it, with the nominal reading of each pose.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def _leave_out_unfilled(read: list[FileRows]) -> list[FileRows]:
     Such a file, the sheet of a plan, only contributes readings and uses of poses that the others
     name. If no file has a measured value, all rows are kept.
     """
-    is_filled = [any(rows.n_residuals for rows, _ in of_file) for of_file in read]
+    is_filled = [any(rows.is_measured.any() for rows, _ in of_file) for of_file in read]
     if not any(is_filled):
         return read
     return [of_file if filled else [] for of_file, filled in zip(read, is_filled, strict=True)]

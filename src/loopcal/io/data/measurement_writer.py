@@ -103,9 +103,12 @@ def format_measurements(
     ----------
     states_use : write the column `use` also where no pose is held out.
     """
+    from loopcal.measure import check_redundancy
+
     require_robot(robot)
     _refuse_names(data)
     kinds = [rows.kind for rows in data.observations]
+    check_redundancy(robot, kinds)
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
     tables = [_tabulate_rows(rows, robot) for rows in data.observations]
     reading_noise, of_poses = _tabulate_poses(data, robot)

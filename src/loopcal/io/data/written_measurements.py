@@ -70,8 +70,8 @@ def _check_rows(before: Observations, after: Observations, order: IntArray) -> N
     ----------
     order : place in the file of each pose.
     """
-    kept, name = (before.weight > 0) & before.present.any(axis=1), before.kind.name
-    after = after.take(after.present.any(axis=1))
+    kept, name = (before.weight > 0) & before.is_measured, before.kind.name
+    after = after.take(after.is_measured)
     require_same(f"poses of {name}", order[before.rows[kept]].tolist(), after.rows.tolist())
     require_same_numbers(f"measured values of {name}", before.measured[kept], after.measured)
     sd = np.where(before.present, np.sqrt(np.diagonal(before.covariance, 0, 1, 2)), np.inf)[kept]

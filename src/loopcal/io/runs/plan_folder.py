@@ -91,7 +91,12 @@ def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
 
 
 def format_plan_data(plan: Plan) -> str:
-    """Return the data file to fill in; its readings have the same digits as the sheet."""
+    """Return the data file to fill in; its readings have the same digits as the sheet.
+
+    They are empty where they are what is measured.
+    """
+    from loopcal.measure import Closure
+
     sensors = tuple(
         replace(s, rows=plan.poses.groups) if s.kind.poses_per_row > 1 else s
         for s in plan.instrument.sensors
@@ -103,7 +108,9 @@ def format_plan_data(plan: Plan) -> str:
     ]
     instrument = replace(plan.instrument, sensors=sensors)
     labels = plan.poses.labels
-    return format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
+    text = format_data_sheet(plan.robot, instrument, readings, labels, plan.poses.held_out)
+    is_closure = any(isinstance(s.kind, Closure) for s in plan.instrument.sensors)
+    return _empty_readings(text, plan.robot) if is_closure else text
 
 
 def refuse_plan_folder(path: Path, force: bool, inputs: Sequence[Path] = ()) -> None:
@@ -235,12 +242,19 @@ def format_surface_data(plan: SurfacePlan) -> str:
         )
     poses = plan.poses
     data = Measurements(robot.name, poses.readings, tuple(observations), labels=poses.labels)
-    lines = format_measurements(data, robot).splitlines()
+    order = {label: i for i, label in enumerate(poses.labels)}
+    return _empty_readings(format_measurements(data, robot), robot, lambda row: order[row[0]])
+
+
+def _empty_readings(
+    text: str, robot: Mechanism, order: Callable[[Sequence[str]], int] | None = None
+) -> str:
+    """Return a measurement file with empty cells of readings, its rows sorted by `order`."""
+    lines = text.splitlines()
     first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     names = _list_columns(robot)[0][-len(robot.actuators) :]
     header, *rows = csv.reader(lines[first:])
     is_reading = [name in names for name in header]
-    order = {label: i for i, label in enumerate(poses.labels)}
-    rows = sorted(rows, key=lambda row: order[row[0]])
+    rows = rows if order is None else sorted(rows, key=order)
     empty = [["" if is_reading[i] else cell for i, cell in enumerate(row)] for row in rows]
     return "\n".join([*lines[:first], *map(format_row, [header, *empty])]) + "\n"

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from loopcal.measure.kinds.directions.direction import Direction as Direction
     from loopcal.measure.kinds.directions.inclination import Inclination as Inclination
     from loopcal.measure.kinds.joints.actuator_readings import ActuatorReadings as ActuatorReadings
+    from loopcal.measure.kinds.joints.closure import Closure as Closure
     from loopcal.measure.kinds.joints.joint_sensor import JointSensor as JointSensor
     from loopcal.measure.kinds.joints.joint_sensor import Locked as Locked
     from loopcal.measure.kinds.kind import Kind as Kind
@@ -37,6 +38,7 @@ else:
             "loopcal.measure.kinds.directions.direction": "Direction",
             "loopcal.measure.kinds.directions.inclination": "Inclination",
             "loopcal.measure.kinds.joints.actuator_readings": "ActuatorReadings",
+            "loopcal.measure.kinds.joints.closure": "Closure",
             "loopcal.measure.kinds.joints.joint_sensor": "JointSensor Locked",
             "loopcal.measure.kinds.kind": "Kind",
             "loopcal.measure.kinds.points.bearing": "Bearing",
@@ -68,6 +70,7 @@ KINDS: LazyRegistry[type[Kind]] = LazyRegistry(
         "autocollimation": "loopcal.measure.kinds.directions.autocollimation:Autocollimation",
         "joint": "loopcal.measure.kinds.joints.joint_sensor:JointSensor",
         "locked": "loopcal.measure.kinds.joints.joint_sensor:Locked",
+        "closure": "loopcal.measure.kinds.joints.closure:Closure",
     }
 )
 """From the name of a kind in files to its class, which is imported when it is looked up."""
