@@ -66,12 +66,14 @@ class FrameMotions:
         independent combinations that move frames.
     motions : (12, g) motions of the two frames by these combinations, in the units of
         `loopcal.estimate.frame_freedoms.frame_twists`, each of length one.
+    has_scale : whether a further combination enlarges all poses by one factor.
     """
 
     kept: FloatArray
     frames: tuple[str, ...]
     count: int
     motions: FloatArray
+    has_scale: bool = False
 
 
 def find_frame_motions(posterior: Posterior) -> FrameMotions:
@@ -107,7 +109,12 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
             frames = (name,)  # only one where it suffices
     infinite = np.isinf(posterior.variance[~posterior.determined])
     kept = null @ _gauge_projector(gauge, infinite)
-    return FrameMotions(kept, frames, count, _explain_motions(moving, base, platform, robot.size))
+    explained = _explain_motions(moving, base, platform, robot.size)
+    growth = np.zeros((int(usable.sum()), 6, 1))
+    growth[:, 3:, 0] = state.T[0, usable, :3, 3]
+    rest = _without_span([base, platform, growth.reshape(-1, 1)], moved)
+    with_scale = np.linalg.svd(rest, compute_uv=False) <= SAME_MOTION * every
+    return FrameMotions(kept, frames, count, explained, bool(with_scale.sum() > gauge.shape[1]))
 
 
 def twist_weights(robot: Mechanism) -> FloatArray:

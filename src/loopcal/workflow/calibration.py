@@ -228,7 +228,7 @@ def _report(
         *(report_validation(errors, held_out is not None) if fit.converged else ()),
         *report_repeats(split),
         *check_split_instruments(split),
-        *report_freedoms(fit),
+        *report_freedoms(fit, fitted),
         *report_scale(fit, fitted),
         start.finding,
         *examined,

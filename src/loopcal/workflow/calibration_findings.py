@@ -15,6 +15,7 @@ from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, check_instruments
 from loopcal.units import Dimension
 from loopcal.workflow.data_split import DataSplit
+from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 
 NO_GAIN = "model.no-expected-gain"
 """Finding that a calibration is not expected to improve on the tolerances."""
@@ -108,13 +109,13 @@ def report_scale(fit: Identification, data: Measurements) -> list[Finding]:
     return [report_finding("workflow.undetermined-scale", names=names)] if names else []
 
 
-def report_freedoms(fit: Identification) -> list[Finding]:
+def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     """Return whether open combinations only move frames, or change poses."""
     if not fit.converged or not fit.unidentifiable:
         return []
     motions = find_frame_motions(fit.posterior)
     count = len(fit.names) - fit.rank
-    findings = []
+    findings = [report_readings_gauge(motions, count)] if is_readings_alone(data) else []
     if motions.count:
         findings.append(
             report_finding(

@@ -24,6 +24,7 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.serialization import json_fields
+from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 
 FEW = 3
 """Combinations that change poses and that a summary lists one by one."""
@@ -39,12 +40,14 @@ class IdentifiabilityReport:
     suggestions : further measurements for open combinations.
     subset : a smallest set of parameters; None where it was not asked for.
     useful : what is determined to a useful accuracy; None where none was stated.
+    is_readings_alone : whether nothing but redundant readings was measured.
     """
 
     analysis: Identifiability
     suggestions: tuple[MeasurementSuggestion, ...]
     subset: IdentifiableSubset | None
     useful: UsefulAccuracy | None = None
+    is_readings_alone: bool = False
 
     @cached_property
     def summary(self) -> tuple[Finding, ...]:
@@ -66,6 +69,8 @@ class IdentifiabilityReport:
             return []
         motions = find_frame_motions(analysis.posterior)
         findings = []
+        if self.is_readings_alone:
+            findings.append(report_readings_gauge(motions, analysis.n_parameters - analysis.rank))
         if motions.count:
             findings.append(
                 report_finding(
@@ -132,4 +137,5 @@ def analyze_identifiability(
     analysis = identifiability(robot, data, rank_tolerance)
     subset = choose_identifiable_subset(analysis) if choose_subset else None
     accuracy = None if useful is None else judge_useful_accuracy(analysis, *useful)
-    return IdentifiabilityReport(analysis, suggest_measurements(analysis), subset, accuracy)
+    suggestions = suggest_measurements(analysis)
+    return IdentifiabilityReport(analysis, suggestions, subset, accuracy, is_readings_alone(data))
