@@ -3,8 +3,8 @@
 
 One machine, drawn from the tolerances, is measured again and again. Its readings determine nine of
 twelve combinations of parameters. In the coordinates in which a fit calls their errors independent
-and of variance one, the spread of the repeats must be one in every direction, and chi-square that of
-its degrees of freedom.
+and of variance one, the spread of the repeats must be one in every direction, and chi-square must
+be that of its degrees of freedom.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from loopcal.diagnose import find_frame_motions
 from loopcal.errors import DataError, FileError
 from loopcal.estimate import LeastSquares, identify
 from loopcal.workflow import Verdict
+from loopcal.workflow.identifiability_report import analyze_identifiability
 
 ANCHORS = 1e-3 * np.array([[-1800, -1200], [1800, -1200], [1800, 1200], [-1800, 1200.0]])
 SIGMA = 2e-4  # [m] of a reading, as the robot file states
@@ -116,11 +117,27 @@ def test_starting_values_ten_percent_off_converge(robot, seed):
 
 
 def test_gauge_is_found_by_computation(robot):
-    """Three motions of the plane; a spool of unknown radius adds the size of the machine."""
+    """Three motions of the plane; spools of unknown radius add the size of the machine."""
     _, readings = measure(*draw_machine(1), 40, 2)
     fit = identify(robot, make_data(robot, readings), LeastSquares())
     motions = find_frame_motions(fit.posterior)
-    assert (motions.frames, motions.count) == (("base", "platform"), 3)
+    assert (motions.count, motions.has_scale) == (3, False)
+    cable = lc.load_robot("cable-4")
+    poses = lc.sample_workspace(cable, 30, 1).coordinates
+    report = analyze_identifiability(cable, lc.simulate(cable, poses, READINGS, 1))
+    (gauge,) = [f for f in report.summary if f.code == "identifiability.readings-gauge"]
+    assert [(part["what"], part["count"]) for part in gauge.data["parts"]] == [
+        ("frames", 6),
+        ("scale", 1),
+    ]
+
+
+def test_wrong_reading_is_named_by_its_pose(robot):
+    _, readings = measure(*draw_machine(1), 30, 2)
+    readings[11, 2] += 5e-3
+    report = lc.calibrate(robot, make_data(robot, readings), lc.CalibrationOptions())
+    (outlier,) = [f for f in report.findings if f.code == "outliers.some"]
+    assert "pose 12" in str(outlier)
 
 
 def test_ls_covariance_is_that_of_repeats(robot):
