@@ -136,8 +136,8 @@ def test_wrong_reading_is_named_by_its_pose(robot):
     _, readings = measure(*draw_machine(1), 30, 2)
     readings[11, 2] += 5e-3
     report = lc.calibrate(robot, make_data(robot, readings), lc.CalibrationOptions())
-    (outlier,) = [f for f in report.findings if f.code == "outliers.some"]
-    assert "pose 12" in str(outlier)
+    (outlier,) = [f for f in report.findings if f.code == "outliers.pose"]
+    assert "Pose 12" in str(outlier)
 
 
 def test_ls_covariance_is_that_of_repeats(robot):
