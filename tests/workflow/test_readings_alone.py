@@ -5,6 +5,7 @@ The reference is the closed form |x - a_k| = q_k + c_k, solved for all positions
 zeros c_k together by scipy, with the three motions of the plane fixed by prescribed coordinates.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -204,3 +205,16 @@ def test_readings_alone_need_a_stated_noise(robot, tmp_path):
     assert error.value.code == "data.closure-without-sigma"
     data = lc.simulate(silent, poses, READINGS, 1, reading_sigma=SIGMA)
     assert data.n_rows == 0
+
+
+@pytest.mark.evidence
+def test_published_repeats_scatter_as_their_standard_deviations_say(root):
+    """100 poses, 200 repeats: 15 % are three standard deviations of the spread of one direction."""
+    path = root / "docs" / "evidence" / "readings_alone.json"
+    if not path.exists():
+        pytest.skip("docs/evidence/readings_alone.json is made by `make evidence`")
+    one, sets, squares, band, share = json.loads(path.read_text())["tables"]["spread"]["rows"]
+    assert 0.85 < one[1] < one[2] < 1.15
+    assert 0.85 < sets[1] < sets[2] < 1.15
+    assert band[1] < squares[1] < squares[2] < band[2]
+    assert share[1] > 0.95  # 198 of 200 are expected; a sd of 1.4
