@@ -92,9 +92,9 @@ RECIPES = (
     ),
     Recipe(
         "cable-4",
-        "belt-4",
         "--kind position --sigma-position 1mm --sigma-reading 1deg",
         "pose,x [mm],y [mm],z [mm]\na,10,20,300\nb,-50,30,200\n",
+        ("closure",),
         words="a b A.anchor.x c d",
     ),
 )
