@@ -60,12 +60,12 @@ def test_a_wrong_sigma_does_not_change_the_test(limb) -> None:
 
 @pytest.mark.parametrize(("ratio", "poses", "unknown"), [(2.0, 20, ()), (0.5, 8, ("frame",))])
 def test_unmoved_machines_are_declared_moved_at_the_stated_rate(ratio, poses, unknown) -> None:
-    """5 % of 24; p-values are uniform. Before, a sigma twice too small moved nearly every one."""
-    changes = [compare(s, ratio, ratio, poses=poses, unknown=unknown) for s in range(24)]
+    """5 % of 16; p-values are uniform. Before, a sigma twice too small moved nearly every one."""
+    changes = [compare(s, ratio, ratio, poses=poses, unknown=unknown) for s in range(16)]
     p_values = [change.p_value for change in changes]
     moved = [change.moved for change in changes if change.moved is not None]
-    assert len(moved) == 24
-    assert sum(moved) <= stats.binom.ppf(0.999, 24, CHANGE_LEVEL)
+    assert len(moved) == 16
+    assert sum(moved) <= stats.binom.ppf(0.999, 16, CHANGE_LEVEL)
     assert stats.kstest(p_values, "uniform").pvalue > 1e-3
     assert all(change.finding.data["level"] == CHANGE_LEVEL for change in changes)
 

@@ -51,8 +51,10 @@ def test_euler_rates_are_the_derivative_and_have_the_stated_inverse(order):
     def turned(x):
         return geometry.log_so3(geometry.euler_to_matrix(angles + x, order) @ base)
 
+    # compiling takes longer than all else: every fifth order, differences for all
+    automatic = turned if order in geometry.EULER_ORDERS[::5] else None
     check_jacobian(
-        turned, geometry.euler_rates(angles, order), np.zeros(3), scale=0.3, automatic=turned
+        turned, geometry.euler_rates(angles, order), np.zeros(3), scale=0.3, automatic=automatic
     )
     product = geometry.euler_rates_inverse(angles, order) @ geometry.euler_rates(angles, order)
     assert_allclose(product, np.eye(3), atol=ROUNDING)

@@ -29,14 +29,14 @@ def test_two_files_are_written_together_or_restored(tmp_path) -> None:
 
 @pytest.mark.slow
 def test_run_folder_is_the_old_or_the_new_one(inputs) -> None:
-    outcomes = examine(CASES["calibrate"], inputs, 10, 4)
+    outcomes = examine(CASES["calibrate"], inputs, 6, 3)
     assert list_wrong_outcomes(outcomes) == []
     assert {"old", "new"} <= set(outcomes[KILL]) | set(outcomes[INTERRUPT])
 
 
 @pytest.mark.slow
 def test_first_run_folder_is_absent_or_complete(inputs) -> None:
-    assert list_wrong_outcomes(examine(CASES["calibrate, no old run"], inputs, 8, 0)) == []
+    assert list_wrong_outcomes(examine(CASES["calibrate, no old run"], inputs, 5, 0)) == []
     assert sorted(FIVE_BAR) == ["data.csv", "run", "targets.csv"]
 
 
