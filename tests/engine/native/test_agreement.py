@@ -144,7 +144,7 @@ def test_proofs_agree_with_numpy_and_between_instruction_sets(name, t, n):
 @pytest.mark.parametrize(("t", "n"), [(1, 300), (7, 5)])
 def test_reached_poses_agree_with_numpy_and_between_instruction_sets(name, t, n):
     robot, case = load_robot(name), make_robot_case(name, t, n)
-    step = 0.4 * np.random.default_rng(n).uniform(-1, 1, (t, n, len(robot.controlled)))
+    step = 0.1 * np.random.default_rng(n).uniform(-1, 1, (t, n, len(robot.controlled)))
     values = read_coordinates(robot.home, robot.controlled) + step
     target = state_target(values, robot.controlled, robot.home)
     arguments = case.program, case.e, target, case.home
