@@ -246,6 +246,7 @@ class Solver {
         Mask settled = (now.reducible <= RESIDUAL * size) &
                        ((block.applied <= STEP * size) | (block.at_rounding > 2.0));
         Lanes zero = now.reducible * 0.0 + now.length * 0.0;  // NaN where one is not finite
+        for (int i = 0; i < 12; i++) zero = zero + block.now[i] * 0.0;  // some are in no equation
         Mask broken = ~((zero == 0.0) & (now.pivot > SINGULAR));
         Mask end = settled | broken | (block.share < 1e-5), near{};
         if (in_.goal.data) {

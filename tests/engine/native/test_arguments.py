@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from loopcal.engine import CONVERGED, Engine, Program, Slot, State, Target, TwistRows
+from loopcal.engine import CONVERGED, NOT_FINITE, Engine, Program, Slot, State, Target, TwistRows
 from loopcal.errors import MissingPackageError
 from tests.engine.cases import draw_map, draw_twist_rows, make_pose_rows
 from tests.engine.native.instruction_sets import ROBOTS, make_engines, make_robot_case
@@ -262,6 +262,15 @@ def check_any_numbers(native: Engine, name: str, rows: int, seed: int) -> int:
 def test_any_numbers_are_answered(name):
     with np.errstate(all="ignore"):
         check_any_numbers(NATIVE, name, 300, 1)
+
+
+def test_a_position_that_no_equation_contains_must_be_finite(engine):
+    case = make_robot_case("agile-eye", 2, 1)  # the loops of a spherical machine leave it out
+    T = np.repeat(case.home.T, 2, axis=0)
+    T[1, 0, 0, 3] = np.inf
+    joints = tuple(np.repeat(a, 2, axis=0) for a in case.home.joints)
+    state = engine.solve(case.program, case.e, case.q, replace(case.home, T=T, joints=joints))
+    assert state.status[:, 0].tolist() == [CONVERGED, NOT_FINITE]
 
 
 @pytest.mark.evidence

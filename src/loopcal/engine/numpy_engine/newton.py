@@ -141,6 +141,7 @@ def _iterate(
                 (applied <= STEP * size) | (at_rounding > 2)
             )
             finite = np.isfinite(now.reducible) & np.isfinite(now.length)
+            finite &= np.isfinite(now.coordinates[:12]).all(axis=0)  # some are in no equation
             broken = ~(finite & (now.pivot > SINGULAR))
             end = settled | broken | (share < 1e-5)
             is_near = np.zeros_like(end)
