@@ -246,7 +246,8 @@ def test_5_dof_measurement_leaves_one_combination_unidentifiable(results) -> Non
         (null,) = five.known.unidentifiable
         assert set(null.names) == parameters
         assert five.answers[LS].is_diverged
-        assert five.normal_equations > 1e3  # [mm], from an inverse that is rounding
+        # [mm] from an inverse that is rounding, which decides how large: 233 to more than 1,000
+        assert five.normal_equations > 1e2
         assert six.normal_equations < 1e2
         # rank detection alone: as good as with 6-DOF
         np.testing.assert_allclose(

@@ -24,8 +24,8 @@ NAMES = """
     CalibrationOptions Constraints FitOptions GCV Gaussian Huber InflatedTolerances Instrument
     LeastSquares LineOfSight MAP MarginalLikelihood PlanOptions Prior Ridge Sensor StatedValue
     StepControl SurfaceOptions TruncatedSVD TruncationGCV Tukey Uniform Dask Processes Ray Serial
-    Autocollimation Bearing Component Direction Distance Inclination JointSensor Line Locked Plane
-    Pose Position Separation Sphere Observations Trials InstrumentRecord
+    Autocollimation Bearing Closure Component Direction Distance Inclination JointSensor Line Locked
+    Plane Pose Position Separation Sphere Observations Trials InstrumentRecord
 """
 SETTINGS = frozenset(NAMES.split())
 """Public classes that a user passes in, which are no results."""

@@ -115,8 +115,9 @@ def test_chi_square_of_a_loss_is_that_of_the_weighted_residuals():
 
 
 def test_fit_that_leads_away_from_a_geometry_without_poses_is_not_called_a_failure(tmp_path):
-    """The nominal anchors close no pose, the calibrated ones all: nothing is there to compare with,
-    but the calibrated geometry is good, and a second calibration can begin with it."""
+    """The nominal anchors close no pose, the calibrated ones all: the readings before calibration
+    contradict each other, and lead to the nearest poses. The calibrated geometry is good, and a
+    second calibration can begin with it."""
     shipped = lc.load_robot("cable-4")
     truth = shipped.with_values(lc.sample_truth(shipped, 1, 1)[0])
     noise = lc.Gaussian(np.array([5e-5] * 3 + [1e-5] * 3))
@@ -130,9 +131,11 @@ def test_fit_that_leads_away_from_a_geometry_without_poses_is_not_called_a_failu
     options = CalibrationOptions(check_conventions=False)
     first = calibrate(lc.load_robot(tmp_path / "far.yaml"), data, options)
     assert first.verdict is Verdict.UNDECIDED
-    assert first.fitted_errors is None
-    (finding,) = [f for f in first.findings if f.code == "workflow.nothing-to-validate"]
-    assert "before calibration reaches none of the 12 poses, the calibrated one 12" in str(finding)
+    assert "fit.poses-open-at-start" in [f.code for f in first.findings]
+    assert first.fitted_errors is not None
+    assert len(first.fitted_errors.poses) == 12
+    (all_kinds,) = re.findall(r"(\S+) sigma before, (\S+) sigma after", str(first.fitted_errors))
+    assert float(all_kinds[0]) > 1e4 > 1e3 * float(all_kinds[1])
     lc.save_robot(first.identification.robot, tmp_path / "corrected.yaml")
     second = calibrate(lc.load_robot(tmp_path / "corrected.yaml"), data, options)
     assert second.fitted_errors is not None
