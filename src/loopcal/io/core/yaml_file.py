@@ -26,7 +26,7 @@ Location = tuple[str | int, ...]
 LONGEST_PROBLEM = 100
 """Characters of a parser's sentence that a message repeats."""
 
-KEPT_TEXTS, KEPT_LENGTH = 8, 100_000
+KEPT_TEXTS, KEPT_LENGTH = 32, 100_000
 """Texts whose trees are kept, and their largest length. A command reads the same text several times
 (it is looked at before it is used, and read back after it was written), which takes as long as a
 fit.
