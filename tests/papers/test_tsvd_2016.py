@@ -482,9 +482,8 @@ def test_evidence_map_is_better_than_raw_methods_and_near_gcv_and_hindsight() ->
             assert read_column(document, "ratios", high)[f"MAP over {method}"] < 1.0
         assert read_column(document, "ratios", ratio)[f"MAP over {CROSS}"] < 1.05
         assert read_column(document, "ratios", ratio)[f"MAP over {HINDSIGHT}"] < 1.15
-        assert (
-            read_column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0
-        )  # nothing beats hindsight
+        # nothing beats hindsight; where both are the same fit, they agree to the end of a descent
+        assert read_column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0 - 1e-9
 
 
 @pytest.mark.evidence
