@@ -223,10 +223,7 @@ class NativeFunctions:
         """Differentiate the platform in parameters and readings."""
         t, n = shape = state.T.shape[:2]
         flat = flatten_program(program, False)
-        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
-        joints = [as_reals(a) for a in joints]
-        _require_arrays(program, arrays, joints, shape)
-        entries, numbers = _flatten_map(program, inputs, shape)
+        entries, arrays, joints = _flatten_inputs(program, e, q, state, inputs, shape)
         p, a = inputs.pattern.parameters, program.n_joints
         by_parameter, by_reading = np.empty((t, n, 6, p)), np.empty((t, n, 6, a))
         if t * n:
@@ -237,7 +234,7 @@ class NativeFunctions:
                     flat.structure.ctypes.data,
                     flat.numbers.ctypes.data,
                     entries.ctypes.data,
-                    _describe_all([*arrays, *numbers]),
+                    _describe_all(arrays),
                     _describe_all(joints),
                     by_parameter.ctypes.data,
                     by_reading.ctypes.data,
@@ -277,10 +274,7 @@ class NativeFunctions:
         """Fold the rows of observed poses."""
         t, n = len(factor), state.T.shape[1]
         flat = flatten_program(program, False)
-        arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
-        joints = [as_reals(a) for a in joints]
-        _require_arrays(program, arrays, joints, (t, n))
-        entries, numbers = _flatten_map(program, inputs, (t, n))
+        entries, arrays, joints = _flatten_inputs(program, e, q, state, inputs, (t, n))
         width = inputs.pattern.parameters + 1
         factor, rows = as_reals(factor), flatten_rows(observed, t, n)
         require(factor.shape == (t, width, width), f"a factor (t, {width}, {width})")
@@ -293,7 +287,7 @@ class NativeFunctions:
                     flat.structure.ctypes.data,
                     flat.numbers.ctypes.data,
                     entries.ctypes.data,
-                    _describe_all([*arrays, *numbers]),
+                    _describe_all(arrays),
                     _describe_all(joints),
                     ctypes.byref(rows.describe()),
                     factor.ctypes.data,
@@ -351,6 +345,24 @@ def _require_rows(
     is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
     is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
     require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
+
+
+def _flatten_inputs(
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    state: State,
+    inputs: ParameterMap,
+    shape: tuple[int, int],
+) -> tuple[IntArray, list[FloatArray], list[FloatArray]]:
+    """Return the entries of a map, e, q, T and the numbers of the map, and the joints of groups.
+
+    They must be kept while their addresses are in use.
+    """
+    arrays, joints = [as_reals(a) for a in (e, q, state.T)], [as_reals(a) for a in state.joints]
+    _require_arrays(program, arrays, joints, shape)
+    entries, numbers = _flatten_map(program, inputs, shape)
+    return entries, [*arrays, *numbers], joints
 
 
 def _flatten_map(
