@@ -14,6 +14,7 @@ from loopcal.measure import (
     Instrument,
     Measurements,
     check_strokes,
+    find_outside_strokes,
     replace_measured_values,
     sample_truth,
     simulate,
@@ -90,9 +91,7 @@ def find_reachable_poses(truth: Mechanism, targets: FloatArray) -> BoolArray:
     """Return which coordinates (n, c) nominal and true machine reach, inside the strokes (n,)."""
     commanded = inverse(truth.nominal, targets)
     reached = forward(truth, commanded.q, commanded).converged
-    strokes = [a.stroke or (-np.inf, np.inf) for a in truth.actuators]
-    low, high = np.transpose(strokes)
-    inside = ((low <= commanded.q) & (commanded.q <= high)).all(axis=1)
+    inside = ~find_outside_strokes(commanded.q, truth).any(axis=1)
     return commanded.converged & reached & inside
 
 

@@ -18,7 +18,7 @@ from loopcal.estimate.poses.states import PoseEstimates
 from loopcal.estimate.problem import Problem
 from loopcal.findings import Finding, report_finding
 from loopcal.geometry import wrap_angle
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, find_outside_strokes
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -114,8 +114,7 @@ def report_doubtful_readings(robot: Mechanism, poses: EstimatedPoses) -> tuple[F
     """
     known = np.asarray(np.isfinite(poses.poses).all(axis=(1, 2)) & ~poses.is_undetermined)
     estimated = np.isinf(poses.sigma) & known[:, None]
-    low, high = np.array([a.stroke or (-np.inf, np.inf) for a in robot.actuators]).T
-    outside = estimated & ((poses.readings < low) | (poses.readings > high))
+    outside = estimated & (find_outside_strokes(poses.readings, robot) > 0.0)
     beside = estimated & _is_on_other_branch(robot, poses, np.asarray(estimated.any(axis=1)))
     codes = (("poses.outside-stroke", outside), ("poses.other-branch", beside))
     return tuple(

@@ -29,9 +29,9 @@ def draw_scene(scene: Scene) -> Figure:
         _draw_map(figure, panels, scene, factor)
     if poses is None:
         return figure
-    ends = _join_ends(poses) / factor
+    ends, flat = _join_ends(poses) / factor, [*choose_view(robot)]
     for axes in panels:
-        kept = [0, 1, 2] if axes.name == "3d" else [*choose_view(robot)]
+        kept = [0, 1, 2] if axes.name == "3d" else flat
         axes.plot(*ends[:, kept].T, color=ERROR, lw=1.0, zorder=8)
         axes.plot(*poses.tool[:, kept].T / factor, "o", color=POSE, ms=2.5, zorder=8)
         if axes.name == "3d" and len(ends):
@@ -56,9 +56,9 @@ def _draw_map(figure: Figure, panels: list[Any], scene: Scene, factor: float) ->
     known = np.isfinite(values) & np.isfinite(scene.map_points).all(axis=1)
     if not known.any():
         return
-    points, drawn = scene.map_points[known] / factor, []
+    points, drawn, flat = scene.map_points[known] / factor, [], [*choose_view(scene.robot)]
     for axes in panels:
-        kept = [0, 1, 2] if axes.name == "3d" else [*choose_view(scene.robot)]
+        kept = [0, 1, 2] if axes.name == "3d" else flat
         style = {"c": values[known], "cmap": SEQUENTIAL, "s": 9.0, "marker": "s", "lw": 0.0}
         drawn.append(axes.scatter(*points[:, kept].T, alpha=0.45, zorder=0.4, **style))
         if axes.name == "3d":

@@ -79,8 +79,8 @@ def list_parts(robot: Mechanism, state: State) -> tuple[Part, ...]:
     foot, top = (np.stack([limb[:, j, :3, 3] for limb in frames], axis=1) for j in (0, -1))
     lines = (Part("limb", trace, i) for i, trace in enumerate(traces))
     joints = (part for i, limb in enumerate(frames) for part in _list_joints(robot, i, limb))
-    triangles = (part for part in _list_triangles(robot, state))
-    return (*lines, *joints, *triangles, *_list_bodies(robot, foot, top, T))
+    triangles, bodies = _list_triangles(robot, state), _list_bodies(robot, foot, top, T)
+    return (*lines, *joints, *triangles, *bodies)
 
 
 def _arrange_limb(frames: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
