@@ -8,7 +8,6 @@ Without the native engine the committed tables are kept.
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,8 @@ from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
 from loopcal.mechanism import sample_workspace
-from tests.engine.cases import Case, draw_map, make_case
+from loopcal.mechanism.platform_coordinates import EULER, POSITION, read_coordinates, state_target
+from tests.engine.cases import Case, draw_map, draw_twist_rows, make_case
 
 TRIALS, POSES = 5, 40
 ROBOTS = tuple(list_shipped_robots())
@@ -69,13 +69,13 @@ def solve_forward(engine: Engine, case: Case) -> Results:
 
 
 def solve_inverse(engine: Engine, case: Case) -> Results:
-    """Return the joints of limbs that reach poses, in radians or sizes."""
-    reached = _close(case)
-    limbs = case.program.with_fixed_platform
-    q = np.broadcast_to(case.home_q, case.q.shape)
-    state = engine.solve(limbs, case.e, q, replace(case.home, T=reached.T), free=True)
-    joints = [np.asarray(a) / max(case.program.size, 1.0) for a in state.joints]
-    return [np.concatenate([a.ravel() for a in joints]), state.status, state.iterations]
+    """Return the joints of limbs at poses, in radians or sizes, and which of these lead there."""
+    coordinates = read_coordinates(_close(case).T, (*POSITION, *EULER))
+    target = state_target(coordinates, (*POSITION, *EULER), case.home.T[0, 0])
+    reached = engine.reach(case.program, case.e, target, case.home)
+    joints = [np.asarray(a) / max(case.program.size, 1.0) for a in reached.state.joints]
+    counts = [reached.state.status, reached.state.iterations, reached.state.closure_sign]
+    return [np.concatenate([a.ravel() for a in joints]), *counts, reached.arrives]
 
 
 def linearize(engine: Engine, case: Case) -> Results:
@@ -103,9 +103,30 @@ def fold(engine: Engine, case: Case) -> Results:
     columns = int(rng.integers(2, 60))
     rows = rng.normal(size=(TRIALS, 5 * columns, columns)) * 10.0 ** rng.uniform(-3, 3, columns)
     rows[:, : len(rows[0]) // 2, : columns // 2] = 0.0
-    R = engine.fold(np.zeros((TRIALS, columns, columns)), rows)
-    scale = np.linalg.norm(rows, axis=1)
-    return [(R.swapaxes(1, 2) @ R) / scale[:, :, None] / scale[:, None]]
+    return [_scale_gram(engine.fold(np.zeros((TRIALS, columns, columns)), rows))]
+
+
+def fold_poses(engine: Engine, case: Case) -> Results:
+    """Return R'R over the lengths of its columns, of measured twists of poses, and which count."""
+    inputs = draw_map(case.program, case.q.shape[:2], True)
+    width = inputs.pattern.parameters + 1
+    factor, is_finite = engine.fold_poses(
+        np.zeros((TRIALS, width, width)),
+        case.program,
+        case.e,
+        case.q,
+        _close(case),
+        inputs,
+        draw_twist_rows(TRIALS, POSES),
+    )
+    return [_scale_gram(factor), is_finite]
+
+
+def _scale_gram(R: np.ndarray) -> np.ndarray:
+    """Return R'R (t, p, p) of factors, their columns scaled to length 1; columns of zeros stay."""
+    length = np.linalg.norm(R, axis=1, keepdims=True)
+    scaled = R / np.where(length > 0.0, length, 1.0)
+    return scaled.swapaxes(1, 2) @ scaled
 
 
 def _close(case: Case) -> State:
@@ -119,6 +140,7 @@ FUNCTIONS: dict[str, tuple[Callable[[Engine, Case], Results], str]] = {
     "linearized closure": (linearize, "largest entry"),
     "sensitivities": (differentiate, "largest entry"),
     "factor": (fold, "lengths of its columns"),
+    "factor of poses": (fold_poses, "lengths of its columns"),
 }
 
 
