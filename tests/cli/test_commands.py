@@ -351,6 +351,9 @@ def test_simulate_adds_the_requested_noise_to_readings_and_states_it(run, tmp_pa
     refused = run("simulate linear-delta --fill noisy.csv --sigma-reading 5um -o x.csv")
     assert refused[0] == 1
     assert "--sigma-reading has no effect because --fill noisy.csv" in refused[2]
+    refused = run("simulate linear-delta --fill noisy.csv --skip-unreachable -o x.csv")
+    assert refused[0] == 1
+    assert "--skip-unreachable has no effect because --fill noisy.csv" in refused[2]
     refused = run("identifiability linear-delta noisy.csv --sigma-reading 5um")
     assert refused[0] == 1
     assert "DATA states the noise of its readings" in refused[2]

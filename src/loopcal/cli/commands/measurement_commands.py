@@ -332,7 +332,7 @@ def _fill_in(
     from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(
-        ("poses", "draw", *DESCRIPTION[3:], "distribution", "sigma_reading"),
+        ("poses", "draw", *DESCRIPTION[3:], "distribution", "sigma_reading", "skip_unreachable"),
         f"because --fill {sheet} states poses and instrument",
     )
     instrument, how = load_instrument(sheet, robot), {"draw_errors": draw_errors, "seed": seed}
