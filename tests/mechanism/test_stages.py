@@ -26,6 +26,7 @@ from loopcal.mechanism import (
     sample_workspace,
 )
 from loopcal.report.scene.robot_parts import list_parts
+from tests.denavit_hartenberg import multiply_denavit_hartenberg
 from tests.jacobians import check_jacobian
 from tests.zoo import load_cached_robot
 
@@ -59,41 +60,6 @@ def draw_values(machine: Mechanism, seed: int) -> Array:
 
 
 # --- 6R arm: Denavit-Hartenberg
-
-# a [m], alpha [rad], d [m], offset of theta [rad], in the convention of Denavit and Hartenberg:
-# Rz(theta) Tz(d) Tx(a) Rx(alpha)
-RIGHT = np.pi / 2
-DENAVIT_HARTENBERG = (
-    (0.160, -RIGHT, 0.520, 0.0),
-    (0.580, 0.0, 0.0, -RIGHT),
-    (0.125, -RIGHT, 0.0, 0.0),
-    (0.0, RIGHT, 0.620, 0.0),
-    (0.0, -RIGHT, 0.0, 0.0),
-    (0.0, 0.0, 0.100, 0.0),
-)
-FLANGE = np.array([[0, 0, 1.0], [0, -1.0, 0], [1.0, 0, 0]])
-"""Orientation of the platform in the last frame, whose z axis is that of the last joint."""
-
-
-def multiply_denavit_hartenberg(q: Array) -> Array:
-    """Return the end poses (n, 4, 4) of readings (n, 6)."""
-    poses = []
-    for row in q:
-        T = np.eye(4)
-        for (a, alpha, d, offset), angle in zip(DENAVIT_HARTENBERG, row, strict=True):
-            ct, st = np.cos(angle + offset), np.sin(angle + offset)
-            ca, sa = np.cos(alpha), np.sin(alpha)
-            T = T @ np.array(
-                [
-                    [ct, -st * ca, st * sa, a * ct],
-                    [st, ct * ca, -ct * sa, a * st],
-                    [0.0, sa, ca, d],
-                    [0.0, 0.0, 0.0, 1.0],
-                ]
-            )
-        T[:3, :3] = T[:3, :3] @ FLANGE
-        poses.append(T)
-    return np.array(poses)
 
 
 def test_arm_agrees_with_denavit_hartenberg_products() -> None:

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from loopcal.errors import DataError
-from loopcal.estimate import identify
+from loopcal.estimate import LeastSquares, identify
 from loopcal.io import load_measurements, save_measurements
 from loopcal.measure import (
     Gaussian,
@@ -23,7 +25,8 @@ from loopcal.measure import (
     sample_truth,
     simulate,
 )
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.mechanism import Mechanism, forward, sample_workspace
+from tests.denavit_hartenberg import ARM_6R, join, multiply_denavit_hartenberg
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -111,3 +114,60 @@ def test_targets_on_an_unknown_stage_are_refused() -> None:
 def test_a_kind_that_compares_poses_has_no_stage() -> None:
     with pytest.raises(DataError, match="compares poses"):
         Separation(of="boom")
+
+
+TARGETS = np.array([[0.05, 0.0, 0.0], [0.0, 0.08, 0.02], [0.0, -0.04, 0.07]])
+TRACKER = {"tracker.x": 2.0, "tracker.rz": 0.7}
+
+
+def locate_targets(base: Array, T: Array, places: Array) -> Array:
+    """Return targets (n, k, 3) in the tracker, at whose frame the base is (rotation, place)."""
+    seen = join(Rotation.from_rotvec(base[:3]).as_matrix(), base[3:]) @ T
+    return np.einsum("nij,kj->nki", seen[:, :3, :3], places) + seen[:, None, :3, 3]
+
+
+def predict_densely(x: Array, q: Array) -> Array:
+    """Return the targets of 24 errors of links, one angle, the base (6) and the targets (9)."""
+    T = multiply_denavit_hartenberg(q, ARM_6R + x[:24].reshape(6, 4), x[24])
+    return locate_targets(x[25:31], T, TARGETS + x[31:].reshape(3, 3))
+
+
+@pytest.mark.slow
+def test_an_arm_is_calibrated_as_accurately_as_by_a_dense_fit() -> None:
+    """Frame of the tracker and places of the targets are unknown; scipy fits all 40 numbers."""
+    robot = load_cached_robot("arm-6r")
+    kind = Position(
+        targets=("t1", "t2", "t3"), places=TARGETS, unknown=("frame", "targets"), frame="tracker"
+    )
+    sigma = 3e-5
+    instrument = Instrument((Sensor(kind, Gaussian(np.full(9, sigma))),))
+    true = robot.with_values(sample_truth(robot, 1, 5)[0])
+    poses = sample_workspace(robot, 60, seed=1).coordinates
+    data = simulate(true, poses, instrument, 6, nuisance_values=TRACKER)
+    fit = identify(robot, data, LeastSquares())
+
+    measured = data.observations[0].measured.reshape(-1, 3, 3)
+    start = np.zeros(40)
+    start[27:29] = -TRACKER["tracker.rz"], -np.cos(0.7) * 2.0
+    start[29] = np.sin(0.7) * 2.0
+    dense = least_squares(
+        lambda x: ((predict_densely(x, data.readings) - measured) / sigma).ravel(),
+        start,
+        x_scale="jac",
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-12,
+    )
+    assert fit.chi_square == pytest.approx(2.0 * dense.cost, rel=1e-9)
+    low, high = chi2.ppf([0.005, 0.995], fit.residual_test.dof)
+    assert low < fit.chi_square < high
+
+    later = sample_workspace(robot, 30, seed=9).solution.q
+    values = dict(zip(fit.nuisance.names, fit.nuisance.estimate, strict=True))
+    seen_from = [values[f"tracker.{name}"] for name in ("rx", "ry", "rz", "x", "y", "z")]
+    R = Rotation.from_rotvec(seen_from[:3]).as_matrix()
+    base = np.r_[Rotation.from_matrix(R.T).as_rotvec(), -R.T @ seen_from[3:]]
+    places = np.array([[values[f"t{i}.{axis}"] for axis in "xyz"] for i in (1, 2, 3)])
+    mine = locate_targets(base, forward(fit.robot, later).T, places)
+    # [m] a hundredth of a micron; the noise is 30 um
+    np.testing.assert_allclose(mine, predict_densely(dense.x, later), rtol=0, atol=1e-8)
