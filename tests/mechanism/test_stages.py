@@ -364,7 +364,7 @@ def test_a_stage_on_a_named_one_branches_off_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "line", "sentence"),
     [
-        ("mount:", "on: shoulde\n    mount:", 9, "'shoulde', which is not a stage"),
+        ("mount:", "on: shoulde\n    mount:", 9, "not a stage .*; allowed are base, shoulder$"),
         (
             "    joint: {kind: R, start: 20",
             "    on: elbow\n    joint: {kind: R, start: 20",

@@ -78,7 +78,7 @@ def check_stage_names(names: Sequence[str], parents: Sequence[str | None]) -> li
         if on not in (BASE, *names):
             raise StageError(
                 f"stage {names[i]!r} is on {on!r}, which is not a stage"
-                f"{suggest_names(on, names)}; allowed are {', '.join((BASE, *names))}",
+                f"{suggest_names(on, names[:i])}; allowed are {', '.join((BASE, *names[:i]))}",
                 i,
             )
     for i, on in enumerate(stated):
