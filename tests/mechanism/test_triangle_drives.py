@@ -248,14 +248,18 @@ home: {yaw: 10}
 """
 
 
-def test_triangles_drive_the_first_joints_of_a_planar_machine(tmp_path: Path) -> None:
-    robot = load_text(tmp_path, PLANAR)
-    plain = PLANAR.replace(
+def use_angle_drives(text: str) -> str:
+    """Return a file with drives that read the angles of the joints."""
+    return text.replace(
         "    triangle: {foot: [-250, 60, 0], head: [-40, 110, 0]}\n    stroke: [150, 300]\n"
         "    unknown: [offset, foot.x, foot.y, head.x]\n    length: {sd: 0.2}\n",
         "    reads: angle\n",
     )
-    motors = load_text(tmp_path, plain)
+
+
+def test_triangles_drive_the_first_joints_of_a_planar_machine(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, PLANAR)
+    motors = load_text(tmp_path, use_angle_drives(PLANAR))
     poses = np.random.default_rng(3).uniform(-1, 1, (20, 3)) * [0.03, 0.03, 0.1]
     turned, pushed = inverse(motors, poses), inverse(robot, poses)
     assert pushed.converged.all()
@@ -267,6 +271,23 @@ def test_triangles_drive_the_first_joints_of_a_planar_machine(tmp_path: Path) ->
     assert "ram2.foot.x" in robot.parameters.names
     result = identifiability(robot, measure(robot, poses))
     assert result.rank == len(robot.parameters)
+
+
+def test_a_complete_model_contains_three_dimensions_of_each_triangle(tmp_path: Path) -> None:
+    complete = PLANAR.replace("family: limbs\n", "family: limbs\nerror_model: complete\n") + (
+        "tolerances: {lengths: {sd: 0.2}, angles: {sd: 0.05}}\n"
+    )
+    unnamed = complete.replace("    unknown: [offset, foot.x, foot.y, head.x]\n", "")
+    unnamed = unnamed.replace("    length: {sd: 0.2}\n", "")
+    named, found = load_text(tmp_path, complete), load_text(tmp_path, unnamed)
+    motors = load_text(tmp_path, use_angle_drives(complete))
+    assert set(found.parameters.names) - set(motors.parameters.names) == {
+        f"ram{i}.{name}" for i in (1, 2, 3) for name in ("foot.x", "foot.y", "head.y")
+    }  # the head is 40 mm and 110 mm from the pin in x and y
+    assert len(named.parameters) == len(found.parameters) + 3  # and head.x, which the file names
+    poses = np.random.default_rng(3).uniform(-1, 1, (60, 3)) * [0.06, 0.06, 0.2]
+    ranks = [identifiability(robot, measure(robot, poses)).rank for robot in (motors, found, named)]
+    assert ranks == [ranks[0], ranks[0] + 9, ranks[0] + 9]
 
 
 def test_anchors_in_pictures_are_as_far_apart_as_the_readings_say(tmp_path: Path) -> None:

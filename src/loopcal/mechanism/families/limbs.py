@@ -74,7 +74,7 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.families.records import RobotRecord, standard_deviation
-from loopcal.mechanism.families.triangle_records import TriangleDrive
+from loopcal.mechanism.families.triangle_records import TriangleDrive, complete_triangle
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -167,7 +167,7 @@ class Limbs(LimbsFile, RobotRecord):
             yield name, PlacedDrive(drive, turns, rotation, start)
 
     def _complete(self, copies: list[_Member], drives: Drives) -> ErrorModel:
-        """Return all errors of all limbs, and the offset of every drive once."""
+        """Return all errors of all limbs, and of every drive once its offset and its triangle."""
         spread = ErrorTolerances(
             standard_deviation(self.tolerances.lengths, "the lengths"),
             standard_deviation(self.tolerances.angles, "the angles"),
@@ -177,6 +177,9 @@ class Limbs(LimbsFile, RobotRecord):
             dimension, offset = placed.dimension, placed.drive.offset
             sd = spread.angle if dimension is Dimension.ANGLE else spread.length
             errors.append(offset_error(f"{name}.offset", name, dimension, offset, sd))
+            if isinstance(placed.drive, TriangleDrive):
+                lengths = self.tolerances.lengths
+                errors.append(complete_triangle(name, placed.drive, placed.rotation, lengths))
         return join_errors(errors)
 
 

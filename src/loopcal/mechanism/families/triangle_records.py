@@ -8,7 +8,7 @@ are those of the joint's errors. Formulas: `loopcal.mechanism.triangle`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -192,6 +192,21 @@ def triangle_errors(
         sd = standard_deviation(tolerance, parameter)
         errors.append(single_error(parameter, dimension, nominal, sd, *maps))
     return join_errors(errors)
+
+
+def complete_triangle(
+    name: str, drive: TriangleDrive, rotation: FloatArray, tolerance: LengthTolerance | None
+) -> ErrorModel:
+    """Return the dimensions of a triangle that, with its offset, have the effects of all others.
+
+    These are two coordinates of the foot across the axis of the joint, and the one of the head that
+    changes its lever most: see docs/theory/triangle-drives.md. Arguments are as above.
+    """
+    across = rotation[:, :2]
+    foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())
+    head = int(np.argmax(np.abs(across @ (across.T @ drive.triangle.head))))
+    unknown = (*(f"foot.{AXES[3 + i]}" for i in foot), f"head.{AXES[3 + head]}")
+    return triangle_errors(name, replace(drive, unknown=unknown, length=tolerance), rotation, ())
 
 
 def is_of_triangle(drive: object, term: str) -> bool:
