@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.bench_identify import _measured, _poses, _tracker
 from benchmarks.bench_kinematics import _problem
 from benchmarks.bench_sensitivity import _first_answer, _record
-from benchmarks.bench_start import _import_numpy, _python
+from benchmarks.bench_start import import_numpy, read_processor_time, run_python
 from benchmarks.harness import Metric, measure_ratio, time_once
 from loopcal.engine import get_current_engine
 from loopcal.engine.selection import VARIABLE
@@ -198,25 +198,22 @@ def bench_command() -> list[Metric]:
     that imports numpy and ends; in processor time of the processes.
     """
     data = ROOT / "examples" / "hexapod-42" / "measurements.csv"
-    code = "import sys; from loopcal.cli import main; sys.argv[0] = 'loopcal'; main()"
-    words = ("-c", code, "calibrate", "hexapod-42", str(data), "--hold-out", "0.25", "-o")
+    words = ("-m", "loopcal", "calibrate", "hexapod-42", str(data), "--hold-out", "0.25", "-o")
 
-    def calibrate() -> None:
+    def calibrate(engine: str) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            _python(*words, str(Path(folder) / "run"))
+            run_python(*words, str(Path(folder) / "run"), engine=engine)
 
-    metrics = []
-    for engine in ENGINES:
-        with use_engine(engine):
-            name, clock = f"engine.{engine}.command", _time_of_processes
-            metrics.append(measure(name, calibrate, _import_numpy, repeats=5, clock=clock))
-    return metrics
-
-
-def _time_of_processes() -> float:
-    """Return the processor time [s] of all processes that ended."""
-    times = os.times()
-    return times.children_user + times.children_system
+    return [
+        measure(
+            f"engine.{engine}.command",
+            partial(calibrate, engine),
+            import_numpy,
+            repeats=9,
+            clock=read_processor_time,
+        )
+        for engine in ENGINES
+    ]
 
 
 def bench_loop() -> list[Metric]:

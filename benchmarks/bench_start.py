@@ -14,25 +14,27 @@ from pathlib import Path
 from benchmarks.harness import Metric, measure_ratio
 
 
-def _python(*arguments: str) -> None:
-    """Run this Python with the arguments, silently, and with the engine in NumPy."""
-    engine = {**os.environ, "LOOPCAL_ENGINE": "numpy"}
-    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL, env=engine)
+def run_python(*arguments: str, engine: str = "numpy") -> None:
+    """Run this Python with the arguments, silently, from compiled modules as users have them."""
+    variables = {**os.environ, "LOOPCAL_ENGINE": engine}
+    variables.pop("PYTHONDONTWRITEBYTECODE", None)
+    words = [sys.executable, *arguments]
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, env=variables)
 
 
-def _read_processor_time() -> float:
+def read_processor_time() -> float:
     """Return the processor time of all processes that this one has waited for [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-_import_numpy = functools.partial(_python, "-c", "import numpy")
+import_numpy = functools.partial(run_python, "-c", "import numpy")
 
 
 def bench_import() -> Metric:
     """Time `import loopcal`, whose public names are loaded on first use."""
     return measure_ratio(
-        "start.import", functools.partial(_python, "-c", "import loopcal"), _import_numpy, limit=1.0
+        "start.import", functools.partial(run_python, "-c", "import loopcal"), import_numpy, limit=1.0
     )
 
 
@@ -40,7 +42,7 @@ def bench_help() -> Metric:
     """Time `loopcal --help`, which loads the commands but nothing heavy."""
     command = "import sys; from loopcal.cli import main; sys.argv = ['loopcal', '--help']; main()"
     return measure_ratio(
-        "start.help", functools.partial(_python, "-c", command), _import_numpy, limit=1.5
+        "start.help", functools.partial(run_python, "-c", command), import_numpy, limit=1.5
     )
 
 
@@ -56,9 +58,9 @@ def bench_calibration() -> list[Metric]:
         return [
             measure_ratio(
                 f"start.{name}",
-                functools.partial(_python, "-m", "loopcal", *words, "--force"),
-                _import_numpy,
-                clock=_read_processor_time,
+                functools.partial(run_python, "-m", "loopcal", *words, "--force"),
+                import_numpy,
+                clock=read_processor_time,
             )
             for name, words in (("calibrate", calibrate), ("report", report))
         ]
