@@ -33,9 +33,8 @@ import_numpy = functools.partial(run_python, "-c", "import numpy")
 
 def bench_import() -> Metric:
     """Time `import loopcal`, whose public names are loaded on first use."""
-    return measure_ratio(
-        "start.import", functools.partial(run_python, "-c", "import loopcal"), import_numpy, limit=1.0
-    )
+    work = functools.partial(run_python, "-c", "import loopcal")
+    return measure_ratio("start.import", work, import_numpy, limit=1.0)
 
 
 def bench_help() -> Metric:

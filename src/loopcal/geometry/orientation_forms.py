@@ -7,7 +7,6 @@ a rotation error about the axes of the frame, so E is the identity there.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -16,6 +15,7 @@ from loopcal.errors import DataError
 from loopcal.geometry import euler_angles, rotations
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
+from loopcal.value_classes import dataclass, field
 
 Conversion = Callable[[FloatArray], FloatArray]
 

@@ -8,7 +8,6 @@ linearized with every actuator free. Source: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -38,6 +37,7 @@ from loopcal.mechanism.states import Status, is_closed, replace_rows, select_pos
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
+from loopcal.value_classes import dataclass, replace
 
 COMPROMISE = 1e-9
 """Residual [m] of a converged row above which its redundant readings contradict each other."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -12,6 +11,7 @@ import numpy as np
 from loopcal.engine import MapPattern, ParameterMap
 from loopcal.mechanism.transmission import find_triangles, joint_slopes, term_derivatives
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.mechanism.model import SlotMap

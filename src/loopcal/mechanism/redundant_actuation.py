@@ -10,8 +10,6 @@ docs/theory/uncertain-readings.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from loopcal import engine
@@ -21,6 +19,7 @@ from loopcal.mechanism.sensitivity import linearize_limbs, name_passive_joints, 
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ Failed rows have NaN.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,7 @@ from loopcal.mechanism.stages.chain_kinematics import (
 from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.value_classes import dataclass
 
 BLOCK_ROWS = 1024
 """Rows linearized together."""

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from loopcal.engine import State
@@ -13,6 +11,7 @@ from loopcal.mechanism.states import compute_limb_frames, driven_values
 from loopcal.mechanism.transmission import TERMS
 from loopcal.mechanism.triangle import turn_head
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from loopcal.planning.problem import name_groups
 from loopcal.planning.sample_size import ErrorCurve
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

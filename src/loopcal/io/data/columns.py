@@ -12,7 +12,6 @@ import re
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
@@ -26,6 +25,7 @@ from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind

@@ -12,7 +12,6 @@ the example-parallel-robots collection.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal
@@ -35,6 +34,7 @@ from loopcal.mechanism.joint_graph import (
 )
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass, field, replace
 
 WHAT = "file of loop closures"
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")

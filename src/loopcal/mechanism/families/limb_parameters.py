@@ -8,7 +8,6 @@ stand for gain and curve. Formulas: docs/theory/parameters.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,6 +38,7 @@ from loopcal.mechanism.families.triangle_records import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import ARTICLES, Dimension
+from loopcal.value_classes import dataclass
 
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)

@@ -9,7 +9,6 @@ repeats. How to write such a file: docs/robots.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +76,7 @@ from loopcal.mechanism.families.records import RobotRecord, standard_deviation
 from loopcal.mechanism.families.triangle_records import TriangleDrive, complete_triangle
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
+from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from loopcal import geometry
@@ -14,6 +12,7 @@ from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.mechanism.joint_graph.loop_closure import CLOSURE_RANK_TOLERANCE, JointGraph
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass
 
 STARTS, SPREAD = 24, 0.6
 """Tries to close the loops, and range of their first joint values [rad, sizes]."""

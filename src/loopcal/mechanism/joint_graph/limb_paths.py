@@ -9,7 +9,6 @@ the same, and one path for each motor is left.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from loopcal.mechanism.joint_graph.home_pose import (
 )
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass
 
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""

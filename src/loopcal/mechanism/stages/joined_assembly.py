@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import (
@@ -19,6 +18,7 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.parameters import CommonError
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass, replace
 
 
 class StageError(MechanismError):

@@ -19,8 +19,6 @@ TSVD.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from loopcal.estimate.published_methods.raw_steps import (
@@ -35,6 +33,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

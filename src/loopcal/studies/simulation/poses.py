@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from loopcal.studies.specification.levels import (
     Scores,
 )
 from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass
 
 TOLERANCES = ("tolerance_factor", "tolerances")
 """Settings of errors that change the tolerances, and with them planned poses."""
