@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One engine computes in a process: the one that LOOPCAL_ENGINE names, and results state it."""
 
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, version
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from loopcal import engine
 from loopcal.cli import main
 from loopcal.engine import Engine, numpy_engine, select_engine, selection
 from loopcal.errors import MissingPackageError
+from tests.engine.conftest import HAS_NATIVE
 
 
 @pytest.fixture
@@ -105,3 +106,8 @@ def test_version_states_the_engine(environment, capsys):
 def test_provenance_states_the_engine(environment):
     environment("numpy")
     assert engine.collect_versions()["engine"] == f"numpy {np.__version__}"
+
+
+@pytest.mark.skipif(not HAS_NATIVE, reason="loopcal-native is not installed")
+def test_the_native_engine_states_the_version_of_its_package():
+    assert select_engine("native").version == version("loopcal-native")

@@ -6,7 +6,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +39,7 @@ from loopcal_native.library import (
 from loopcal_native.pose_rows import flatten_rows
 from loopcal_native.programs import flatten_pattern, flatten_program, require
 from loopcal_native.tasks import NO_TASK, TaskCalls
+from loopcal_native.version import VERSION
 
 
 def make_engine(variant: str = "") -> Engine:
@@ -54,9 +54,8 @@ def make_engine(variant: str = "") -> Engine:
     if name not in sets:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
     own = NativeFunctions(sets[name])
-    number = version("loopcal-native")
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
-    return Engine(f"native:{name}", number, *functions, own.differentiate, own.fold_poses)
+    return Engine(f"native:{name}", VERSION, *functions, own.differentiate, own.fold_poses)
 
 
 @dataclass(frozen=True)
