@@ -30,6 +30,15 @@ def test_function_is_that_of_scipy(name) -> None:
     assert getattr(special_functions, name) is getattr(scipy.special, name)
 
 
+def test_imports_in_functions_look_nothing_up(monkeypatch) -> None:
+    from loopcal.numerics.special_functions import ndtr
+
+    monkeypatch.setattr(special_functions, "_import_functions", lambda: pytest.fail("looked up"))
+    from loopcal.numerics.special_functions import ndtr as again
+
+    assert again is ndtr
+
+
 def test_functions_are_imported_without_the_package_and_are_those_of_a_later_import() -> None:
     code = f"""
 import sys

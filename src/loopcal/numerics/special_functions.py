@@ -36,6 +36,8 @@ else:
 
     def __getattr__(name: str) -> Any:
         """Return a function of scipy.special."""
+        if name.startswith("__"):  # `from ... import` asks every time whether this is a package
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         function = getattr(_import_functions(), name)
         globals()[name] = function
         return function

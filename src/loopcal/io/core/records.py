@@ -103,7 +103,8 @@ def read_units(file: YamlFile) -> dict[Dimension, Unit]:
     return units
 
 
-def get_field_types(record: type) -> dict[str, Any]:
+@cache
+def get_field_types(record: type) -> Mapping[str, Any]:
     """Return key -> annotation of the fields that a record takes from a file."""
     hints = typing.get_type_hints(record, include_extras=True)
     return {_key(f.name): hints[f.name] for f in dataclasses.fields(record) if f.init}
