@@ -41,7 +41,7 @@ def dataclass(
         own = set(vars(cls))
         if not own.isdisjoint(("__setattr__", "__delattr__")):
             raise TypeError(f"{cls.__name__} is frozen and cannot define how fields are set")
-        dataclasses.dataclass(repr=False, eq=False, kw_only=kw_only)(cls)
+        dataclasses.dataclass(repr=False, eq=False, kw_only=kw_only)(cls)  # noqa: TID251 here
         shared: dict[str, Any] = {"__setattr__": _set_once, "__delattr__": _refuse_to_delete}
         if repr:
             shared["__repr__"] = _represent
@@ -59,9 +59,10 @@ def dataclass(
 
 def _set_once(self: Any, name: str, value: object) -> None:
     """Set a field, as `__init__` does; raise FrozenInstanceError where it has a value."""
-    if name in self.__dict__ or name not in self.__dataclass_fields__:
+    state = self.__dict__
+    if name in state or name not in self.__dataclass_fields__:
         raise FrozenInstanceError(f"cannot assign to field {name!r}")
-    self.__dict__[name] = value
+    state[name] = value
 
 
 def _refuse_to_delete(self: object, name: str) -> NoReturn:
