@@ -42,6 +42,7 @@ HINTS = {
     "files.platform-unknown": "use --platform LINK",
     "files.platform-unclear": "use --platform LINK",
     "files.limb-branches": "use --platform LINK",
+    "files.motors-outside": "use --platform LINK",
     "files.no-limbs": "use --platform LINK",
     "files.urdf-needed": "use --into robot.urdf",
     "files.robot-of-program": "type loopcal import FILE -o printer.yaml --data heights.csv (for "

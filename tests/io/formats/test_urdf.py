@@ -13,7 +13,7 @@ from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.io.formats.urdf_closures import read_mechanism
 from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.mechanism.joint_graph import find_limb_paths
+from loopcal.mechanism.joint_graph import find_stage_paths
 from tests.io.formats.urdf_machines import UrdfSolver
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
@@ -60,7 +60,7 @@ def test_poses_agree_with_the_tree_after_closing_its_loops(files, read, name) ->
     robot = read[name][1]
     solver = UrdfSolver(files[name], files[name].with_name("robot.yaml"))
     mechanism = read_mechanism(urdf_tree.read(files[name]), files[name].with_name("robot.yaml"))
-    paths = find_limb_paths(mechanism.graph, mechanism.locate(FRAME[name])[0])
+    paths = find_stage_paths(mechanism.graph, mechanism.locate(FRAME[name])[0], lambda _: np.eye(4))
     start = np.zeros(len(solver.values))
     for joint, value in zip(paths.graph.names, paths.home, strict=True):
         start[solver.columns[joint]] = value

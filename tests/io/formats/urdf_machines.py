@@ -8,6 +8,7 @@ such URDF with xml and yaml, and closes its loops by Newton's method with finite
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -159,7 +160,10 @@ def write_constraint(joint: MachineJoint, frames: dict[str, np.ndarray]) -> str:
 def write_origin(element: str, T: np.ndarray) -> str:
     """Return an origin."""
     xyz = " ".join(repr(float(v)) for v in T[:3, 3])
-    rpy = " ".join(repr(float(v)) for v in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
+    with warnings.catch_warnings():  # of a pitch of 90 degrees, where one of many is as good
+        warnings.simplefilter("ignore", UserWarning)
+        angles = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
+    rpy = " ".join(repr(float(v)) for v in angles)
     return f'<{element} xyz="{xyz}" rpy="{rpy}"/>'
 
 

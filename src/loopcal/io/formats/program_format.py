@@ -171,7 +171,9 @@ class Format:
     stores_fit: bool = False
 
 
-def get_record(source: ExportSource, family: type, format_name: str, needed: str) -> Any:
+def get_record(
+    source: ExportSource, family: type | tuple[type, ...], format_name: str, needed: str
+) -> Any:
     """Return the family's record of a robot; DataError where it is not `needed`."""
     record = getattr(source.robot.record, "record", None)
     if not isinstance(record, family):

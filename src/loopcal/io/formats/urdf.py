@@ -10,43 +10,34 @@ the text stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from loopcal import geometry
-from loopcal.errors import DataError, FileError, MechanismError
+from loopcal.errors import FileError, MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.io.core.read_back import require_same, require_same_numbers
-from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.io.formats import urdf_tree
-from loopcal.io.formats.program_format import (
-    Exported,
-    ExportSource,
-    Format,
-    Imported,
-    ImportOptions,
-    format_head,
-    get_byte_order_mark,
-    get_record,
-    report_changes,
-)
+from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
 from loopcal.io.formats.urdf_closures import UrdfMechanism, read_mechanism
-from loopcal.io.formats.urdf_limbs import format_limb, format_pose
+from loopcal.io.formats.urdf_export import write
+from loopcal.io.formats.urdf_stages import (
+    choose_family,
+    choose_link,
+    format_robot,
+    list_stage_names,
+)
 from loopcal.io.formats.urdf_tree import Urdf
-from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
-from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.joint_graph import (
-    LimbPaths,
-    choose_coordinates,
+    ClosedStage,
+    StagePaths,
     count_repeated_closures,
-    find_limb_paths,
+    find_stage_paths,
     list_nearby,
     list_possible_platforms,
 )
 from loopcal.typing import FloatArray
+from loopcal.value_classes import replace
 
 LARGE = 30.0
 """Largest distance of two joints of a link that is plausible [m]; URDF has no other unit."""
@@ -54,21 +45,12 @@ LARGE = 30.0
 MIMICS = 1e-9
 """Largest difference between a joint and the one that it mimics [rad, m]."""
 
-PLACED = 1e-9
-"""Accepted difference between the places of a joint in URDF and robot file [m, 1]."""
-
-COORDINATES = {"rx": "roll", "ry": "pitch", "rz": "yaw", "x": "x", "y": "y", "z": "z"}
-
-REMARK = "Limbs are named after their first joint, joints as in the URDF."
-ROBOT = """\
-freedoms: [{freedoms}]
-controlled: [{controlled}]
-actuators:
-{actuators}
-limbs:
-{limbs}
-{parameters}home: {home}
-"""
+REMARKS = {
+    "limbs": "Limbs are named after their first joint, joints as in the URDF.",
+    "stages": "Stages are named after their joint, those with loops after the link that they "
+    "carry, limbs after their first joint, joints as in the URDF.",
+}
+"""What people should know about the names, by the family of the robot file."""
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
@@ -87,129 +69,48 @@ def read(path: Path, options: ImportOptions) -> Imported:
         closures = None
     mechanism = read_mechanism(urdf, closures)
     platform, frame = _find_platform(mechanism, options.platform)
+
+    def locate_frame(body: str) -> FloatArray:
+        return mechanism.locate(frame if body == platform else choose_link(mechanism, body))[1]
+
     try:
-        paths = find_limb_paths(mechanism.graph, platform)
+        paths = find_stage_paths(mechanism.graph, platform, locate_frame)
+        if paths.outside and options.platform is None:
+            finding = report_finding(
+                "files.motors-outside", motors=paths.outside, platform=platform
+            )
+            raise MechanismError(finding)
     except MechanismError as error:
-        finding = error.args[0]
-        joints = finding.data.get("joints", ("",))
-        raise urdf.error(finding, joints[-1]) from None
-    graph, T_body_frame = paths.graph, mechanism.locate(frame)[1]
+        finding = _name_links(mechanism, error.args[0])
+        raise urdf.error(finding, _find_origin(urdf, finding.data.get("joints", ()))) from None
     _check_mimics(urdf, paths)
-    motion = graph.find_motions(paths.home)
-    twists = graph.find_twists(paths.home, platform, T_body_frame)
-    home = graph.get_place(graph.place(paths.home[None]), platform)[0] @ T_body_frame
-    drives = (f"  {quote_scalar(name)}: {_format_drive(urdf, name)}" for name in graph.motors)
     closing = closures.name if closures is not None else "its constraints"
     what = f"a URDF with loop closures in {closing}"
-    limbs = [format_limb(paths, limb, T_body_frame) for limb in paths.limbs]
-    parameters = "".join(limb.parameters for limb in limbs)
-    head = format_head(path, what, "limbs", options.name, ("m", "rad"), REMARK)
-    text = head + ROBOT.format(
-        freedoms=", ".join(paths.freedoms),
-        controlled=", ".join(COORDINATES[n] for n in choose_coordinates(twists @ motion)),
-        actuators="\n".join(drives),
-        limbs="".join(limb.text for limb in limbs),
-        parameters=f"parameters:\n{parameters}\n" if parameters else "",
-        home=format_pose(home),
-    )
+    family = choose_family(paths)
+    remark = REMARKS[family]
+    head = format_head(path, what, family, options.name, ("m", "rad"), remark)
+    text = head + format_robot(mechanism, paths, frame)
     return Imported(text, None, tuple(_report_structure(mechanism, paths, frame)))
-
-
-def write(source: ExportSource, into: Path | None) -> Exported:
-    """Return the URDF with corrected origins.
-
-    Raises
-    ------
-    DataError : no URDF is given. FileError : its joints have other places than the robot's.
-    """
-    record: Limbs = get_record(source, Limbs, "urdf", "a robot of the family limbs")
-    if into is None:
-        raise DataError(report_finding("files.urdf-needed"))
-    urdf, changes, expressed = urdf_tree.read(into), [], set()
-    nominal = source.robot.parameters.nominal.tolist()
-    values = zip(source.values().items(), nominal, strict=True)
-    deviations = {name: value - before for (name, value), before in values}
-    for name, shifts, motor in _list_origins(record, urdf):
-        shift = np.array([deviations.get(parameter, 0.0) for parameter in shifts])
-        zero = deviations.get(f"{motor}.offset", 0.0)
-        expressed |= {*shifts, f"{motor}.offset"}
-        if not shift.any() and zero == 0.0:
-            continue
-        joint = urdf.places[name]
-        turn = zero if joint.kind == "R" else 0.0
-        R = geometry.exp_so3(turn * joint.axis)
-        moved = joint.origin @ geometry.make_pose(R, shift + (zero - turn) * joint.axis)
-        urdf = urdf.with_origin(name, moved, turned=turn != 0.0)
-        distance = float(np.linalg.norm(moved[:3, 3] - joint.origin[:3, 3]))
-        changes.append(
-            report_finding(
-                "files.joint-moved",
-                line=joint.line,
-                joint=name,
-                distance=Quantity(distance * 1e3, "mm"),
-                turn=Quantity(turn, "rad"),
-            )
-        )
-    others = tuple(name for name, d in deviations.items() if d and name not in expressed)
-    rest = (report_finding("files.not-expressed", format="the URDF", names=others),)
-    text = get_byte_order_mark(into) + urdf.text
-    findings = (*report_changes(changes), *(rest if others else ()))
-    return Exported(text, partial(_check_written, urdf=urdf), findings)
-
-
-def _check_written(path: Path, urdf: Urdf) -> None:
-    """Read a written URDF; raise LoopcalError where its joints have other places."""
-    read = urdf_tree.read(path)
-    require_same("joints", list(urdf.joints), list(read.joints))
-    for name, place in urdf.places.items():
-        require_same_numbers(f"origin of {name}", place.origin, read.places[name].origin)
-    require_same("the text is complete", True, read.text == urdf.text)
-
-
-def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:
-    """Yield URDF joint, names of the shifts along its axes, and its motor.
-
-    Raises
-    ------
-    FileError : a limb begins at another place than in the robot file.
-    """
-    named = [parameter.name for parameter in record.parameters]
-    for limb in record.limbs:
-        first = limb.chain[0] if limb.chain else None
-        if first is not None and first.name in urdf.joints:
-            _check_place(urdf, first.name, matrix_from_place(first.at))
-        driven = (j for j in limb.chain if isinstance(j, Revolute | Prismatic))
-        motors = {joint.name: joint.actuated for joint in driven if joint.actuated}
-        prefix = f"{limb.name}."
-        names = [entry.name or entry.of for entry in limb.errors] + list(motors)
-        names += [n.removeprefix(prefix)[:-2] for n in named if n.startswith(prefix)]
-        for name in dict.fromkeys(names):
-            if name in urdf.places:
-                shifts = [f"{limb.name}.{name}.{axis}" for axis in "xyz"]
-                yield name, shifts, motors.get(name) or ""
-
-
-def _check_place(urdf: Urdf, name: str, stated: FloatArray) -> None:
-    """Refuse a URDF in which the first joint of a limb has another place; raises FileError."""
-    joint = urdf.joints[name]
-    if urdf.find_body(joint.parent) != urdf.root:
-        return  # a closure carries it
-    place = urdf.place_in_body(joint.parent) @ joint.origin
-    if np.abs(place - stated).max() > PLACED:
-        sentence = f"joint {name!r} has another place in the robot file"
-        raise urdf.error(f"{sentence}; export into the URDF it was read from", name)
 
 
 def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str]:
     """Return the platform's body, and the link whose frame is the platform frame.
 
     It is the link that is named; else the only frame (a link on a fixed joint that closes no loop)
-    on a moving body, of several the only one on a body that limbs join to the base; else that body.
+    on a moving body, of several the only one on a body at an end of the mechanism that limbs join
+    to what carries it; else that body. Several ends, such as the feet of a humanoid, are listed.
     """
     urdf, graph = mechanism.urdf, mechanism.graph
     moving = graph.bodies[1:]
+    fixed = (joint.child for joint in urdf.joints.values() if not joint.kind)
+    frames = [link for link in fixed if link not in mechanism.frames]
+    frames = [link for link in frames if mechanism.locate(link)[0] in moving]
     possible = list_possible_platforms(graph)
-    links = tuple(link for body in possible or moving for link in mechanism.list_links(body))
+    suited = [link for link in frames if mechanism.locate(link)[0] in possible]
+    named = {mechanism.locate(link)[0] for link in suited}
+    # of each possible body its frames, or its link
+    others = (choose_link(mechanism, body) for body in possible or moving if body not in named)
+    links = (*suited, *others)
     if name is not None:
         known = name in {*urdf.carrier, urdf.root}
         body = mechanism.locate(name)[0] if known else None
@@ -217,20 +118,41 @@ def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str
             finding = report_finding("files.platform-unknown", platform=name, links=links)
             raise FileError(finding, urdf.path)
         return str(body), name
-    fixed = (joint.child for joint in urdf.joints.values() if not joint.kind)
-    frames = [link for link in fixed if link not in mechanism.frames]
-    frames = [link for link in frames if mechanism.locate(link)[0] in moving]
-    suited = [link for link in frames if mechanism.locate(link)[0] in possible]
     chosen = frames if len(frames) == 1 else suited
     if len(chosen) == 1:
         return mechanism.locate(chosen[0])[0], chosen[0]
     if not chosen and len(possible) == 1:
-        return possible[0], mechanism.list_links(possible[0])[0]
+        return possible[0], choose_link(mechanism, possible[0])
     finding = report_finding("files.platform-unclear", frames=tuple(frames), links=links)
     raise FileError(finding, urdf.path)
 
 
-def _check_mimics(urdf: Urdf, paths: LimbPaths) -> None:
+def _find_origin(urdf: Urdf, names: Sequence[str]) -> str:
+    """Return the last joint of the file among joints of a mechanism; empty where there is none.
+
+    Parts of a replaced joint end in _X, _Y or _Z; a closure has the name of a link.
+    """
+    for name in reversed(names):
+        carrier = urdf.carrier.get(name)
+        for joint in (name, name[:-2], carrier.name if carrier is not None else ""):
+            if joint in urdf.places:
+                return joint
+    return ""
+
+
+def _name_links(mechanism: UrdfMechanism, finding: Finding) -> Finding:
+    """Return a refusal that names the links of the file instead of the bodies that they form."""
+    bodies = {"body", "body_a", "body_b", "platform"}
+    data = {
+        key: choose_link(mechanism, value) if key in bodies else value
+        for key, value in finding.data.items()
+    }
+    if "platforms" in data:
+        data["platforms"] = tuple(choose_link(mechanism, body) for body in data["platforms"])
+    return replace(finding, data=data)
+
+
+def _check_mimics(urdf: Urdf, paths: StagePaths) -> None:
     """Refuse a joint that mimics another where the loops do not make it so; raises FileError."""
     graph = paths.graph
     near = list_nearby(graph, paths.home)
@@ -248,14 +170,7 @@ def _check_mimics(urdf: Urdf, paths: LimbPaths) -> None:
         raise urdf.error(finding, joint.name)
 
 
-def _format_drive(urdf: Urdf, name: str) -> str:
-    """Return one drive of the robot file."""
-    joint = urdf.joints[name]
-    stroke = "" if joint.limits is None else f", stroke: [{joint.limits[0]!r}, {joint.limits[1]!r}]"
-    return f"{{reads: {'angle' if joint.kind == 'R' else 'length'}, unknown: [offset]{stroke}}}"
-
-
-def _report_structure(mechanism: UrdfMechanism, paths: LimbPaths, frame: str) -> Iterator[Finding]:
+def _report_structure(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -> Iterator[Finding]:
     """Yield the size of the mechanism, its home, and what the robot file does not express."""
     graph, motions = paths.graph, paths.motions
     yield report_finding(
@@ -271,10 +186,17 @@ def _report_structure(mechanism: UrdfMechanism, paths: LimbPaths, frame: str) ->
     yield report_finding(
         "files.urdf-home", residual=f"{residual:.1g} m", frame=frame, freedoms=paths.freedoms
     )
+    if len(paths.stages) > 1:
+        names = list_stage_names(mechanism, paths)
+        loops = (isinstance(stage, ClosedStage) for stage in paths.stages)
+        closed = tuple(name for name, is_loop in zip(names, loops, strict=True) if is_loop)
+        yield report_finding("files.urdf-stages", count=len(names), stages=names, closed=closed)
     if graph.size > LARGE:
         yield report_finding("files.urdf-large", size=Quantity(graph.size, "m"))
     if motions.idle:
         yield report_finding("files.idle-motions", count=motions.idle, joints=motions.moved)
+    if paths.outside:
+        yield report_finding("files.motors-left-out", motors=paths.outside, frame=frame)
     if paths.dangling:
         yield report_finding("files.joints-dangling", joints=paths.dangling)
     if paths.replaced:

@@ -29,7 +29,9 @@ from loopcal.mechanism.joint_graph import (
     JointGraph,
     Weld,
     assemble_graph,
+    find_perpendicular,
     list_axes_across,
+    turn_between,
     weld_bodies,
 )
 from loopcal.plain_text import quote
@@ -253,30 +255,12 @@ def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | Gr
         return (GraphJoint(name, kind, a, b, A, B, first, near, far, shifts),)
     # the cross: at value zero the second axis is turned across the first
     cross = f"cross of {name}"
-    across = _find_perpendicular(first, second)
-    turn = geometry.make_pose(_turn_between(second, across), np.zeros(3))
+    across = find_perpendicular(first, second)
+    turn = geometry.make_pose(turn_between(second, across), np.zeros(3))
     return (
         GraphJoint(f"{name}_1", "R", a, cross, A, np.eye(4), first, near),
         GraphJoint(f"{name}_2", "R", cross, b, turn, B, second, "", far),
     )
-
-
-def _find_perpendicular(axis: FloatArray, near: FloatArray) -> FloatArray:
-    """Return the unit vector (3,) across an axis that is nearest to another vector."""
-    across = near - axis * (axis @ near)
-    if np.linalg.norm(across) < 1e-6:
-        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
-
-
-def _turn_between(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return a rotation (3, 3) that turns one unit vector into another."""
-    across = np.cross(one, other)
-    sine, cosine = float(np.linalg.norm(across)), float(one @ other)
-    if sine < 1e-12:
-        across, sine = _find_perpendicular(one, one), 1.0
-        return geometry.exp_so3(across * (0.0 if cosine > 0 else np.pi))
-    return geometry.exp_so3(across / sine * np.arctan2(sine, cosine))
 
 
 def _list_joints(urdf: Urdf, overrides: Mapping[str, str]) -> Iterator[GraphJoint]:

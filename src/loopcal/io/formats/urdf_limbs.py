@@ -125,13 +125,14 @@ def _format_joint(paths: LimbPaths, joint: GraphJoint, place: FloatArray) -> lis
     if joint.kind == "S":
         R = measure_rotation(paths.graph, paths.home, joint)
         roll, pitch, yaw = geometry.matrix_to_euler(R, "xyz")
-        start = _format_list((yaw, pitch, roll))
+        start = format_list((yaw, pitch, roll))
         return [f"      - {{joint: S, name: {name}, {where}, start: {start}}}"]
     motor = f", actuated: {name}" if joint.name in paths.graph.motors else ""
     value = get_value(paths.graph, paths.home, joint)
-    axis = f"axis: {_format_list(joint.axis)}, start: {value!r}"
+    axis = f"axis: {format_list(joint.axis)}, start: {value!r}"
     return [f"      - {{joint: {joint.kind}, name: {name}, {where}, {axis}{motor}}}"]
 
 
-def _format_list(vector: Any) -> str:
+def format_list(vector: Any) -> str:
+    """Return numbers as a flow list."""
     return f"[{', '.join(repr(float(v)) if abs(v) > ZERO else '0' for v in vector)}]"

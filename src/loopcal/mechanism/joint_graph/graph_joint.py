@@ -80,3 +80,21 @@ class GraphJoint:
 def list_axes_across(axis: FloatArray) -> str:
     """Return the axes of a joint's frame that are not the joint's."""
     return "".join(a for a, part in zip("xyz", np.abs(axis), strict=True) if part < 1 - 1e-9)
+
+
+def find_perpendicular(axis: FloatArray, near: FloatArray) -> FloatArray:
+    """Return the unit vector (3,) across an axis that is nearest to another vector."""
+    across = near - axis * (axis @ near)
+    if np.linalg.norm(across) < 1e-6:
+        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
+
+
+def turn_between(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return a rotation (3, 3) that turns one unit vector into another."""
+    across = np.cross(one, other)
+    sine, cosine = float(np.linalg.norm(across)), float(one @ other)
+    if sine < 1e-12:
+        across, sine = find_perpendicular(one, one), 1.0
+        return geometry.exp_so3(across * (0.0 if cosine > 0 else np.pi))
+    return geometry.exp_so3(across / sine * np.arctan2(sine, cosine))

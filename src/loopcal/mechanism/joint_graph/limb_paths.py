@@ -12,29 +12,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loopcal.errors import MechanismError
-from loopcal.findings import report_finding
 from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.joint_graph.graph_blocks import Block
 from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
-from loopcal.mechanism.joint_graph.home_pose import (
-    Freedoms,
-    find_freedoms,
-    find_homes,
-    is_drawn_pose,
-    list_nearby,
-)
+from loopcal.mechanism.joint_graph.home_pose import Freedoms, find_freedoms, list_nearby
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.typing import FloatArray
 from loopcal.value_classes import dataclass
 
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
-
-FIRM, FIRM_DRAWN = 0.5, 0.01
-"""Share of the best firmness that a home pose must have, and the pose that was drawn [1]."""
-
-INDEPENDENT = 1e-3
-"""Singular value, relative to the largest twist, above which coordinates are independent [1]."""
 
 Path = tuple[GraphJoint, ...]
 
@@ -45,10 +32,10 @@ class LimbPaths:
 
     Attributes
     ----------
-    graph : without bodies that hang on it only. home : joint values (j,). platform : its body.
+    graph : its base carries the limbs. home : joint values (j,). platform : its body.
     limbs : joints of each limb, each from the body before it. freedoms : of the platform, in base
         axes. motions : what motors and passive joints can do at home.
-    replaced : joints that the freedoms express. dangling : joints that were left out.
+    replaced : joints that the freedoms express.
     """
 
     graph: JointGraph
@@ -58,138 +45,89 @@ class LimbPaths:
     freedoms: tuple[str, ...]
     motions: Freedoms
     replaced: tuple[str, ...] = ()
-    dangling: tuple[str, ...] = ()
 
 
-def find_limb_paths(graph: JointGraph, platform: str) -> LimbPaths:
-    """Return the limbs at the nearest home pose in which the motors hold the platform firmly.
+def find_limbs(block: Block) -> tuple[tuple[Path, ...] | None, bool]:
+    """Return the limbs of a block from its base to its platform, and whether they are all of it.
 
-    Raises
-    ------
-    MechanismError : the loops do not close, a limb branches, no limbs join base and platform, or a
-        motor moves nothing between them; a finding with the joints.
+    They are None where a limb branches; limbs that are not all of it need `is_translating`.
     """
-    whole, graph = graph, remove_dangling(graph, platform)
-    dangling = tuple(joint.name for joint in whole.joints if joint not in graph.joints)
-    outside = tuple(name for name in whole.motors if name in dangling)
-    if outside:
-        finding = report_finding("files.motors-outside", motors=outside, platform=platform)
-        raise MechanismError(finding)
-    homes = find_homes(graph)
-    motions = [find_freedoms(graph, home, platform) for home in homes]
-    complete = limbs = _find_complete_limbs(graph, platform)
-    if limbs is None:
-        limbs = _find_driven_limbs(graph, platform)
-        kept = [
-            i for i in range(len(homes)) if _is_translating(graph, homes[i], motions[i], platform)
-        ]
-        homes, motions = tuple(homes[i] for i in kept), [motions[i] for i in kept]
-    if limbs is None or not homes:
-        raise MechanismError(_describe_branch(whole, graph, platform))
-    share = FIRM_DRAWN if is_drawn_pose(graph, homes[0]) else FIRM
-    limit = share * max(one.firmness for one in motions)
-    home, motion = next(
-        pair for pair in zip(homes, motions, strict=True) if pair[1].firmness >= limit
-    )
-    freedoms = _list_freedoms(graph, home, platform)
-    if complete and not _stay_within(graph, home, platform, freedoms):
-        freedoms = AXES
+    complete = find_complete_limbs(block.graph, block.platform)
+    if complete is not None:
+        return complete, True
+    return _find_driven_limbs(block.graph, block.platform), False
+
+
+def place_limbs(
+    block: Block,
+    home: FloatArray,
+    limbs: tuple[Path, ...],
+    is_complete: bool,
+    T_body_frame: FloatArray,
+) -> LimbPaths:
+    """Return the limbs of a block at its home pose (j,), for a frame (4, 4) of its platform.
+
+    Loops of complete limbs are closed in all components of twist that one of their joints can have,
+    so that a planar loop has three equations, and one with a joint across its plane has six.
+    """
+    graph, platform = block.graph, block.platform
+    freedoms = list_freedoms(graph, home, platform, T_body_frame, is_complete)
     limbs = _sort_limbs(limbs, graph.motors)
     used = {joint.name for limb in limbs for joint in limb}
     used |= {joint.origin_b for limb in limbs for joint in limb}
     replaced = tuple(joint.name for joint in graph.joints if joint.name not in used)
-    return LimbPaths(graph, home, platform, limbs, freedoms, motion, replaced, dangling)
+    motions = find_freedoms(graph, home, platform)
+    return LimbPaths(graph, home, platform, limbs, freedoms, motions, replaced)
 
 
-def remove_dangling(graph: JointGraph, platform: str) -> JointGraph:
-    """Return the mechanism without bodies that hang on it by one joint, such as a camera."""
-    while True:
-        counts = dict.fromkeys(graph.bodies, 0)
-        for joint in graph.joints:
-            counts[joint.body_a] += 1
-            counts[joint.body_b] += 1
-        loose = frozenset(
-            body for body, n in counts.items() if n < 2 and body not in (graph.base, platform)
-        )
-        if not loose:
-            return graph
-        graph = graph.without(loose)
-
-
-def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
-    """Return the bodies that limbs join to the base without branches, those with most limbs first.
-
-    Bodies in the middle of an unbranched chain are left out where another body has more limbs, and
-    bodies that fewer joints than motors carry, where others have more.
-    """
-    counts, carried = {}, {}
-    for body in graph.bodies[1:]:
-        limbs = _find_complete_limbs(remove_dangling(graph, body), body)
-        if limbs is not None:
-            carried[body] = min(len(limb) for limb in limbs)
-            counts[body] = len(limbs)
-    needed = min(max(carried.values(), default=0), len(graph.motors))
-    counts = {body: count for body, count in counts.items() if carried[body] >= needed}
-    most = max(counts.values(), default=0)
-    return tuple(body for body, count in counts.items() if count == most)
-
-
-def choose_coordinates(twists: FloatArray) -> list[str]:
-    """Return coordinates of the platform that move independently, positions first.
-
-    `twists` (6, m) are those of the platform for the m motions of the mechanism.
-    """
-    chosen: list[str] = []
-    for name in ("x", "y", "z", "rx", "ry", "rz"):
-        rows = twists[[AXES.index(n) for n in (*chosen, name)]]
-        s = np.linalg.svd(rows, compute_uv=False)
-        if len(chosen) < twists.shape[1] and s[-1] > INDEPENDENT * np.abs(twists).max():
-            chosen.append(name)
-    return chosen
-
-
-def _is_translating(graph: JointGraph, home: FloatArray, motion: Freedoms, platform: str) -> bool:
+def is_translating(block: Block, home: FloatArray) -> bool:
     """Return whether motors set all freedoms of a platform that does not turn near a home pose."""
-    if motion.mobility != len(graph.motors):
+    motion = find_freedoms(block.graph, home, block.platform)
+    if motion.mobility != len(block.graph.motors):
         return False
-    freedoms = _list_freedoms(graph, home, platform)
+    freedoms = list_freedoms(block.graph, home, block.platform, np.eye(4))
     return len(freedoms) == motion.mobility and not any(name.startswith("r") for name in freedoms)
 
 
-def _list_freedoms(graph: JointGraph, home: FloatArray, platform: str) -> tuple[str, ...]:
-    """Return the components of twist in which the platform moves, at home or near it."""
+def list_freedoms(
+    graph: JointGraph,
+    home: FloatArray,
+    platform: str,
+    T_body_frame: FloatArray,
+    of_joints: bool = False,
+) -> tuple[str, ...]:
+    """Return the components of twist in which a frame of the platform moves, at home or near it.
+
+    With `of_joints`, those in which any joint alone would move it.
+    """
     largest = np.zeros(6)
     for q in list_nearby(graph, home):
-        motion = graph.find_twists(q, platform, np.eye(4)) @ graph.find_motions(q)
-        largest = np.maximum(largest, np.abs(motion).max(axis=1, initial=0.0))
-    return tuple(name for name, size in zip(AXES, largest, strict=True) if size > MOTION)
+        motion = graph.find_twists(q, platform, T_body_frame) @ graph.find_motions(q)
+        moves = [motion]
+        if of_joints:
+            moves += _list_joint_twists(graph, q, platform, T_body_frame)
+        largest = np.maximum(largest, np.abs(np.column_stack(moves)).max(axis=1, initial=0.0))
+    limit = MOTION * np.array([1.0] * 3 + [max(1.0, graph.size)] * 3)
+    return tuple(name for name, size in zip(AXES, largest > limit, strict=True) if size)
 
 
-def _stay_within(
-    graph: JointGraph, home: FloatArray, platform: str, freedoms: tuple[str, ...]
-) -> bool:
-    """Return whether rotary joints and slides move the platform in its freedoms only.
-
-    Loops are closed in the freedoms of the platform. A joint across them, which its loop keeps from
-    moving, would be free there.
-    """
-    placement = graph.place(home[None])
-    origin = graph.get_place(placement, platform)[0, :3, 3]
-    others = [AXES.index(name) for name in AXES if name not in freedoms]
+def _list_joint_twists(
+    graph: JointGraph, q: FloatArray, platform: str, T_body_frame: FloatArray
+) -> list[FloatArray]:
+    """Return the twists (6, 1 or 3) that each joint alone gives a frame of the platform."""
+    placement = graph.place(q[None])
+    origin = (graph.get_place(placement, platform) @ T_body_frame)[0, :3, 3]
+    twists = []
     for joint in graph.joints:
-        if joint.kind == "S":
-            continue
         frame = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
-        axis = frame[:3, :3] @ joint.axis
-        arm = np.cross(axis, origin - frame[:3, 3])
-        turn, velocity = (axis, arm) if joint.kind == "R" else (0 * axis, axis)
-        twist = dict(zip(("rx", "ry", "rz", "x", "y", "z"), (*turn, *velocity), strict=True))
-        if any(abs(twist[AXES[i]]) > MOTION * max(1.0, graph.size) for i in others):
-            return False
-    return True
+        axes = frame[:3, :3] if joint.kind == "S" else (frame[:3, :3] @ joint.axis)[:, None]
+        arms = np.cross(axes, origin - frame[:3, 3], axisa=0, axisc=0)
+        slides = joint.kind == "P"
+        twists.append(np.concatenate([0.0 * axes, axes] if slides else [axes, arms]))
+    return twists
 
 
-def _find_complete_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
+def find_complete_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
     """Return limbs that contain every body and joint; None where there are none."""
     left, limbs = list(graph.joints), []
     for first in [joint for joint in graph.joints if graph.base in (joint.body_a, joint.body_b)]:
@@ -247,18 +185,6 @@ def _find_shortest_path(graph: JointGraph, first: GraphJoint, platform: str) -> 
                     visited.add(after)
                     queue.append((*path, joint))
     return None
-
-
-def _describe_branch(whole: JointGraph, graph: JointGraph, platform: str) -> object:
-    """Return the refusal, with the joints of the first body at which a limb branches."""
-    others = tuple(body for body in list_possible_platforms(whole) if body != platform)
-    for body in graph.bodies:
-        names = tuple(joint.name for joint in graph.joints if body in (joint.body_a, joint.body_b))
-        if body not in (graph.base, platform) and len(names) > 2:
-            return report_finding(
-                "files.limb-branches", joints=names, body=body, platform=platform, platforms=others
-            )
-    return report_finding("files.no-limbs", platform=platform, platforms=others)
 
 
 def _orient_path(path: Sequence[GraphJoint], body: str) -> Path:
