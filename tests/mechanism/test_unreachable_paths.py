@@ -6,7 +6,7 @@ import pytest
 
 from loopcal import engine
 from loopcal.io import load_robot
-from loopcal.mechanism import batch_kinematics, forward
+from loopcal.mechanism import forward, reading_paths
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_unreachable_readings_take_few_solutions_and_stay_marked(calls) -> None:
     robot = load_robot("hexapod-42")
     calls.clear()
     assert not forward(robot, far).converged.any()
-    first, last = batch_kinematics.PATH_STEPS
+    first, last = reading_paths.PATH_STEPS
     assert len(calls) < 1 + first + last  # the finer path ended before its last step
 
 
@@ -35,5 +35,5 @@ def test_redundant_readings_that_contradict_each_other_take_few_solutions(calls)
     calls.clear()
     state = forward(robot, np.full((3, 4), 80.0))  # every line half a meter shorter than at home
     assert not state.converged.any()
-    first, last = batch_kinematics.PATH_STEPS
+    first, last = reading_paths.PATH_STEPS
     assert len(calls) < 1 + first + last / 2  # the finer path ended where the gap opened wide

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     )
     from loopcal.mechanism.batch_kinematics import forward_trials as forward_trials
     from loopcal.mechanism.batch_kinematics import inverse_trials as inverse_trials
+    from loopcal.mechanism.batch_kinematics import step_towards_closure as step_towards_closure
     from loopcal.mechanism.compilation import build as build
     from loopcal.mechanism.families import FAMILIES as FAMILIES
     from loopcal.mechanism.families.records import AngleTolerance as AngleTolerance
@@ -101,6 +102,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism.states import driven_values as driven_values
     from loopcal.mechanism.states import select_poses as select_poses
     from loopcal.mechanism.transmission import TERMS as TERMS
+    from loopcal.mechanism.transmission import WEIGHT as WEIGHT
     from loopcal.mechanism.transmission import harmonic_frequencies as harmonic_frequencies
     from loopcal.mechanism.transmission import joint_slopes as joint_slopes
     from loopcal.mechanism.transmission import joints_from_readings as joints_from_readings
@@ -129,6 +131,7 @@ else:
             """,
             "loopcal.mechanism.batch_kinematics": """
                 compute_closure_sign compute_readings find_directly_reachable forward_trials
+                step_towards_closure
                 inverse_trials
             """,
             "loopcal.mechanism.compilation": "build",
@@ -160,7 +163,7 @@ else:
             """,
             "loopcal.mechanism.states": "Status compute_limb_frames driven_values select_poses",
             "loopcal.mechanism.transmission": """
-                TERMS harmonic_frequencies joint_slopes joints_from_readings nominal_terms
+                TERMS WEIGHT harmonic_frequencies joint_slopes joints_from_readings nominal_terms
                 readings_from_joints term_derivatives
             """,
             "loopcal.mechanism.triangle": "TRIANGLE_TERMS compute_range",

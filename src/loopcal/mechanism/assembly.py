@@ -13,10 +13,9 @@ from typing import Protocol
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.platform_coordinates import COORDINATES, check_coordinates
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
-from loopcal.units import SI_SYMBOLS, Dimension
+from loopcal.units import Dimension
 from loopcal.value_classes import dataclass, field
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")
@@ -175,6 +174,8 @@ class Actuator:
         the joint value is the reading.
     period : reading per turn of the source of the harmonics [m or rad], 0 for none.
     sigma : standard deviation of the reading, weighs redundant readings [m or rad].
+    weights : of a summed drive, by the name of a driven joint: the transmission gives the sum of
+        weight * joint value. Without them it gives the value of the joint of its own name.
     """
 
     name: str
@@ -183,6 +184,12 @@ class Actuator:
     terms: Mapping[str, float] = field(default_factory=dict)
     period: float = 0.0
     sigma: float | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def driven_joints(self) -> tuple[str, ...]:
+        """Names of the driven joints that it reads: its own, or those of its sum."""
+        return tuple(self.weights) or (self.name,)
 
     @property
     def is_triangle(self) -> bool:
@@ -226,11 +233,16 @@ class Assembly:
     stages: tuple[AttachedStage, ...] = ()
 
     @cached_property
+    def driven_joints(self) -> tuple[str, ...]:
+        """Names of the driven joints: those of the actuators, of summed drives those of sums."""
+        return tuple(dict.fromkeys(name for a in self.actuators for name in a.driven_joints))
+
+    @cached_property
     def passive_joints(self) -> tuple[tuple[Limb, Joint], ...]:
         """Joints whose value is no reading, with their limbs: passive ones, and pins of triangles
         that a linear actuator turns.
         """
-        read = {a.name for a in self.actuators if not a.is_triangle}
+        read = {name for a in self.actuators if not a.is_triangle for name in a.driven_joints}
         pairs = ((limb, joint) for limb in self.limbs for joint in limb.joints)
         return tuple((limb, joint) for limb, joint in pairs if joint.actuator not in read)
 
@@ -240,13 +252,18 @@ class Assembly:
         limb_of = {drive: limb.name for limb in reversed(self.limbs) for drive in limb.drives}
         limb_of |= {limb.name: limb.name for limb in self.limbs}
         owners: dict[str, set[str]] = {}
+        for actuator in self.actuators:
+            # the terms of a sum belong to the limbs of its joints
+            limbs = {limb_of[name] for name in actuator.driven_joints}
+            limb_of.setdefault(actuator.name, next(iter(limbs)) if len(limbs) == 1 else "")
         for entry in self.maps:
             owners.setdefault(entry.parameter, set()).add(limb_of[entry.address.owner])
         for shared in self.shared:
             limbs = {limb_of[address.owner] for address in shared.outputs}
             for name in shared.inputs:
                 owners.setdefault(name, set()).update(limbs)
-        return {name: next(iter(limbs)) for name, limbs in owners.items() if len(limbs) == 1}
+        single = {name: next(iter(limbs)) for name, limbs in owners.items() if len(limbs) == 1}
+        return {name: limb for name, limb in single.items() if limb}
 
 
 @dataclass(frozen=True)
@@ -266,19 +283,6 @@ class AttachedStage:
     assembly: Assembly
 
 
-def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:
-    """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError.
-
-    A stage that is a serial joint needs no controlled coordinates, because its joint is commanded.
-    """
-    _check_size(assembly)
-    _check_names(assembly)
-    for limb in assembly.limbs:
-        _check_limb(limb)
-    _check_freedoms(assembly, is_stage)
-    _check_ranges(assembly)
-
-
 def is_serial(assembly: Assembly) -> bool:
     """Return whether the pose is the product of driven joints: one limb without passive joints."""
     if assembly.stages or len(assembly.limbs) != 1 or len(assembly.freedoms) < len(AXES):
@@ -287,113 +291,7 @@ def is_serial(assembly: Assembly) -> bool:
     return limb.ending == "rigid" and all(joint.actuator for joint in limb.joints)
 
 
-def _check_size(assembly: Assembly) -> None:
-    """Refuse more limbs, joints, actuators or parameters than a mechanism may have."""
-    refuse_more(MOST_LIMBS, len(assembly.limbs), f"{assembly.name} has", "limbs")
-    for limb in assembly.limbs:
-        refuse_more(MOST_JOINTS, len(limb.joints), f"limb {limb.name!r} has", "joints")
-    refuse_more(MOST_ACTUATORS, len(assembly.actuators), f"{assembly.name} has", "actuators")
-    refuse_more(MOST_PARAMETERS, len(assembly.parameters), f"{assembly.name} has", "parameters")
-
-
 def refuse_more(most: int, count: int, subject: str, noun: str) -> None:
     """Raise MechanismError where `count` is above `most`: `subject count noun`."""
     if count > most:
         raise MechanismError(f"{subject} {count} {noun}, but at most {most} are allowed; use fewer")
-
-
-def _check_names(assembly: Assembly) -> None:
-    """Refuse duplicate names, and drives or actuators without their counterpart."""
-    limbs, actuators = [limb.name for limb in assembly.limbs], [a.name for a in assembly.actuators]
-    for kind, names in (("limb", limbs), ("actuator", actuators)):
-        for name in names:
-            if names.count(name) > 1:
-                raise MechanismError(f"two {kind}s are called {name!r}; give each its own name")
-    driven = [name for limb in assembly.limbs for name in limb.drives]
-    for name in actuators:
-        if name not in driven:
-            raise MechanismError(
-                f"actuator {name!r} drives 0 joints; let it drive one joint, or one in each of "
-                "several limbs"
-            )
-    unknown = sorted(set(driven) - set(actuators))
-    if unknown:
-        raise MechanismError(
-            f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or "
-            "correct the name"
-        )
-
-
-def _check_limb(limb: Limb) -> None:
-    """Refuse duplicate names, two joints on a drive, an unknown ending or missing links."""
-    joints = [joint.name for joint in limb.joints]
-    if len(set(joints)) < len(joints):
-        raise MechanismError(
-            f"two joints of limb {limb.name!r} have the same name ({', '.join(joints)}); give each "
-            "its own name"
-        )
-    if len(set(limb.drives)) < len(limb.drives):
-        raise MechanismError(
-            f"actuator {limb.drives[0]!r} drives two joints of limb {limb.name!r}; an actuator "
-            "may drive one joint of a limb"
-        )
-    if limb.ending not in ENDINGS:
-        raise MechanismError(
-            f"limb {limb.name!r} ends in {limb.ending!r}; allowed endings are {', '.join(ENDINGS)}"
-        )
-    if len(limb.links) != len(limb.joints) + 1:
-        raise MechanismError(
-            f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; give "
-            "one link more than joints"
-        )
-
-
-def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
-    """Refuse missing, unknown or duplicate freedoms and controlled coordinates."""
-    freedoms = assembly.freedoms
-    unknown = [f for f in freedoms if f not in AXES]
-    if unknown:
-        raise MechanismError(
-            f"{unknown[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}"
-        )
-    if not freedoms:
-        raise MechanismError(
-            f"{assembly.name} has no freedoms; state those of its platform, of {', '.join(AXES)}"
-        )
-    duplicates = [f for f in freedoms if freedoms.count(f) > 1]
-    if duplicates:
-        raise MechanismError(
-            f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}; name each once"
-        )
-    rotations = [f for f in freedoms if f.startswith("r")]
-    if len(rotations) == 2:
-        raise MechanismError(
-            f"{assembly.name} has the freedoms {' and '.join(rotations)}, which define no pose: "
-            "the same two rotations in another order lead to another one. Let the platform have "
-            "all freedoms, and add a limb with the joint that holds it, such as {joint: U, axes: "
-            "[x, y]} with the ending rigid"
-        )
-    if is_stage and is_serial(assembly):
-        return
-    if not assembly.controlled:
-        raise MechanismError(
-            f"{assembly.name} names no controlled coordinate; state one for each freedom, of "
-            f"{', '.join(COORDINATES)}"
-        )
-    check_coordinates(assembly.controlled)
-
-
-def _check_ranges(assembly: Assembly) -> None:
-    """Refuse strokes and limits whose low end is not below the high one."""
-    ranges = [(f"stroke of {a.name} runs", a.stroke, a.dimension) for a in assembly.actuators]
-    ranges += [
-        (f"limits of {limb.name}.{joint.name} run", joint.limits, joint.dimension)
-        for limb in assembly.limbs
-        for joint in limb.joints
-    ]
-    for what, bounds, dimension in ranges:
-        if bounds and not bounds[0] < bounds[1]:
-            raise MechanismError(
-                f"the {what} from {bounds[0]:g} to {bounds[1]:g} {SI_SYMBOLS[dimension]}; the "
-                "first value must be smaller"
-            )

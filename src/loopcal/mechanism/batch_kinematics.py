@@ -25,27 +25,31 @@ from loopcal.mechanism.platform_coordinates import (
     pose_from_coordinates,
     read_coordinates,
 )
+from loopcal.mechanism.reading_paths import (
+    Loops,
+    clear_sign,
+    find_wrong_rows,
+    follow_path,
+    is_square,
+)
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.stages.chain_inverse import solve_readings
 from loopcal.mechanism.stages.chain_kinematics import multiply_signs, solve_stages
 from loopcal.mechanism.stages.serial_limb import solve_serial
-from loopcal.mechanism.states import Status, driven_values, replace_rows, select_rows, without_poses
+from loopcal.mechanism.states import Status, driven_values, without_poses
+from loopcal.mechanism.summed_drives import solve_open_sums
+from loopcal.mechanism.sums import apply_weights
 from loopcal.mechanism.transmission import (
+    evaluate_sums,
     find_triangles,
     joints_from_readings,
     measure_excess,
     readings_from_joints,
+    select_weights,
 )
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
-PATH_STEPS = (8, 64)
-"""Steps of the path from the start's readings, tried in turn where the direct solution fails."""
-WIDE = 1e-2
-"""Gap, relative to the robot's size, that the errors of redundant readings do not explain.
-
-A pose that they leave open by more is a wrong minimum.
-"""
 ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
 
 
@@ -73,6 +77,9 @@ def forward_trials(
     e, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
+        if robot.has_open_sums:
+            sums = evaluate_sums(q, tau, robot.slots.frequency)
+            return close_at_joints(robot, e, sums, start, follow, weights=select_weights(tau))
         joints = joints_from_readings(q, tau, robot.slots.frequency)
     state = close_at_joints(robot, e, joints, start, follow, goal)
     return _mark_out_of_reach(robot, state, q, tau) if len(find_triangles(tau)) else state
@@ -96,22 +103,42 @@ def close_at_joints(
     start: State | None = None,
     follow: bool = True,
     goal: State | None = None,
+    weights: FloatArray | None = None,
 ) -> State:
     """Solve forward kinematics like `forward_trials`, for displacements and joint values.
 
     e : (t | 1, n_displacements). joints : (t | 1, n, n_joints) values of the driven joints, n > 0.
+    With `weights` (t | 1, a, n_joints) they are their sums (t | 1, n, a).
     """
     begin = clear_sign(robot, start or robot.home_state)
     if robot.is_serial:
         return solve_serial(robot, e, joints, begin.T.shape[:2])
-    state = clear_sign(robot, engine.solve(robot.program, e, joints, begin, goal=goal))
-    wrong = _find_wrong_rows(robot, state, begin)
+    loops = Loops(robot, e, weights)
+    state = loops.solve(joints, begin, goal)
+    wrong = find_wrong_rows(robot, state, begin)
     if not wrong.any():
         return state
     if not follow:
         beyond = wrong & (state.status == Status.CONVERGED.value)
         return replace(state, status=np.where(beyond, np.int8(Status.OTHER_MODE), state.status))
-    return _follow_path(robot, e, joints, begin, state, wrong)
+    return follow_path(loops, joints, begin, state, wrong)
+
+
+def step_towards_closure(
+    robot: Mechanism, values: FloatArray, q: FloatArray, begin: State
+) -> State:
+    """Return the states (t, n) one Newton step from `begin` at readings q (t | 1, n, a).
+
+    For robots without stages.
+    """
+    e, tau = robot.slots(values)
+    if robot.has_open_sums:
+        weights = select_weights(tau)
+        assert weights is not None
+        sums = evaluate_sums(q, tau, robot.slots.frequency)
+        return solve_open_sums(robot.program, e, weights, sums, begin, 1)
+    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    return engine.solve(robot.program, e, joints, begin, max_iterations=1)
 
 
 def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:
@@ -192,10 +219,15 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
         return multiply_signs(robot, values, state, compute_closure_sign)
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
-    if not _is_square(robot):
+    if not is_square(robot):
         return np.zeros(state.status.shape, np.int8)
-    e, _ = robot.slots(values)
+    e, tau = robot.slots(values)
     joints = driven_values(robot.program, state)
+    if robot.has_open_sums:
+        weights = select_weights(tau)
+        assert weights is not None
+        sums = apply_weights(weights, joints)
+        return solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
     return engine.solve(robot.program, e, joints, state, max_iterations=0).closure_sign
 
 
@@ -210,108 +242,6 @@ def count_shared_drives(program: Program) -> int:
     """Return the number of driven joints beyond one for each actuator."""
     driven = sum(int((columns >= 0).sum()) for g in program.groups for columns in g.actuator)
     return driven - program.n_joints
-
-
-def _is_square(robot: Mechanism) -> bool:
-    """Return whether closure with locked actuators has as many equations as freedoms."""
-    if robot.stages:
-        return all(_is_square(stage.robot) for stage in robot.stages)
-    return robot.program.is_square
-
-
-def clear_sign(robot: Mechanism, state: State) -> State:
-    """Return the state with sign 0 if closure is not square: the sign means nothing there."""
-    if _is_square(robot):
-        return state
-    return replace(state, closure_sign=np.zeros_like(state.closure_sign))
-
-
-def _find_open_rows(robot: Mechanism, state: State) -> BoolArray:
-    """Return the rows that failed or left a wide gap."""
-    return (state.status != Status.CONVERGED.value) | (state.residual > WIDE * robot.size)
-
-
-def _find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
-    """Return the rows that failed, ended beyond a singularity or left a wide gap."""
-    closed = state.status == Status.CONVERGED.value
-    beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
-    failed = (
-        ~closed & (state.status != Status.NOT_FINITE.value) & (state.status != engine.NEAR_GOAL)
-    )
-    return failed | closed & beyond
-
-
-def _follow_path(
-    robot: Mechanism,
-    e: FloatArray,
-    joints: FloatArray,
-    begin: State,
-    state: State,
-    wrong: BoolArray,
-) -> State:
-    """Solve the wrong rows along the straight path of joint values from the start.
-
-    The steps become smaller until a row arrives.
-    """
-    shape = state.T.shape[0], state.T.shape[1]
-    trial, pose = np.nonzero(wrong)
-    displacements = np.broadcast_to(e, (shape[0], e.shape[1]))[trial]
-    target = np.broadcast_to(joints, (*shape, joints.shape[2]))[trial, pose][:, None]
-    first, result = select_rows(begin, shape, trial, pose), select_rows(state, shape, trial, pose)
-    origin = driven_values(robot.program, first)
-    alive = np.arange(len(trial))
-    for count in PATH_STEPS:
-        zero = np.zeros(len(alive), int)
-        begun = select_rows(first, (len(trial), 1), alive, zero)
-        path = origin[alive], target[alive]
-        leave = count == PATH_STEPS[-1]
-        current = _take_steps(robot, displacements[alive], path, begun, count, leave)
-        result = replace_rows(result, alive, zero, current)
-        alive = alive[_find_wrong_rows(robot, current, begun)[:, 0]]
-        if not len(alive):
-            break
-    closed = result.status == Status.CONVERGED.value
-    status = np.where(
-        closed & (result.residual > WIDE * robot.size), np.int8(Status.UNREACHABLE), result.status
-    )
-    other = closed & (result.closure_sign != first.closure_sign)
-    status = np.where(other, np.int8(Status.OTHER_MODE), status)
-    return replace_rows(state, trial, pose, replace(result, status=status))
-
-
-def _take_steps(
-    robot: Mechanism,
-    e: FloatArray,
-    path: tuple[FloatArray, FloatArray],
-    begin: State,
-    count: int,
-    leave: bool,
-) -> State:
-    """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
-
-    With `leave`, a row that fails or opens wide on the way goes to the end at once: there the path
-    leaves the reach of the robot, and each further step would use many iterations for nothing.
-    """
-    origin, target = path
-    current, moving = begin, np.arange(len(target))
-    for step in range(1, count + 1):
-        zero = np.zeros(len(moving), int)
-        q = origin[moving] + (target[moving] - origin[moving]) * (step / count)
-        solved = engine.solve(
-            robot.program, e[moving], q, select_rows(current, (len(target), 1), moving, zero)
-        )
-        current = replace_rows(current, moving, zero, clear_sign(robot, solved))
-        if leave and step < count:
-            failed = moving[_find_open_rows(robot, current)[moving, 0]]
-            if len(failed):
-                zero = np.zeros(len(failed), int)
-                state = select_rows(current, (len(target), 1), failed, zero)
-                solved = engine.solve(robot.program, e[failed], target[failed], state)
-                current = replace_rows(current, failed, zero, clear_sign(robot, solved))
-                moving = np.setdiff1d(moving, failed)
-                if not len(moving):
-                    break
-    return current
 
 
 def _inverse_with_shared_drives(

@@ -13,7 +13,8 @@ from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb, check_assembly
+from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb
+from loopcal.mechanism.assembly_checks import check_assembly
 from loopcal.mechanism.batch_kinematics import (
     compute_closure_sign,
     count_shared_drives,
@@ -32,7 +33,7 @@ from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.stages.chain_compilation import build_chain
 from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import driven_values, make_start
-from loopcal.mechanism.transmission import ALL_TERMS, harmonic_frequencies, nominal_terms
+from loopcal.mechanism.transmission import harmonic_frequencies, name_terms, nominal_terms
 from loopcal.parameters import ParameterTable
 from loopcal.typing import IntArray
 from loopcal.units import DISPLAY_UNITS, SI_SYMBOLS, Dimension
@@ -83,7 +84,7 @@ def _compile(
     check_nominal_values(table)
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
-    size, a = compute_characteristic_length(assembly), len(assembly.actuators)
+    size, a = compute_characteristic_length(assembly), len(assembly.driven_joints)
     groups, places, count = _group_limbs(assembly, slots, {})
     guess = _make_first_guess(assembly, groups)
     idle = find_idle_joints(Program(groups, freedoms, size, count, a), guess)
@@ -91,6 +92,7 @@ def _compile(
     if idle:
         groups, places, count = _group_limbs(assembly, slots, idle)
         guess = _make_first_guess(assembly, groups)
+    _check_sums(assembly, groups, freedoms)
     weights = _weigh_actuators(assembly, groups, freedoms)
     robot = Mechanism(
         assembly,
@@ -140,13 +142,13 @@ def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
     Refuses maps onto addresses that the mechanism does not have.
     """
     limbs = {limb.name: limb for limb in assembly.limbs}
-    actuators = {a.name for a in assembly.actuators}
+    actuators, terms = {a.name for a in assembly.actuators}, name_terms(assembly.actuators)
     slots: dict[str, dict[Address, Slot]] = {name: {} for name in limbs}
     addresses = dict.fromkeys(m.address for m in assembly.maps)
     addresses |= dict.fromkeys(a for s in assembly.shared for a in s.outputs)
     unknown = []
     for address in addresses:
-        is_term = address.element == "transmission" and address.axis in ALL_TERMS
+        is_term = address.element == "transmission" and address.axis in terms
         if is_term and address.owner in actuators:
             continue
         slot = _find_slot(limbs[address.owner], address) if address.owner in limbs else None
@@ -237,8 +239,8 @@ def _group_limbs(
 
 
 def _number_actuators(assembly: Assembly, limbs: list[Limb]) -> IntArray:
-    """Return the actuators (J + 1, k) of each joint and rod of limbs, -1 for passive ones."""
-    column = {a.name: i for i, a in enumerate(assembly.actuators)}
+    """Return the columns of q (J + 1, k) of each joint and rod of limbs, -1 for passive ones."""
+    column = {name: i for i, name in enumerate(assembly.driven_joints)}
     drives = [
         [column[name] if name else -1 for name in (*(j.actuator for j in m.joints), m.actuator)]
         for m in limbs
@@ -263,16 +265,8 @@ def _weigh_actuators(
     """
     if len(assembly.actuators) <= len(freedoms):
         return None
-    for group in groups:
-        rows = len(group.rows) - len(group.unknown_joints(False))
-        driven = int((group.actuator[:, 0] >= 0).sum())
-        if rows != driven or driven != 1:
-            limb = assembly.limbs[group.limbs[0]].name
-            raise MechanismError(
-                f"{assembly.name} has {len(assembly.actuators)} actuators for {len(freedoms)} "
-                f"freedoms, and limb {limb!r} has {driven} of them and {rows} closure equations; "
-                "redundant actuation needs limbs with one of each"
-            )
+    what = f"{len(assembly.actuators)} actuators for {len(freedoms)} freedoms"
+    _refuse_other_limbs(assembly, groups, what, "redundant actuation")
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.actuators]
     if len({a.sigma is None for a in assembly.actuators}) > 1 or min(sigma) <= 0:
         raise MechanismError(
@@ -280,6 +274,42 @@ def _weigh_actuators(
             "actuator, or for none"
         )
     return tuple(s / max(sigma) for s in sigma)
+
+
+def _check_sums(assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]) -> None:
+    """Refuse sums whose numbers of readings, joints and freedoms do not fit."""
+    if not any(a.weights for a in assembly.actuators):
+        return
+    a, joints, m = len(assembly.actuators), len(assembly.driven_joints), len(freedoms)
+    if a > m:
+        raise MechanismError(
+            f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums; leave "
+            "out readings, because redundant readings cannot be sums"
+        )
+    if a == joints:
+        return
+    if a < m:
+        raise MechanismError(
+            f"{assembly.name} has {a} readings of {joints} driven joints for {m} freedoms, so its "
+            "sums do not hold the platform; state one reading for every freedom"
+        )
+    what = f"{a} readings of {joints} driven joints"
+    _refuse_other_limbs(assembly, groups, what, "a sum of more joints than there are readings")
+
+
+def _refuse_other_limbs(
+    assembly: Assembly, groups: tuple[Group, ...], what: str, subject: str
+) -> None:
+    """Refuse limbs that have not one actuator and one closure equation each."""
+    for group in groups:
+        rows = len(group.rows) - len(group.unknown_joints(False))
+        driven = int((group.actuator[:, 0] >= 0).sum())
+        if rows != driven or driven != 1:
+            limb = assembly.limbs[group.limbs[0]].name
+            raise MechanismError(
+                f"{assembly.name} has {what}, and limb {limb!r} has {driven} of them and {rows} "
+                f"closure equations; {subject} needs limbs with one of each"
+            )
 
 
 def _report_locked(limb: Limb, place: int) -> Finding:
@@ -297,11 +327,12 @@ def _map_slots(
 ) -> SlotMap:
     """Return the linear maps as one matrix and the shared maps with their places."""
     actuators = {a.name: i for i, a in enumerate(assembly.actuators)}
+    names = name_terms(assembly.actuators)
 
     def place(address: Address) -> int:
         if address in places:
             return places[address]
-        return count + terms.shape[1] * actuators[address.owner] + ALL_TERMS.index(address.axis)
+        return count + terms.shape[1] * actuators[address.owner] + names.index(address.axis)
 
     terms, w = nominal_terms(assembly.actuators), harmonic_frequencies(assembly.actuators)
     matrix = np.zeros((count + terms.size, len(table)))

@@ -25,13 +25,10 @@ from loopcal.mechanism.batch_kinematics import (
     count_shared_drives,
     forward_trials,
 )
+from loopcal.mechanism.limb_rows import name_passive_joints, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
-from loopcal.mechanism.sensitivity import (
-    differentiate_pose,
-    name_passive_joints,
-    stack_platform_rows,
-)
+from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solution_modes import reach_coordinates, solve_in_mode
 from loopcal.mechanism.states import Status, is_closed, replace_rows, select_poses, select_rows
 from loopcal.presentation import TableResult

@@ -14,16 +14,17 @@ from loopcal import engine
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     COORDINATES,
     compare_coordinates,
     read_coordinates,
 )
-from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.states import driven_values
+from loopcal.mechanism.summed_drives import differentiate_lengths
+from loopcal.mechanism.transmission import select_weights
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
 
 RANK = 1e-9
 """Relative size below which a singular value at home counts as zero.
@@ -94,7 +95,23 @@ def check_mobility(robot: Mechanism) -> Mechanism:
         repeated = _report_repeated(names, len(A) - independent, motions)
         robot = replace(robot, findings=(*robot.findings, repeated))
     _check_controlled(robot, movable, scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0])
+    if robot.has_open_sums:
+        _check_open_sums(robot, scale)
     return robot
+
+
+def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
+    """Refuse sums that leave the platform free at home; scale : (m,) of its freedoms."""
+    e, tau = robot.slots(robot.values[None])
+    weights = select_weights(tau)
+    assert weights is not None
+    slope = differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
+    if _count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
+        raise MechanismError(
+            f"{robot.name}: the sums of its readings do not hold the platform at home, where it "
+            "can move while all sums are constant; correct the weights of `sum:`, or state another "
+            "`home:`"
+        )
 
 
 def _report_repeated(names: Sequence[str], count: int, motions: FloatArray) -> Finding:
@@ -145,12 +162,14 @@ def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
     program, e = robot.program, robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, state), state)
     motion = np.linalg.norm(stack_driven_columns(program, blocks)[0, 0], axis=0)
-    turns = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    names = robot.assembly.driven_joints
+    turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
+    turns = np.array([name in turning for name in names])
     is_idle = motion < STRETCHED * np.where(turns, robot.size, 1.0)
     finding = report_finding(
         "mechanism.singular-home",
         name=robot.name,
-        actuators=tuple(a.name for a, idle in zip(robot.actuators, is_idle, strict=True) if idle),
+        actuators=tuple(name for name, idle in zip(names, is_idle, strict=True) if idle),
     )
     raise MechanismError(finding)
 

@@ -15,6 +15,7 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.parameter_units import MovedSlots, ParameterUnits, find_moved_slots
+from loopcal.mechanism.transmission import select_weights
 from loopcal.parameters import ParameterTable
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -36,7 +37,7 @@ class SlotMap:
 
     slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]. The first
     `n_displacements` slots are e, the others the terms of the actuators, (a, k) row by row, with
-    k = 18 where one is a triangle drive, and 8 elsewhere.
+    k = 18 where one is a triangle drive, 18 + J where one reads a sum of J joints, 8 elsewhere.
 
     Attributes
     ----------
@@ -99,7 +100,9 @@ class SlotMap:
         key = places.tobytes()
         if key not in self._moved:
             touches, count = self.touches[:, places], self.terms.shape[1]
-            self._moved[key] = find_moved_slots(touches, self.n_displacements, count)
+            weights = select_weights(self.terms)
+            joints = 0 if weights is None else weights.shape[-1]
+            self._moved[key] = find_moved_slots(touches, self.n_displacements, count, joints)
         return self._moved[key]
 
     @cached_property
@@ -128,8 +131,8 @@ class LimbMap:
     is_plain : whether each of these parameters is exactly one displacement of the limb, in the same
         order and with coefficient 1.
     drives : for each driven joint: the joint, its actuator, and the transmission terms that
-        parameters move.
-    readings : the actuators, as columns.
+        parameters move. Of summed drives it is the number of the driven joint, without terms.
+    readings : the actuators, as columns; of summed drives the driven joints.
     """
 
     displacements: slice
@@ -270,6 +273,18 @@ class Mechanism(TableResult):
         return is_serial(self.assembly)
 
     @cached_property
+    def has_sums(self) -> bool:
+        """Whether a reading is a weighted sum of joint values."""
+        return any(actuator.weights for actuator in self.actuators)
+
+    @cached_property
+    def has_open_sums(self) -> bool:
+        """Whether its readings are sums of more lengths than there are readings, so that only the
+        pose determines each length.
+        """
+        return not self.stages and self.program.n_joints > len(self.actuators)
+
+    @cached_property
     def limb_maps(self) -> tuple[tuple[LimbMap, ...], ...]:
         """Maps of each limb, group by group."""
         return tuple(
@@ -318,6 +333,9 @@ def _map_limb(program: Program, group: Group, k: int, slots: SlotMap) -> LimbMap
     for j, actuator in enumerate(group.actuator[:, k]):
         if actuator >= 0:
             a = int(actuator)
+            if select_weights(slots.terms) is not None:
+                drives.append((j, a, ()))
+                continue
             count = slots.terms.shape[1]
             begin = program.n_displacements + count * a
             terms = slots.touches[begin : begin + count]

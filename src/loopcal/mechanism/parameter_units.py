@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal.engine import MapPattern, ParameterMap
-from loopcal.mechanism.transmission import find_triangles, joint_slopes, term_derivatives
+from loopcal.mechanism.sums import invert_weights
+from loopcal.mechanism.transmission import (
+    differentiate_sums,
+    find_triangles,
+    joint_slopes,
+    joints_from_readings,
+    select_weights,
+    term_derivatives,
+)
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.value_classes import dataclass
 
@@ -23,8 +31,10 @@ class MovedSlots:
 
     Attributes
     ----------
-    slots, columns : (z,) slots that may move, and by which of the parameters.
-    terms : numbers of the transmission terms among them.
+    slots, columns : (z,) slots that may move, and by which of the parameters. A term of a summed
+        drive is there once for each joint, because it moves all of them.
+    terms : numbers of the transmission terms among them; of summed drives, counted through all
+        actuators.
     pattern : the same as the engine knows it; displacements are the first slots.
     """
 
@@ -34,14 +44,23 @@ class MovedSlots:
     pattern: MapPattern
 
 
-def find_moved_slots(touches: BoolArray, n_displacements: int, n_terms: int) -> MovedSlots:
+def find_moved_slots(
+    touches: BoolArray, n_displacements: int, n_terms: int, n_summed: int = 0
+) -> MovedSlots:
     """Return the slots that p parameters move.
 
     touches : (s, p) which of the slots each may move. n_terms : of the transmission of an actuator.
+    n_summed : joints whose values are in sums.
     """
     slot, column = np.nonzero(touches)
     cut = int(np.searchsorted(slot, n_displacements))
     joint, term = np.divmod(slot[cut:] - n_displacements, n_terms)
+    if n_summed:
+        term = np.tile(slot[cut:] - n_displacements, n_summed)
+        joint = np.repeat(np.arange(n_summed), len(slot) - cut)
+        slot, column = (
+            np.concatenate([part[:cut], np.tile(part[cut:], n_summed)]) for part in (slot, column)
+        )
     terms, function = np.unique(term, return_inverse=True)
     pattern = MapPattern(
         touches.shape[1],
@@ -79,12 +98,25 @@ class ParameterUnits:
             slopes[:, :cut],
             slopes[:, cut:],
             self._evaluate_terms(q, tau),
-            joint_slopes(q, tau, slots.frequency),
+            self._evaluate_slopes(q, tau),
         )
+
+    def _evaluate_slopes(self, q: FloatArray, tau: FloatArray) -> FloatArray:
+        """Return d joint / d reading (t | 1, n | 1, a); with summed drives one for each joint, so
+        that derivatives by readings are those by joints.
+        """
+        if (weights := select_weights(tau)) is not None:
+            return np.ones((1, 1, weights.shape[-1]))
+        return joint_slopes(q, tau, self.slots.frequency)
 
     def _evaluate_terms(self, q: FloatArray, tau: FloatArray) -> FloatArray:
         """Return what the moved transmission terms contribute, (t | 1, n | 1, a, terms)."""
         w, terms = self.slots.frequency, self.slots.moved_by(self.places).terms
+        if (weights := select_weights(tau)) is not None:
+            actuators, numbers = np.divmod(np.array(terms, np.int64), tau.shape[-1])
+            slopes = differentiate_sums(q, tau, w, joints_from_readings(q, tau, w))
+            inverse = invert_weights(weights)[:, None][..., actuators]
+            return inverse * slopes[:, :, None, actuators, numbers]
         has_offsets_only = not any(terms) and not len(find_triangles(tau))
         if not terms or has_offsets_only:
             # offsets are the same for all poses

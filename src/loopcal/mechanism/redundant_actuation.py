@@ -14,8 +14,8 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
+from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.sensitivity import linearize_limbs, name_passive_joints, solve_passive_motion
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
@@ -58,13 +58,15 @@ def differentiate_at_pose(
 ) -> PoseDrivenSensitivity:
     """Differentiate readings and passive joints of redundant actuators at states (t, n).
 
+    With summed drives the derivatives are those of the driven joints in place of readings.
+
     Parameters
     ----------
-    values : (t | 1, p). q : (t | 1, n, a) readings that close every limb.
+    values : (t | 1, p). q : (t | 1, n, a) readings that close every limb; not used for sums.
     """
     t, n = state.T.shape[:2]
     names = name_passive_joints(robot)
-    a, p, m = len(robot.actuators), len(robot.parameters), len(robot.freedoms)
+    a, p, m = robot.program.n_joints, len(robot.parameters), len(robot.freedoms)
     readings, passive = np.zeros((t, n, a, p + m)), np.zeros((t, n, len(names), p + m))
     for rows, limbs in linearize_limbs(robot, values, q, state):
         for limb in limbs.rows(limbs.blocks.closure):

@@ -18,16 +18,18 @@ import numpy as np
 from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
 from loopcal.mechanism.batch_kinematics import (
-    clear_sign,
     close_at_coordinates,
     close_at_joints,
     compute_closure_sign,
+    compute_readings,
     count_shared_drives,
     determine_platform,
+    forward_trials,
 )
 from loopcal.mechanism.mode_paths import SAME_JOINTS, connect_states, measure_distance, repeat_poses
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
+from loopcal.mechanism.reading_paths import clear_sign
 from loopcal.mechanism.stages.chain_kinematics import judge_stage_modes
 from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -110,6 +112,8 @@ def judge_modes(
         return judge_stage_modes(robot, state, begin, judge_modes)
     if robot.is_serial:
         return state, np.zeros(state.T.shape[1], bool)
+    if robot.has_open_sums:
+        return _judge_by_readings(robot, state, begin)
     e, _ = robot.slots(robot.values[None])
     begin, n = clear_sign(robot, begin), state.T.shape[1]
     closed = state.status[0] == Status.CONVERGED
@@ -130,6 +134,30 @@ def judge_modes(
     judged, is_other[rows] = _judge_paths(robot, first, select_poses(state, rows))
     new = reshape_rows(judged, len(rows), 1)
     return replace_rows(state, np.zeros_like(rows), rows, new), is_other
+
+
+def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
+    """Return what `judge_modes` returns, by forward kinematics from `begin` at the readings."""
+    values = robot.values[None]
+    if not state.T.shape[1]:
+        return state, np.zeros(0, bool)
+    state = replace(state, closure_sign=compute_closure_sign(robot, values, state))
+    closed = state.status[0] == Status.CONVERGED
+    is_other = closed & (state.closure_sign[0] != begin.closure_sign[0])
+    rows = np.flatnonzero(closed & ~is_other)
+    if not len(rows):
+        return state, is_other
+    goal = select_poses(state, rows)
+    start = select_poses(begin, rows) if begin.T.shape[1] == len(closed) > 1 else begin
+    back = forward_trials(robot, values, compute_readings(robot, values, goal), start)
+    is_other[rows] = ~((back.status[0] == Status.CONVERGED) & _is_near(robot, back, goal))
+    return state, is_other
+
+
+def _is_near(robot: Mechanism, a: State, b: State) -> BoolArray:
+    """Return which poses (k,) of states (1, k) are the same."""
+    gap = np.abs(geometry.pose_difference(a.T[0], b.T[0]) * robot.twist_scale).max(axis=1)
+    return np.asarray(gap <= SAME_POSE * robot.size)
 
 
 def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
@@ -162,9 +190,8 @@ def _solve_from(
     joints = driven_values(robot.program, goal)
     back = close_at_joints(robot, e, joints, first, follow, goal)
     closed = back.status[0] == Status.CONVERGED
-    gap = np.abs(geometry.pose_difference(back.T[0], goal.T[0]) * robot.twist_scale).max(axis=1)
     is_near = back.status[0] == NEAR_GOAL
-    return is_near | closed & (gap <= SAME_POSE * robot.size), ~(is_near | closed)
+    return is_near | closed & _is_near(robot, back, goal), ~(is_near | closed)
 
 
 def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:

@@ -11,7 +11,9 @@ docs/theory/parameters.md. Of a triangle drive this is the length of the actuato
 joint's angle follows (`loopcal.mechanism.triangle`).
 
 Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them. Terms tau are
-(t, a, 8), or (t, a, 18) with those of triangles behind them, all zero for any other drive.
+(t, a, 8), or (t, a, 18) with those of triangles behind them, all zero for any other drive. Where a
+drive reads a sum of joint values, the weights W of the J driven joints follow, (t, a, 18 + J), and
+the formula gives the sums s = W joints (`loopcal.mechanism.sums`).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator
+from loopcal.mechanism.sums import apply_weights, invert_weights
 from loopcal.mechanism.triangle import (
     MOVABLE,
     TRIANGLE_TERMS,
@@ -40,10 +43,22 @@ Each has the joint's unit, per power of the reading's unit; of a triangle drive,
 ALL_TERMS = (*TERMS, *TRIANGLE_TERMS)
 """Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 18)."""
 SIDE = ALL_TERMS.index("side")
+WEIGHT = "weight."
+"""What the name of the term of a weight begins with; the name of a driven joint follows."""
+
+
+def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
+    """Return the names of the terms of actuators, in the order of the last axis of tau."""
+    if any(a.weights for a in actuators):
+        joints = dict.fromkeys(name for a in actuators for name in a.driven_joints)
+        return (*ALL_TERMS, *(f"{WEIGHT}{name}" for name in joints))
+    return ALL_TERMS if any("side" in a.terms for a in actuators) else TERMS
 
 
 def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
     """Return the nominal transmission terms (a, 8), or (a, 18) if one is a triangle drive.
+
+    With summed drives they are (a, 18 + J).
 
     Raises
     ------
@@ -62,10 +77,11 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
                 f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing; "
                 "state a gain other than 0"
             )
-    terms = ALL_TERMS if any("side" in a.terms for a in actuators) else TERMS
-    rows = [
-        [a.terms.get(term, 1.0 if term == "gain" else 0.0) for term in terms] for a in actuators
-    ]
+    terms, rows = name_terms(actuators), []
+    for a in actuators:
+        weights = {f"{WEIGHT}{name}": w for name, w in (a.weights or {a.name: 1.0}).items()}
+        stated = {"gain": 1.0, **a.terms, **weights}
+        rows.append([stated.get(term, 0.0) for term in terms])
     return np.array(rows, dtype=float).reshape(-1, len(terms))
 
 
@@ -112,11 +128,14 @@ def term_derivatives(
 
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return the joint values (t, n, a) of readings q under terms tau (t | 1, a, 8 | 18).
+    """Return the joint values (t, n, a) of readings q under terms tau (t | 1, a, 8 | 18 | 18 + a).
 
-    The angle of a triangle drive is NaN where no angle reaches its length.
+    The angle of a triangle drive is NaN where no angle reaches its length. Summed drives must have
+    as many readings as joints.
     """
-    values = _evaluate(q, tau, w)
+    values = evaluate_sums(q, tau, w)
+    if (weights := select_weights(tau)) is not None:
+        return apply_weights(invert_weights(weights), values)
     triangles = find_triangles(tau)
     if len(triangles):
         values = np.array(values)
@@ -127,7 +146,10 @@ def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> Float
 
 
 def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a)."""
+    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a).
+
+    Of summed drives it is d sum / d reading.
+    """
     slopes, triangles = _evaluate_slopes(q, tau, w), find_triangles(tau)
     if not len(triangles):
         return slopes
@@ -144,6 +166,8 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> 
     The linear terms are inverted exactly; Newton's method adds the others. Joints that read their
     own values are returned as they are.
     """
+    if (weights := select_weights(tau)) is not None:
+        joints = apply_weights(weights, joints)
     triangles = find_triangles(tau)
     if len(triangles):
         shape = np.broadcast_shapes(joints.shape, (len(tau), 1, 1))
@@ -158,11 +182,29 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> 
     if not tau[..., 2:7].any():
         return readings
     for _ in range(20):
-        step = (_evaluate(readings, tau, w) - joints) / _evaluate_slopes(readings, tau, w)
+        step = (evaluate_sums(readings, tau, w) - joints) / _evaluate_slopes(readings, tau, w)
         readings = readings - step
         if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
             break
     return readings
+
+
+def select_weights(tau: FloatArray) -> FloatArray | None:
+    """Return the weights (t | 1, a, J) of summed drives, None of a machine without them."""
+    return tau[..., len(ALL_TERMS) :] if tau.shape[-1] > len(ALL_TERMS) else None
+
+
+def differentiate_sums(
+    q: FloatArray, tau: FloatArray, w: FloatArray, joints: FloatArray
+) -> FloatArray:
+    """Return d (s - W joints) / d tau at constant readings and joints (t, n, J), (t, n, a, k)."""
+    columns = term_derivatives(q, tau[..., : len(TERMS)], w)
+    shape = np.broadcast_shapes(columns[0].shape, (*joints.shape[:2], len(w)))
+    slopes = np.zeros((*shape, tau.shape[-1]))
+    for i, column in enumerate(columns):
+        slopes[..., i] = column
+    slopes[..., len(ALL_TERMS) :] = -joints[:, :, None]
+    return slopes
 
 
 def find_triangles(tau: FloatArray) -> IntArray:
@@ -178,13 +220,13 @@ def measure_excess(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     It is NaN where a reading is not a number.
     """
     triangles = find_triangles(tau)
-    length = _evaluate(q, tau, w)[..., triangles]
+    length = evaluate_sums(q, tau, w)[..., triangles]
     low, high = compute_range(_select_triangles(tau, triangles))
     return np.maximum(np.maximum(low - length, length - high), 0.0).max(axis=-1)
 
 
-def _evaluate(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Return the joint values (t, n, a) of readings; of triangle drives their lengths."""
+def evaluate_sums(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
     if not tau[..., 2 : len(TERMS)].any():
         return tau[:, None, :, 0] + split_readings(q, len(w))[0] * tau[:, None, :, 1]
     columns = term_derivatives(q, tau[..., : len(TERMS)], w)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal import geometry
-from loopcal.mechanism import TRIANGLE_TERMS, Mechanism
+from loopcal.mechanism import TRIANGLE_TERMS, WEIGHT, Mechanism
 from loopcal.report.numbers import ABSENT, format_in, format_number, units_of
 from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.units import Dimension, Unit
 
 if TYPE_CHECKING:
-    from loopcal.mechanism.assembly import Address
+    from loopcal.mechanism.assembly import Actuator, Address
 
 Units = Mapping[Dimension, Unit]
 JOINTS = {"R": ("turns about z", Dimension.ANGLE), "P": ("slides along z", Dimension.LENGTH)}
@@ -111,6 +111,7 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
     for actuator in robot.actuators:
         joint_unit = units[_joint_dimension(robot, actuator.name)]
         reading = units[actuator.dimension]
+        joints = ", ".join(_driven_joints(robot, actuator))
         for term, value in {"gain": 1.0, **actuator.terms}.items():
             if value and term not in TRIANGLE_TERMS:
                 power = POWERS.get(term, 0)
@@ -118,12 +119,16 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
                 rows.append(
                     (
                         actuator.name,
-                        ", ".join(_driven_joints(robot, actuator.name)),
+                        joints,
                         term,
                         format_number(number, DIGITS),
                         _unit_of_term(joint_unit, reading, power),
                     )
                 )
+        rows += [
+            (actuator.name, joints, f"{WEIGHT}{joint}", format_number(weight, DIGITS), "1")
+            for joint, weight in actuator.weights.items()
+        ]
     columns = (
         word_column("actuator"),
         word_column("drives", wraps=True),
@@ -181,16 +186,16 @@ def _joint_values_at_home(robot: Mechanism) -> dict[int, np.ndarray]:
     return {i: joints[0, 0, k] for group, joints in groups for k, i in enumerate(group.limbs)}
 
 
-def _driven_joints(robot: Mechanism, actuator: str) -> list[str]:
+def _driven_joints(robot: Mechanism, actuator: Actuator) -> list[str]:
     """Return the names of the joints and rods that an actuator drives."""
-    limbs = robot.assembly.limbs
+    limbs, driven = robot.assembly.limbs, actuator.driven_joints
     joints = [
         f"{limb.name}/{joint.name}"
         for limb in limbs
         for joint in limb.joints
-        if joint.actuator == actuator
+        if joint.actuator in driven
     ]
-    return joints + [f"{limb.name}/rod" for limb in limbs if limb.actuator == actuator]
+    return joints + [f"{limb.name}/rod" for limb in limbs if limb.actuator in driven]
 
 
 def _place(T: np.ndarray, units: Units) -> tuple[str, ...]:
@@ -212,6 +217,8 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     length = units[Dimension.LENGTH]
     if address.element == "transmission":
         reading = units[next(a.dimension for a in robot.actuators if a.name == address.owner)]
+        if address.axis.startswith(WEIGHT):
+            return 1.0, "1"
         if address.axis in ("skew.x", "skew.y"):
             return units[Dimension.ANGLE].factor_to_si, units[Dimension.ANGLE].symbol
         joint, power = units[_joint_dimension(robot, address.owner)], POWERS.get(address.axis, 0)
@@ -223,15 +230,18 @@ def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[
     return unit.factor_to_si, unit.symbol
 
 
-def _joint_dimension(robot: Mechanism, actuator: str) -> Dimension:
-    """Return the dimension of what a transmission gives: a joint, or the length of a triangle."""
-    if any(a.is_triangle for a in robot.actuators if a.name == actuator):
+def _joint_dimension(robot: Mechanism, name: str) -> Dimension:
+    """Return the dimension of what the transmission of an actuator gives: a joint or a sum of
+    joints, or the length of a triangle.
+    """
+    actuator = next(a for a in robot.actuators if a.name == name)
+    if actuator.is_triangle:
         return Dimension.LENGTH
     kinds = [
         joint.kind
         for limb in robot.assembly.limbs
         for joint in limb.joints
-        if joint.actuator == actuator
+        if joint.actuator in actuator.driven_joints
     ]
     return JOINTS[kinds[0]][1] if kinds else Dimension.LENGTH
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from loopcal.mechanism import TRIANGLE_TERMS, Mechanism, compute_range
@@ -33,6 +35,7 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
         *format_list([(f.severity.value, str(f)) for f in inspection.findings]),
         _build_actuator_table(inspection),
         *([_build_triangle_table(robot)] if any(a.is_triangle for a in robot.actuators) else []),
+        *([_build_sum_table(robot)] if any(a.weights for a in robot.actuators) else []),
         *([_build_parameter_table(robot)] if len(robot.parameters) else []),
         *([_build_common_error_table(robot)] if robot.parameters.common else []),
     ]
@@ -74,6 +77,30 @@ def _build_triangle_table(robot: Mechanism) -> Table:
         word_column("unit"),
     )
     return Table("Triangles: dead points, where a drive turns nothing", columns, tuple(rows))
+
+
+def _build_sum_table(robot: Mechanism) -> Table:
+    """Return what each reading is a sum of."""
+    rows = [
+        (a.name, format_sum(a.weights or dict.fromkeys(a.driven_joints, 1.0)))
+        for a in robot.actuators
+    ]
+    columns = (word_column("reading"), word_column("sum of joint values", wraps=True))
+    if robot.has_open_sums:
+        count = f"{len(robot.actuators)} of {robot.program.n_joints} joints"
+        return Table(f"Sums: {count}, each of which the pose determines", columns, tuple(rows))
+    return Table("Sums: what the transmission of a reading gives", columns, tuple(rows))
+
+
+def format_sum(weights: Mapping[str, float]) -> str:
+    """Return a weighted sum as text, such as `m + 2 k`."""
+    text = ""
+    for name, weight in weights.items():
+        if weight:
+            size = "" if abs(weight) == 1.0 else f"{format_number(abs(weight), DIGITS)} "
+            sign = " - " if weight < 0.0 else " + "
+            text += f"{sign if text else sign.strip(' +')}{size}{name}"
+    return text
 
 
 def _build_parameter_table(robot: Mechanism) -> Table:

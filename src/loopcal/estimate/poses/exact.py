@@ -78,7 +78,10 @@ class ExactPoses:
         kinds = (rows.kind for block in self.blocks for rows in block.rows)
         is_simple = all(kind.poses_per_row == 1 and not kind.sensed_joints for kind in kinds)
         has_more = self.nuisance is not None or self.located is not None or self.names
-        return is_simple and not (has_more or self.free.errors or self.free.robot.stages)
+        robot = self.free.robot
+        return is_simple and not (
+            has_more or self.free.errors or robot.stages or robot.has_open_sums
+        )
 
     def at_readings(self, q: FloatArray) -> ExactPoses:
         """Return these rows at other readings (a, n, actuators) [SI]."""

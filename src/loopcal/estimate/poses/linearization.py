@@ -29,7 +29,7 @@ from loopcal.mechanism import (
     differentiate_pose,
     differentiate_sensed_values,
     forward_trials,
-    joints_from_readings,
+    step_towards_closure,
 )
 from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -150,10 +150,8 @@ def linearize_closure(
 ) -> LinearizedPoses:
     """Linearize the loop closure at given poses T (a, n, 4, 4), without solving it."""
     robot = free.robot
-    e, tau = robot.slots(values)
-    joints = joints_from_readings(readings, tau, robot.slots.frequency)
     begin = replace(robot.home_state, T=T)
-    state = engine.solve(robot.program, e, joints, begin, max_iterations=1)
+    state = step_towards_closure(robot, values, readings, begin)
     step = geometry.pose_difference(state.T, T)
     given_state = replace(state, T=T, status=np.zeros_like(state.status))
     D = differentiate_pose(robot, values, readings, given_state, free.columns).parameters

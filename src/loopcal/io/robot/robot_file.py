@@ -43,6 +43,7 @@ from loopcal.mechanism import (
     build,
     match_parameter_names,
 )
+from loopcal.mechanism.families.summed_records import SumError
 from loopcal.mechanism.stages.joined_assembly import StageError
 from loopcal.typing import FloatArray
 from loopcal.value_classes import dataclass
@@ -274,6 +275,8 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
         parameters = record.expand().parameters
     except StageError as error:
         raise file.error(str(error), (KEY, error.index)) from None
+    except SumError as error:
+        raise file.error(str(error), ("actuators", error.actuator)) from None
     names = [parameter.name for parameter in parameters]
     for key in ("fixed", "stored_parameters"):
         for i, pattern in enumerate(getattr(record, key)):

@@ -28,7 +28,8 @@ from loopcal.mechanism.stages.chain_kinematics import solve_stages
 from loopcal.mechanism.stages.chain_state import join_stage_states
 from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
-from loopcal.mechanism.transmission import joints_from_readings
+from loopcal.mechanism.summed_drives import solve_open_sums
+from loopcal.mechanism.transmission import evaluate_sums, joints_from_readings, select_weights
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -195,8 +196,12 @@ def _close(robot: Mechanism, values: FloatArray, q: FloatArray, start: State | N
     if robot.stages:
         return solve_stages(robot, values, q, start, _close)
     e, tau = robot.slots(values)
-    joints = joints_from_readings(q, tau, robot.slots.frequency)
-    begin = start or robot.home_state
+    begin, w = start or robot.home_state, robot.slots.frequency
+    if robot.has_open_sums:
+        weights = select_weights(tau)
+        assert weights is not None
+        return solve_open_sums(robot.program, e, weights, evaluate_sums(q, tau, w), begin)
+    joints = joints_from_readings(q, tau, w)
     if robot.is_serial:
         return solve_serial(robot, e, joints, begin.T.shape[:2])
     state = engine.solve(robot.program, e, joints, begin)
@@ -211,6 +216,8 @@ def _flatten_poses(robot: Mechanism, state: State) -> FloatArray:
 
 def _subtract_turns(robot: Mechanism, state: State) -> State:
     """Return the state with driven joints moved by full turns to the middle of their strokes."""
+    if robot.has_open_sums:
+        return state  # of lengths, which do not repeat
     middle = np.array(
         [
             np.mean(a.stroke) if a.stroke and np.isfinite(a.stroke).all() else 0.0

@@ -27,20 +27,20 @@ from loopcal.mechanism.analysis.workspace import sample_workspace
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.batch_kinematics import compute_closure_sign, compute_readings
 from loopcal.mechanism.kinematics import Solution, forward, inverse, make_solution
+from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
-from loopcal.mechanism.sensitivity import (
-    differentiate_pose,
-    stack_driven_columns,
-    stack_platform_rows,
-)
+from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.stages.chain_state import (
     find_carrying_actuators,
     split_stage_states,
     transport_to_end,
 )
 from loopcal.mechanism.states import driven_values, join_states
+from loopcal.mechanism.summed_drives import differentiate_lengths
+from loopcal.mechanism.sums import invert_weights
+from loopcal.mechanism.transmission import select_weights
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -244,14 +244,33 @@ def _compute_margins(
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearize(program, e, driven_values(program, state), state)
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
-    A = stack_platform_rows(blocks)[0] / robot.twist_scale[list(program.freedoms)]
-    Q = stack_driven_columns(program, blocks)[0] / np.where(turning, robot.size, 1.0)
+    A, Q = stack_platform_rows(blocks)[0], stack_driven_columns(program, blocks)[0]
+    if robot.has_sums:
+        A, Q = _sum_rows(robot, state, A, Q)
+    A = A / robot.twist_scale[list(program.freedoms)]
+    Q = Q / np.where(turning, robot.size, 1.0)
     good = np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2))
     A, Q = np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0)
     _, s, V = np.linalg.svd(A)
     _, r, W = np.linalg.svd(Q)
     margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
     return margin, V[:, -1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+
+
+def _sum_rows(
+    robot: Mechanism, state: State, A: FloatArray, Q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return closure rows against freedoms (n, c, m) and against sums (n, c, a) of a state (1, n).
+
+    A, Q : against freedoms and joints. The rows of open sums are W L_y dy - ds = 0.
+    """
+    e, tau = robot.slots(robot.values[None])
+    weights = select_weights(tau)
+    assert weights is not None
+    if robot.has_open_sums:
+        rows = np.matmul(weights, differentiate_lengths(robot.program, e, state)[0])
+        return rows, np.tile(-np.eye(len(robot.actuators)), (len(rows), 1, 1))
+    return A, np.matmul(Q, invert_weights(weights))
 
 
 def _compute_chain_margins(

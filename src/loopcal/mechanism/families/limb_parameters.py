@@ -30,6 +30,7 @@ from loopcal.mechanism.families.records import (
     RatioTolerance,
     standard_deviation,
 )
+from loopcal.mechanism.families.summed_records import is_weight, weight_errors
 from loopcal.mechanism.families.triangle_records import (
     TriangleDrive,
     is_of_triangle,
@@ -38,7 +39,7 @@ from loopcal.mechanism.families.triangle_records import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import ARTICLES, Dimension
-from loopcal.value_classes import dataclass
+from loopcal.value_classes import dataclass, field
 
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
@@ -59,19 +60,35 @@ class PlacedDrive:
     """A drive and the joint that it moves; of several joints, the first.
 
     turns : whether the joint is rotary. rotation : (3, 3) R_placed_joint, whose third column is
-    the joint's axis. start : value of the joint near home [rad or m].
+    the joint's axis. start : value of the joint near home [rad or m]. weights : of the driven
+    joints in a sum, by name.
     """
 
     drive: Drive
     turns: bool
     rotation: FloatArray
     start: float = 0.0
+    weights: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def dimension(self) -> Dimension:
         """Dimension of what the transmission gives: the joint, or the length of a triangle."""
         is_angle = self.turns and not isinstance(self.drive, TriangleDrive)
         return Dimension.ANGLE if is_angle else Dimension.LENGTH
+
+
+def check_motion(name: str, drive: Drive, turns: bool) -> None:
+    """Refuse a drive whose transmission does not give what its joint does; raises
+    MechanismError.
+    """
+    if turns == isinstance(drive, AngleDrive | TriangleDrive):
+        return
+    motion, allowed = (
+        ("turns", "reads: angle without a radius, or a triangle")
+        if turns
+        else ("slides", "reads: length, or reads: angle with a radius")
+    )
+    raise MechanismError(f"actuator {name!r} drives a joint that {motion}; state {allowed}")
 
 
 def build_actuator(name: str, placed: PlacedDrive) -> Actuator:
@@ -85,9 +102,9 @@ def build_actuator(name: str, placed: PlacedDrive) -> Actuator:
         terms |= place_triangle(name, drive, placed.rotation, placed.start)
     reads_length = isinstance(drive, LengthDrive | TriangleDrive)
     dimension = Dimension.LENGTH if reads_length else Dimension.ANGLE
-    return Actuator(
-        name, dimension, drive.stroke, {"offset": drive.offset, **terms}, drive.period, drive.sigma
-    )
+    terms = {"offset": drive.offset, **terms}
+    period, sigma = drive.period, drive.sigma
+    return Actuator(name, dimension, drive.stroke, terms, period, sigma, placed.weights)
 
 
 def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
@@ -103,8 +120,9 @@ def drive_errors(name: str, placed: PlacedDrive) -> ErrorModel:
     errors = []
     if isinstance(drive, TriangleDrive):
         errors.append(triangle_errors(name, drive, placed.rotation, tuple(known)))
+    errors += [weight_errors(name, drive, placed.weights, tuple(known))]
     for term in drive.unknown:
-        if is_of_triangle(drive, term):
+        if is_of_triangle(drive, term) or is_weight(placed.weights, term):
             continue
         if term not in known:
             raise MechanismError(

@@ -222,7 +222,9 @@ class LengthDrive:
 
     joint value = offset + gain * reading + harmonics of the period. `unknown` names terms to
     identify (offset, gain, backlash, and with a period sin1, cos1, sin2, cos2), with the tolerances
-    `length` and, for the gain, `ratio`.
+    `length` and, for the gain, `ratio`. With a `sum`, the name of a driven joint -> weight, this is
+    the sum of weight * joint value; its unknown weights (weight.m, or weight for all) have the
+    tolerance `weights`.
     """
 
     reads: Literal["length"]
@@ -234,6 +236,8 @@ class LengthDrive:
     unknown: tuple[str, ...] = ()
     length: LengthTolerance | None = None
     ratio: RatioTolerance | None = None
+    sum: Mapping[str, Ratio] = field(default_factory=dict)
+    weights: RatioTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -252,6 +256,8 @@ class AngleDrive:
     unknown: tuple[str, ...] = ()
     angle: AngleTolerance | None = None
     ratio: RatioTolerance | None = None
+    sum: Mapping[str, Ratio] = field(default_factory=dict)
+    weights: RatioTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -275,6 +281,8 @@ class SpoolDrive:
     length: LengthTolerance | None = None
     radii: LengthTolerance | None = None
     buildups: LengthTolerance | None = None
+    sum: Mapping[str, Ratio] = field(default_factory=dict)
+    weights: RatioTolerance | None = None
 
 
 Drive = LengthDrive | AngleDrive | SpoolDrive | TriangleDrive

@@ -37,6 +37,7 @@ from loopcal.mechanism.families.error_models import (
 from loopcal.mechanism.families.limb_parameters import (
     PlacedDrive,
     build_actuator,
+    check_motion,
     check_units,
     drive_errors,
     find_engine_axis,
@@ -73,6 +74,7 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.families.records import RobotRecord, standard_deviation
+from loopcal.mechanism.families.summed_records import check_sums, has_sums, list_readings
 from loopcal.mechanism.families.triangle_records import TriangleDrive, complete_triangle
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -106,11 +108,7 @@ class Limbs(LimbsFile, RobotRecord):
         _refuse_many(self)
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
         copies = [member for group in members.values() for member in group]
-        # a drive that several limbs name is one drive
-        drives: dict[str, PlacedDrive] = {}
-        for copy in copies:
-            for name, drive in self._drives(copy):
-                drives.setdefault(name, drive)
+        drives = self._place_drives(copies)
         errors = join_errors(
             (
                 *(_limb_errors(member) for member in copies),
@@ -141,30 +139,32 @@ class Limbs(LimbsFile, RobotRecord):
                 "leave it out" + (f"; joints are driven by {', '.join(drives)}" if drives else "")
             )
 
-    def _drives(self, member: _Member) -> Iterator[tuple[str, PlacedDrive]]:
-        """Yield the names of a limb's drives, and the drives with their joints."""
-        limb, rotations = member.placed.limb, member.placed.rotations
-        driven = [
-            (j.actuator, j.kind == "R", rotations[j.name], j.start)
-            for j in limb.joints
-            if j.actuator
-        ]
-        if limb.actuator:
-            driven.append((limb.actuator, False, np.eye(3), 0.0))
-        for name, turns, rotation, start in driven:
-            plain = AngleDrive("angle") if turns else LengthDrive("length")
-            shared_name = name.removesuffix(member.suffix)
-            drive = self.actuators.get(name) or self.actuators.get(shared_name) or plain
-            if turns != isinstance(drive, AngleDrive | TriangleDrive):
-                motion, allowed = (
-                    ("turns", "reads: angle without a radius, or a triangle")
-                    if turns
-                    else ("slides", "reads: length, or reads: angle with a radius")
-                )
-                raise MechanismError(
-                    f"actuator {name!r} drives a joint that {motion}; state {allowed}"
-                )
-            yield name, PlacedDrive(drive, turns, rotation, start)
+    def _place_drives(self, copies: list[_Member]) -> dict[str, PlacedDrive]:
+        """Return the drives by name, in the order of the readings, with their joints."""
+        # a drive that several limbs name is one drive
+        joints: dict[str, _DrivenJoint] = {}
+        for member in copies:
+            for joint in _list_driven_joints(member):
+                joints.setdefault(joint.name, joint)
+        drives: dict[str, PlacedDrive] = {}
+        if not has_sums(self.actuators):
+            for name, joint in joints.items():
+                plain = AngleDrive("angle") if joint.turns else LengthDrive("length")
+                drive = self.actuators.get(name) or self.actuators.get(joint.stated) or plain
+                check_motion(name, drive, joint.turns)
+                drives[name] = PlacedDrive(drive, joint.turns, joint.rotation, joint.start)
+            return drives
+        stated = {name: joint.stated for name, joint in joints.items()}
+        turning = {name: joint.turns for name, joint in joints.items()}
+        readings = list_readings(self.actuators, stated)
+        limb_of = {name: joint.limb for name, joint in joints.items()}
+        check_sums({name: weights for name, (_, weights) in readings.items()}, turning, limb_of)
+        for name, (key, weights) in readings.items():
+            drive, turns = self.actuators[key], turning[next(iter(weights))]
+            check_motion(name, drive, turns)
+            own = {} if tuple(weights) == (name,) and weights[name] == 1.0 else weights
+            drives[name] = PlacedDrive(drive, turns, np.eye(3), 0.0, own)
+        return drives
 
     def _complete(self, copies: list[_Member], drives: Drives) -> ErrorModel:
         """Return all errors of all limbs, and of every drive once its offset and its triangle."""
@@ -190,6 +190,35 @@ class _Member:
     record: LimbRecord
     placed: PlacedLimb
     suffix: str
+
+
+@dataclass(frozen=True)
+class _DrivenJoint:
+    """A joint or rod under the name of its drive.
+
+    stated : this name as the file states it, without the number of a copy. limb : its limb.
+    turns, rotation, start : as in `PlacedDrive`.
+    """
+
+    name: str
+    stated: str
+    limb: str
+    turns: bool
+    rotation: FloatArray
+    start: float
+
+
+def _list_driven_joints(member: _Member) -> Iterator[_DrivenJoint]:
+    """Yield the driven joints of a limb, the rod last."""
+    limb, rotations = member.placed.limb, member.placed.rotations
+    for j in limb.joints:
+        if j.actuator:
+            stated = j.actuator.removesuffix(member.suffix)
+            turns = j.kind == "R"
+            yield _DrivenJoint(j.actuator, stated, limb.name, turns, rotations[j.name], j.start)
+    if limb.actuator:
+        stated = limb.actuator.removesuffix(member.suffix)
+        yield _DrivenJoint(limb.actuator, stated, limb.name, False, np.eye(3), 0.0)
 
 
 Members = Mapping[str, tuple[_Member, ...]]

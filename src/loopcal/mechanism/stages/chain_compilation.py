@@ -22,7 +22,7 @@ from loopcal.mechanism.stages.chain_state import (
     join_stage_states,
 )
 from loopcal.mechanism.states import driven_values
-from loopcal.mechanism.transmission import readings_from_joints
+from loopcal.mechanism.transmission import ALL_TERMS, readings_from_joints
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension
@@ -50,7 +50,7 @@ def build_chain(
     stages = _build_stages(assembly.stages, build)
     table = ParameterTable(assembly.parameters, assembly.common_errors)
     size = compute_chain_size(stages)
-    program = _join_programs(stages, size, len(assembly.actuators))
+    program = _join_programs(stages, size)
     robot = Mechanism(
         assembly,
         table,
@@ -121,13 +121,13 @@ def compute_chain_size(stages: Sequence[Stage]) -> float:
     return max([reach, *loops]) or DEFAULT_SIZE
 
 
-def _join_programs(stages: Sequence[Stage], size: float, count: int) -> Program:
+def _join_programs(stages: Sequence[Stage], size: float) -> Program:
     """Return the structure of all stages, with the platform's six freedoms."""
-    groups, limbs, first = [], 0, 0
+    groups, limbs, first, joints = [], 0, 0, 0
     for stage in stages:
         own = stage.robot.program
         for group in own.groups:
-            driven = np.where(group.actuator >= 0, group.actuator + stage.actuators.start, -1)
+            driven = np.where(group.actuator >= 0, group.actuator + joints, -1)
             groups.append(
                 replace(
                     group,
@@ -137,8 +137,8 @@ def _join_programs(stages: Sequence[Stage], size: float, count: int) -> Program:
                 )
             )
         limbs += len(stage.robot.assembly.limbs)
-        first += own.n_displacements
-    return Program(tuple(groups), tuple(range(len(AXES))), size, first, count)
+        first, joints = first + own.n_displacements, joints + own.n_joints
+    return Program(tuple(groups), tuple(range(len(AXES))), size, first, joints)
 
 
 def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
@@ -147,22 +147,28 @@ def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
     displacements = sum(own.n_displacements for own in maps)
     actuators = sum(len(own.terms) for own in maps)
     k = max(own.terms.shape[1] for own in maps)
+    has_sums = any(stage.robot.has_sums for stage in stages)
+    if has_sums:
+        k = len(ALL_TERMS) + sum(stage.robot.program.n_joints for stage in stages)
     matrix = np.zeros((displacements + actuators * k, len(nominal)))
-    shared, first, term = [], 0, displacements
+    shared, first, term, joint = [], 0, displacements, 0
+    terms = np.zeros((actuators, k))
     for stage, own in zip(stages, maps, strict=True):
         d = own.n_displacements
         a, width = own.terms.shape
-        of_terms = (np.arange(a)[:, None] * k + np.arange(width)).ravel()
+        columns = np.arange(width)
+        columns[len(ALL_TERMS) :] += joint  # the weights of its own joints
+        terms[stage.actuators, columns] = own.terms
+        if has_sums and width <= len(ALL_TERMS):
+            terms[stage.actuators, len(ALL_TERMS) + joint + np.arange(a)] = np.eye(a)
+        joint += stage.robot.program.n_joints
+        of_terms = (np.arange(a)[:, None] * k + columns).ravel()
         places = np.concatenate([np.arange(d) + first, of_terms + term])
         matrix[places, stage.parameters] = own.matrix
         for function, inputs, outputs in own.shared:
-            columns = tuple(i + stage.parameters.start for i in inputs)
-            shared.append((function, columns, tuple(int(places[o]) for o in outputs)))
+            values = tuple(i + stage.parameters.start for i in inputs)
+            shared.append((function, values, tuple(int(places[o]) for o in outputs)))
         first, term = first + d, term + a * k
-    # a stage without triangle drives has no terms of them
-    terms = np.concatenate(
-        [np.pad(own.terms, ((0, 0), (0, k - own.terms.shape[1]))) for own in maps]
-    )
     frequency = np.concatenate([own.frequency for own in maps])
     return SlotMap(matrix, tuple(shared), nominal, displacements, terms, frequency)
 

@@ -160,7 +160,7 @@ class _Rows:
         frequency = robot.slots.frequency
         shown = np.expand_dims(q, 1 - self.axis)
         slopes = np.broadcast_to(joint_slopes(shown, tau, frequency), shown.shape).reshape(q.shape)
-        length = np.abs(step * slopes) / _find_joint_units(robot)
+        length = np.abs(step * slopes) / _find_units(robot)
         longest = np.maximum(length.max(axis=1, initial=0.0), LONGEST_STEP)
         return step * (LONGEST_STEP / longest)[:, None]
 
@@ -307,7 +307,8 @@ def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
     return now
 
 
-def _find_joint_units(robot: Mechanism) -> FloatArray:
-    """Return the units (a,) of long steps of driven joints: a radian, or the robot's size [m]."""
+def _find_units(robot: Mechanism) -> FloatArray:
+    """Return the units (a,) of long steps of joints and of sums: a radian, or the size [m]."""
     turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
-    return np.array([1.0 if a.name in turning else robot.size for a in robot.actuators])
+    turns = (not turning.isdisjoint(a.driven_joints) for a in robot.actuators)
+    return np.array([1.0 if is_angle else robot.size for is_angle in turns])
