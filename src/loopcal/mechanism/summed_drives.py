@@ -31,6 +31,10 @@ from loopcal.mechanism.transmission import differentiate_sums, joint_slopes, sel
 from loopcal.typing import FloatArray
 
 
+ITERATIONS = 25
+"""Newton steps of a pose; those within reach need fewer than ten."""
+
+
 class Motion(NamedTuple):
     """Derivatives by parameters (t, n, .., p) and by readings (t, n, .., a)."""
 
@@ -44,7 +48,7 @@ def solve_open_sums(
     weights: FloatArray,
     sums: FloatArray,
     begin: State,
-    max_iterations: int = 60,
+    max_iterations: int = ITERATIONS,
 ) -> State:
     """Return the states (t, n) at which the weighted sums of driven joints are given.
 

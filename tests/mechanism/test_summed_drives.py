@@ -1,0 +1,442 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readings that are weighted sums of joint values, against closed forms and a constraint solver."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+
+from loopcal.errors import FileError, MechanismError
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure import select_joint_values
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    analyze_singularity,
+    compute_closure_sign,
+    differentiate_passive_joints,
+    differentiate_pose,
+    find_assembly_modes,
+    forward,
+    forward_trials,
+    inverse,
+    sample_workspace,
+    solve_at_pose,
+)
+from tests.jacobians import central_difference, check_jacobian
+from tests.zoo import load_cached_robot
+
+Array = NDArray[np.float64]
+
+WRIST = """format: 1
+family: limbs
+name: coupled-wrist
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+actuators:
+  m1: {reads: angle, gain: 0.5, sum: {j1: 1}, unknown: [offset], angle: {sd: 0.1}}
+  j2: {reads: angle, stroke: [-170, 170]}
+  j3: {reads: angle, sum: {j2: -0.1, j3: 1}, unknown: [weight.j2], weights: {sd: 0.001}}
+limbs:
+  - name: arm
+    ending: rigid
+    chain:
+      - {joint: R, name: a, axis: z, actuated: j1, start: 20}
+      - {joint: R, name: b, at: [300, 0, 0], axis: z, actuated: j2, start: 60}
+      - {joint: R, name: c, at: [250, 0, 0], axis: z, actuated: j3, start: 10}
+    tip: [80, 0, 0]
+    errors: [{of: b, shift: [x], tolerance: {sd: 0.2}}]
+home: {x: 300, y: 350, yaw: 90}
+"""
+
+STRUTS = """format: 1
+family: limbs
+name: struts
+units: {length: m, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+actuators:
+  q1: {reads: length, sum: {s1: 1, s2: 1}, unknown: [weight, gain, offset], weights: {sd: 0.01}, ratio: {sd: 0.01}, length: {sd: 0.01}}
+  q2: {reads: length, period: 0.3, sum: {s1: 1, s3: 2}, unknown: [sin1], length: {sd: 0.001}}
+  q3: {reads: angle, radius: 0.1, buildup: 0.001, sum: {s2: 1, s4: 2}, unknown: [radius, buildup], radii: {sd: 0.001}, buildups: {sd: 0.0001}}
+limbs:
+  - {name: one, tip: [0.1, 0, 0], ending: ball, attach: [-0.15, -0.1, 0], errors: &errors [{of: hinge, shift: [x, y], tolerance: {sd: 0.002}}], chain: [{joint: R, name: hinge, at: [-1, 0.8, 0], start: -45}, {joint: P, name: slide, axis: x, actuated: s1, start: 0.9}]}
+  - {name: two, tip: [0.1, 0, 0], ending: ball, attach: [-0.15, 0.1, 0], errors: *errors, chain: [{joint: R, name: hinge, at: [1, 0.8, 0], start: 210}, {joint: P, name: slide, axis: x, actuated: s2, start: 1.2}]}
+  - {name: three, tip: [0.1, 0, 0], ending: ball, attach: [0.15, -0.1, 0], errors: *errors, chain: [{joint: R, name: hinge, at: [-1, -0.7, 0], start: 30}, {joint: P, name: slide, axis: x, actuated: s3, start: 1.2}]}
+  - {name: four, tip: [0.1, 0, 0], ending: ball, attach: [0.15, 0.1, 0], errors: *errors, chain: [{joint: R, name: hinge, at: [1, -0.7, 0], start: 140}, {joint: P, name: slide, axis: x, actuated: s4, start: 1.1}]}
+"""  # noqa: E501
+
+CELL = """format: 1
+family: stages
+name: cell
+units: {length: mm, angle: deg}
+controlled: [x, y, z, yaw]
+stages:
+  - {name: lift, joint: {kind: P, axis: z}}
+  - name: plate
+    family: limbs
+    freedoms: [x, y, rz]
+    controlled: [x, y, yaw]
+    home: {x: 10}
+    actuators:
+      q1: {reads: length, sum: {m: 1, n: 1}, unknown: [weight.n], weights: {sd: 0.001}}
+      q2: {reads: length, sum: {m: 1, k: 2}}
+      q3: {reads: length, sum: {n: 1, h: 2}}
+    limbs:
+      - {name: m, tip: [-1000, 800, 0], ending: distance, attach: [-150, -100, 0], actuated: m}
+      - {name: n, tip: [1000, 800, 0], ending: distance, attach: [-150, 100, 0], actuated: n}
+      - {name: k, tip: [-1000, -700, 0], ending: distance, attach: [150, -100, 0], actuated: k}
+      - {name: h, tip: [1000, -700, 0], ending: distance, attach: [150, 100, 0], actuated: h}
+"""
+
+
+def load_text(folder: Path, text: str) -> Mechanism:
+    """Return the robot of a file with this text."""
+    path = folder / "robot.yaml"
+    path.write_text(text, "utf-8")
+    return load_robot(path)
+
+
+def draw_errors(robot: Mechanism, seed: int) -> Mechanism:
+    """Return a robot with parameters off by one tolerance, drawn."""
+    sd = np.array([p.tolerance or 0.0 for p in robot.parameters.entries])
+    return robot.with_values(
+        robot.values + sd * np.random.default_rng(seed).standard_normal(sd.size)
+    )
+
+
+def get(robot: Mechanism, name: str) -> float:
+    """Return the value of a parameter [SI]."""
+    return float(robot.values[robot.parameters.index(name)])
+
+
+# --- as many readings as joints
+
+
+def test_crossed_belts_agree_with_their_closed_form() -> None:
+    nominal = load_cached_robot("core-xy")
+    robot = draw_errors(nominal, 1)
+    q = np.random.default_rng(2).uniform([-20, -20, 0.01], [20, 20, 0.25], (500, 3))
+    sums = [
+        get(robot, f"{m}.offset") + get(robot, f"{m}.radius") * q[:, i] for i, m in enumerate("ab")
+    ]
+    u, v = get(robot, "a.weight.y"), get(robot, "b.weight.y")
+    y = (sums[0] - sums[1]) / (u - v)  # x + u y = a, x + v y = b
+    x = sums[0] - u * y
+    z = get(robot, "z.offset") + get(robot, "z.gain") * q[:, 2]
+    bridge = [get(robot, f"gantry.x.{axis}") for axis in ("rx", "ry", "rz")]
+    lift = [get(robot, f"gantry.z.{axis}") for axis in ("rx", "ry")]
+    T = forward(robot, q).T
+    # first order in the tilts, of 1 mrad over 0.35 m
+    near = np.column_stack([x, y, z]) + np.column_stack(
+        [z * (bridge[1] + lift[1]), x * bridge[2] - z * (bridge[0] + lift[0]), -x * bridge[1]]
+    )
+    assert np.abs(T[:, :3, 3] - near).max() < 3e-6
+    straight = nominal.with_values(
+        np.where(["gantry" in n for n in robot.parameters.names], 0.0, robot.values)
+    )
+    exact = forward(straight, q).T[:, :3, 3]
+    np.testing.assert_allclose(exact, np.column_stack([x, y, z]), rtol=0, atol=1e-12)
+
+
+def test_a_joint_is_read_alone_and_in_a_sum(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, WRIST)
+    assert [a.name for a in robot.actuators] == ["m1", "j2", "j3"]
+    q = np.random.default_rng(3).uniform(-1, 1, (20, 3))
+    first, second = 0.5 * q[:, 0], q[:, 1]
+    third = q[:, 2] + 0.1 * second
+    yaw = first + second + third
+    x = 0.3 * np.cos(first) + 0.25 * np.cos(first + second) + 0.08 * np.cos(yaw)
+    T = forward(robot, q).T
+    np.testing.assert_allclose(T[:, 0, 3], x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(T[:, 0, 0], np.cos(yaw), rtol=0, atol=1e-12)
+
+
+# --- fewer readings than lengths
+
+ANCHORS = {"m": (-1.0, 0.8), "n": (1.0, 0.8), "k": (-1.0, -0.7), "h": (1.0, -0.7)}
+POINTS = {"m": (-0.15, -0.1), "n": (-0.15, 0.1), "k": (0.15, -0.1), "h": (0.15, 0.1)}
+SUMS = {"q1": ("m", 1.0, "n"), "q2": ("m", 2.0, "k"), "q3": ("n", 2.0, "h")}
+
+
+def compute_readings(robot: Mechanism, y: Any, values: Any, module: Any = np) -> Any:
+    """Return the three readings of pulley-3 at a pose (x, y, yaw), from its drawing."""
+
+    def value(name: str) -> Any:
+        return values[robot.parameters.index(name)]
+
+    def length(name: str) -> Any:
+        px, py = POINTS[name]
+        cos, sin = module.cos(y[2]), module.sin(y[2])
+        dx = y[0] + cos * px - sin * py - value(f"{name}.anchor.x")
+        dy = y[1] + sin * px + cos * py - value(f"{name}.anchor.y")
+        return module.sqrt(dx**2 + dy**2)
+
+    return module.stack(
+        [
+            length(one) + value(f"{q}.weight.{other}") * length(other) - value(f"{q}.offset")
+            for q, (one, _, other) in SUMS.items()
+        ]
+    )
+
+
+def test_pulleys_agree_with_a_constraint_solver() -> None:
+    robot = draw_errors(load_cached_robot("pulley-3"), 4)
+    sample = sample_workspace(load_cached_robot("pulley-3"), 60, seed=5)
+    q = sample.solution.q
+    solved = forward(robot, q)
+    assert solved.converged.all()
+    for i, wanted in enumerate(q):
+        y = fsolve(
+            lambda y, wanted=wanted: compute_readings(robot, y, robot.values) - wanted,
+            sample.coordinates[i],
+            xtol=1e-12,
+        )
+        np.testing.assert_allclose(solved.T[i, :2, 3], y[:2], rtol=0, atol=1e-9 * robot.size)
+        turn = Rotation.from_matrix(solved.T[i, :3, :3]).as_rotvec()
+        np.testing.assert_allclose(turn, [0, 0, y[2]], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["core-xy", "pulley-3"])
+def test_readings_of_poses_lead_back_to_them(name: str) -> None:
+    robot = draw_errors(load_cached_robot(name), 6)
+    reached = inverse(robot, sample_workspace(robot, 300, seed=7).coordinates)
+    assert reached.converged.all()
+    back = forward(robot, reached.q)
+    assert back.converged.all()
+    np.testing.assert_allclose(back.T, reached.T, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_of_pulleys_agree_with_differences_and_jax() -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    robot = draw_errors(load_cached_robot("pulley-3"), 8)
+    y, free = np.array([0.12, -0.2, 0.07]), [3, 4, 2]
+    q = compute_readings(robot, y, robot.values)
+    state = forward_trials(robot, robot.values[None], q[None, None])
+    known = differentiate_pose(robot, robot.values[None], q[None, None], state)
+
+    def closed_form(y: Any, values: Any) -> Any:
+        return compute_readings(robot, y, values, jax.numpy)
+
+    slope = np.linalg.inv(jax.jacobian(closed_form)(y, robot.values))
+    by_values = -slope @ jax.jacobian(closed_form, 1)(y, robot.values)
+    np.testing.assert_allclose(known.readings[0, 0][free], slope, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(known.parameters[0, 0][free], by_values, rtol=0, atol=1e-11)
+
+    def move(x: Array) -> Array:
+        T = forward_trials(robot, x, q[None, None], state).T[:, 0]
+        return np.column_stack([T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
+
+    check_jacobian(
+        move,
+        known.parameters[0, 0][free],
+        robot.values,
+        scale=0.05,
+        atol=1e-9,
+        atol_reason="[m, rad] Newton's own accuracy over the smallest step",
+        is_batched=True,
+    )
+
+
+@pytest.mark.parametrize("text", [WRIST, STRUTS, CELL])
+def test_poses_and_passive_joints_are_differentiated_by_every_term(
+    tmp_path: Path, text: str
+) -> None:
+    robot = load_text(tmp_path, text)
+    reached = inverse(robot, robot.home[None])
+    assert reached.converged.all()
+    values, a = robot.values, len(robot.actuators)
+    q = reached.q[0] + 0.02
+    state = forward_trials(robot, values[None], q[None, None])
+    assert state.status == Status.CONVERGED
+    known = differentiate_pose(robot, values[None], q[None, None], state)
+    passive = differentiate_passive_joints(robot, values[None], q[None, None], state)
+
+    def move(x: Array) -> Array:
+        shown = x[:, None, :a]
+        solved = forward_trials(robot, x[:, a:], shown, state)
+        T = solved.T[:, 0]
+        pose = [T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])]
+        joints = select_joint_values(robot, passive.names, shown, solved)
+        return np.column_stack([*pose, *(value[:, 0] for value in joints.values())])
+
+    both = [
+        np.concatenate([one[0, 0][[3, 4, 2]], two[0, 0]])
+        for one, two in ((known.readings, passive.readings), (known.parameters, passive.parameters))
+    ]
+    check_jacobian(
+        move,
+        np.concatenate(both, axis=1),
+        np.concatenate([q, values]),
+        scale=0.05,
+        atol=1e-9,
+        atol_reason="[m, rad] Newton's own accuracy over the smallest step",
+        is_batched=True,
+    )
+
+
+def test_struts_with_hinges_are_the_same_machine_as_rods(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, STRUTS)
+    y = np.array([[0.05, 0.02, 0.03]])
+    solved = inverse(robot, y)
+    assert solved.converged.all()
+    turn = Rotation.from_rotvec([0, 0, 0.03]).as_matrix()[:2, :2]
+    slides = {  # of the slides, which begin 0.1 m before their tips
+        name: np.linalg.norm(turn @ POINTS[name] + y[0, :2] - ANCHORS[name]) - 0.1
+        for name in ANCHORS
+    }
+    first = slides["m"] + slides["n"]
+    third = slides["n"] + 2 * slides["h"]
+    assert solved.q[0, 0] == pytest.approx(first, abs=1e-12)
+    wound = 0.1 * solved.q[0, 2] + 0.001 / (4 * np.pi) * solved.q[0, 2] ** 2
+    assert wound == pytest.approx(third, abs=1e-12)
+
+
+def test_readings_far_from_the_start_follow_a_path_or_state_why_not() -> None:
+    robot = load_cached_robot("pulley-3")
+    q = np.random.default_rng(9).uniform([1, 2, 2], [5, 6, 6], (200, 3))
+    solved = forward(robot, q)
+    assert set(np.unique(solved.status)) <= {int(s) for s in Status}
+    good = solved.converged
+    assert good.sum() > 5
+    assert (solved.state.closure_sign[0, good] == robot.home_state.closure_sign).all()
+    for i in np.flatnonzero(good):
+        T = solved.T[i]
+        y = np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
+        np.testing.assert_allclose(compute_readings(robot, y, robot.values), q[i], atol=1e-9)
+
+
+def test_assembly_modes_of_sums_have_the_readings_of_home() -> None:
+    robot = load_cached_robot("pulley-3")
+    home = inverse(robot, np.zeros((1, 3))).q[0]
+    modes = find_assembly_modes(robot, home).solution
+    for T in modes.T:
+        y = np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
+        np.testing.assert_allclose(compute_readings(robot, y, robot.values), home, atol=1e-9)
+
+
+def test_the_sign_of_closure_is_that_of_the_derivative_of_the_sums() -> None:
+    robot = load_cached_robot("pulley-3")
+    y = np.random.default_rng(10).uniform([-0.6, -0.5, -2.5], [0.6, 0.5, 2.5], (60, 3))
+    T = inverse(robot, np.zeros((1, 3))).T.repeat(60, axis=0)
+    T[:, :3, :3] = Rotation.from_rotvec(y[:, 2:] * [[0, 0, 1]]).as_matrix()
+    T[:, :2, 3] = y[:, :2]
+    state = solve_at_pose(robot, robot.values[None], T[None], robot.home_state)[0]
+    slopes = np.array(
+        [
+            central_difference(lambda x: compute_readings(robot, x, robot.values), x, np.ones(3))[0]
+            for x in [np.zeros(3), *y]
+        ]
+    )
+    home, *signs = np.sign(np.linalg.det(slopes))
+    assert min(signs) < max(signs)
+    found = compute_closure_sign(robot, robot.values[None], state)[0]
+    np.testing.assert_array_equal(
+        found * robot.home_state.closure_sign[0, 0], np.multiply(signs, home)
+    )
+    margins = analyze_singularity(robot, T).drive_margin
+    assert (margins > 0).any()
+
+
+def test_sums_of_a_stage_are_solved_in_the_chain(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, CELL)
+    wanted = np.random.default_rng(11).uniform([-0.3, -0.3, -1, -0.1], [0.3, 0.3, 1, 0.1], (30, 4))
+    solved = inverse(robot, wanted)
+    assert solved.converged.all()
+    np.testing.assert_allclose(forward(robot, solved.q).T, solved.T, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(solved.q[:, 0], wanted[:, 2], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(solved.T[:, :3, 3], wanted[:, :3], rtol=0, atol=1e-11)
+
+
+# --- mistakes
+
+
+PLATE = """format: 1
+family: limbs
+name: plate
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+actuators:
+  q1: {reads: length, sum: {m: 1, n: 1}, unknown: [weight.n], weights: {sd: 0.001}}
+  q2: {reads: length, sum: {m: 1, k: 2}}
+  q3: {reads: length, sum: {n: 1, h: 2}}
+limbs:
+  - {name: M, tip: [-1000, 800, 0], ending: distance, attach: [-150, -100, 0], actuated: m}
+  - {name: N, tip: [1000, 800, 0], ending: distance, attach: [-150, 100, 0], actuated: n}
+  - {name: K, tip: [-1000, -700, 0], ending: distance, attach: [150, -100, 0], actuated: k}
+  - {name: H, tip: [1000, -700, 0], ending: distance, attach: [150, 100, 0], actuated: h}
+"""
+SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, sum: {n: 1, h: 2}}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence", "line"),
+    [
+        (SECOND, "q2: {reads: length, sum: {m: 1, kk: 2}}", "names 'kk', which no limb", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 1, h: 2}}", "'k' of limb 'K' is in no sum", 8),
+        (SECOND, "q2: {reads: length, sum: {m: 2, n: 2}}\n  k: {reads: length}",
+         "singular: that of actuator 'q2' follows", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 0, k: 0}}", "all weights in the sum", 9),
+        (SECOND, "q2: {reads: length, sum: {m: 1, k: .inf}}", "is inf; write a finite number", 9),
+        (SECOND, "q2: {reads: length}", "'q2' drives no joint and states no `sum:`", 9),
+        ("[weight.n]", "[weight.k]", "no term 'weight.k'", 8),
+        ("[weight.n]", "[wait.n]", "no term 'wait.n'", None),
+        (f"  {THIRD}\n", "", "'h' of limb 'H' is in no sum", 8),
+        (f"  {THIRD}\n", "  h: {reads: length}\n  k: {reads: length}\n",
+         "redundant readings cannot be sums", None),
+        (THIRD, f"{THIRD}\n  m: {{reads: length}}\n  k: {{reads: length}}",
+         "5 readings .* are sums of 4 joints", 12),
+        (f"  {SECOND}\n  {THIRD}\n", "  q2: {reads: length, sum: {k: 1, h: 2}}\n",
+         "2 readings of 4 driven joints for 3 freedoms", None),
+        (THIRD, "q3: {reads: angle, sum: {n: 1, h: 2}}", "drives a joint that slides", None),
+        (THIRD, "q3: {triangle: {foot: [1, 0, 0], head: [0, 1, 0]}}", "beside sums", 10),
+    ],
+)  # fmt: skip
+def test_impossible_sums_are_refused_in_one_sentence(
+    tmp_path: Path, old: str, new: str, sentence: str, line: int | None
+) -> None:
+    assert load_text(tmp_path, PLATE).has_open_sums
+    assert old in PLATE
+    with pytest.raises((FileError, MechanismError), match=sentence) as error:
+        load_text(tmp_path, PLATE.replace(old, new, 1))
+    text = str(error.value)
+    assert "\n" not in text
+    assert "robot.yaml" in text
+    assert line is None or f"line {line}" in text or f":{line}" in text
+
+
+def test_a_sum_of_an_angle_and_a_length_is_refused(tmp_path: Path) -> None:
+    text = WRIST.replace("{joint: R, name: b", "{joint: P, name: b").replace(
+        "start: 60", "start: 6"
+    )
+    with pytest.raises(FileError, match="is a sum of the angle 'j3' and the length 'j2'"):
+        load_text(tmp_path, text)
+
+
+def test_sums_that_do_not_hold_the_platform_are_refused(tmp_path: Path) -> None:
+    # no cable holds the plate against rotation about the point in which all of them meet
+    text = PLATE
+    for point in ("[-150, -100, 0]", "[-150, 100, 0]", "[150, -100, 0]", "[150, 100, 0]"):
+        text = text.replace(f"attach: {point}", "attach: [0, 0, 0]")
+    with pytest.raises((FileError, MechanismError), match=r"can rotate|leave|free|hold"):
+        load_text(tmp_path, text)
+    symmetric = PLATE.replace(SECOND, "q2: {reads: length, sum: {k: 1, h: 1}}").replace(
+        THIRD, "q3: {reads: length, sum: {m: 1, n: 1, k: 1, h: 2}}"
+    )
+    symmetric = symmetric.replace("-700", "-800").replace("150, 100", "150, 99.999")
+    assert load_text(tmp_path, symmetric).has_open_sums
+
+
+def test_a_drive_of_two_stages_is_refused(tmp_path: Path) -> None:
+    text = CELL.replace("joint: {kind: P, axis: z}", "joint: {kind: P, axis: z, drive: q1}")
+    with pytest.raises(FileError, match="actuator 'q1' drives the stages 'lift' and 'plate'"):
+        load_text(tmp_path, text)
