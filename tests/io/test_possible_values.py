@@ -16,7 +16,7 @@ from loopcal.mechanism import find_impossible_values, forward
 from loopcal.units import SI_SYMBOLS
 
 ROBOTS = tuple(list_shipped_robots())
-WITHOUT_RODS = ("3-rps", "agile-eye", "belt-4", "pentapod")
+WITHOUT_RODS = ("3-rps", "agile-eye", "belt-4", "pentapod", "pulley-3")
 
 
 def write_table(tmp_path: Path, robot: str, rows: str) -> Path:

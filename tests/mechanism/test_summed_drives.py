@@ -157,6 +157,18 @@ def test_a_joint_is_read_alone_and_in_a_sum(tmp_path: Path) -> None:
     np.testing.assert_allclose(T[:, 0, 0], np.cos(yaw), rtol=0, atol=1e-12)
 
 
+def test_the_arm_on_the_page_of_robots_is_that_of_its_formula(tmp_path: Path, root: Path) -> None:
+    page = (root / "docs" / "robots.md").read_text("utf-8")
+    section = page[page.index("### Summed drives") :]
+    robot = load_text(tmp_path, section[section.index("```yaml\n") + 8 :].split("```")[0])
+    reached = inverse(robot, sample_workspace(robot, 40, seed=1).coordinates)
+    assert reached.converged.all()
+    first, second = reached.q.T  # the motor of the elbow reads the direction of the forearm
+    x = 0.3 * np.cos(first) + 0.25 * np.cos(second)
+    y = 0.3 * np.sin(first) + 0.25 * np.sin(second)
+    np.testing.assert_allclose(reached.T[:, :2, 3], np.column_stack([x, y]), rtol=0, atol=1e-12)
+
+
 # --- fewer readings than lengths
 
 ANCHORS = {"m": (-1.0, 0.8), "n": (1.0, 0.8), "k": (-1.0, -0.7), "h": (1.0, -0.7)}
@@ -192,10 +204,12 @@ def test_pulleys_agree_with_a_constraint_solver() -> None:
     solved = forward(robot, q)
     assert solved.converged.all()
     for i, wanted in enumerate(q):
-        y = fsolve(
-            lambda y, wanted=wanted: compute_readings(robot, y, robot.values) - wanted,
-            sample.coordinates[i],
-            xtol=1e-12,
+        y = np.asarray(
+            fsolve(
+                lambda y, wanted=wanted: compute_readings(robot, y, robot.values) - wanted,
+                sample.coordinates[i],
+                xtol=1e-12,
+            )
         )
         np.testing.assert_allclose(solved.T[i, :2, 3], y[:2], rtol=0, atol=1e-9 * robot.size)
         turn = Rotation.from_matrix(solved.T[i, :3, :3]).as_rotvec()

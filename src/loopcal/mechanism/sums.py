@@ -24,14 +24,15 @@ def apply_weights(weights: FloatArray, values: FloatArray) -> FloatArray:
 
 def invert_weights(weights: FloatArray) -> FloatArray:
     """Return the inverses of matrices (.., J, J), NaN where one is singular or not finite."""
-    finite = np.isfinite(weights).all(axis=(-1, -2))[..., None, None]
+    finite = np.all(np.isfinite(weights), axis=(-1, -2), keepdims=True)
     unit = np.eye(weights.shape[-1])
     weights = np.where(finite, weights, unit)
     with np.errstate(all="ignore"):
         try:
             inverse = np.linalg.inv(weights)
         except np.linalg.LinAlgError:
-            finite = finite & (np.linalg.matrix_rank(weights) == len(unit))[..., None, None]
+            rank = np.asarray(np.linalg.matrix_rank(weights))[..., None, None]
+            finite = finite & (rank == len(unit))
             inverse = np.linalg.inv(np.where(finite, weights, unit))
         return np.where(finite, inverse, np.nan)
 

@@ -249,7 +249,7 @@ def _compute_margins(
         A, Q = _sum_rows(robot, state, A, Q)
     A = A / robot.twist_scale[list(program.freedoms)]
     Q = Q / np.where(turning, robot.size, 1.0)
-    good = np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
     A, Q = np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0)
     _, s, V = np.linalg.svd(A)
     _, r, W = np.linalg.svd(Q)
