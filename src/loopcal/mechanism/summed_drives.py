@@ -30,7 +30,6 @@ from loopcal.mechanism.sums import apply_weights, invert_weights
 from loopcal.mechanism.transmission import differentiate_sums, joint_slopes, select_weights
 from loopcal.typing import FloatArray
 
-
 ITERATIONS = 25
 """Newton steps of a pose; those within reach need fewer than ten."""
 
