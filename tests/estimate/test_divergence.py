@@ -67,18 +67,18 @@ def test_estimate_far_outside_its_tolerance_is_reported():
 def test_hopeless_fit_follows_no_paths_to_poses_that_its_steps_do_not_reach(monkeypatch):
     """Such a step is shortened. Paths from its own readings took most of the time of these fits."""
     followed = []
-    follow = batch_kinematics._follow_path
+    follow = batch_kinematics.follow_path
 
-    def count(robot, e, joints, begin, state, wrong):
+    def count(loops, joints, begin, state, wrong):
         followed.append(int(wrong.sum()))
-        return follow(robot, e, joints, begin, state, wrong)
+        return follow(loops, joints, begin, state, wrong)
 
     data = hexapod_data(12)
     rows = data.observations[0]
     measured = rows.measured.copy()
     measured[4, 3:] += 1000.0  # [m]
     wrong = replace(data, observations=(replace(rows, measured=measured),))
-    monkeypatch.setattr(batch_kinematics, "_follow_path", count)
+    monkeypatch.setattr(batch_kinematics, "follow_path", count)
     fit = identify(hexapod(), wrong, LeastSquares())
     assert not fit.converged
     assert followed == []

@@ -77,7 +77,7 @@ def evaluation_counter(monkeypatch):
         monkeypatch.setattr(owner, attribute, wrapped)
 
     counting(UncertainPoses, "_evaluate", "evaluations")
-    counting(trials_module, "_follow_path", "followed")
+    counting(trials_module, "follow_path", "followed")
     return count
 
 
