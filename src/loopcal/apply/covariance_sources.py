@@ -142,8 +142,11 @@ def halve_sigma(
     elif source.kind == READINGS and data.reading_sigma is not None:
         changed = replace(data, reading_sigma=0.5 * data.reading_sigma)
     elif source.kind == INSTRUMENT:
-        observations = tuple(_halve(rows, source.name, data) for rows in data.observations)
-        changed = replace(data, observations=observations)
+        of_poses, of_base = (
+            tuple(_halve(rows, source.name, data) for rows in observations)
+            for observations in (data.observations, data.base_observations)
+        )
+        changed = replace(data, observations=of_poses, base_observations=of_base)
     elif source.kind == SETUP and _has_stated_setup(fit):
         other = _with_half_setup(fit, data)
     else:
@@ -201,6 +204,7 @@ def _name(rows: Observations, session: str, data: Measurements) -> str:
     frame = getattr(rows.kind, "frame", None)
     if any(getattr(o.kind, "frame", None) != frame for o in alike):
         name = f"{name} in {frame}"
+    name = f"{name} of the base" if rows.kind.is_of_base else name
     return f"{name}, {session}" if session else name
 
 
@@ -212,7 +216,7 @@ def _number_sources(
     """
     numbers: dict[tuple[str, str], int] = {}
     members = []
-    for rows in (o for o in data.observations if len(o)):
+    for rows in (o for o in data.all_observations if len(o)):
         labels = [(INSTRUMENT, _name(rows, session, data)) for session in rows.session.tolist()]
         members.append(np.array([numbers.setdefault(label, len(numbers)) for label in labels]))
     if problem.is_uncertain:

@@ -226,7 +226,7 @@ def _describe_instruments(
 def list_instrument_frames(data: Measurements) -> Iterable[tuple[str, FloatArray, bool]]:
     """Return name, stated T_base_frame (4, 4) and whether it is unknown of each complete frame."""
     listed: dict[str, tuple[FloatArray, bool]] = {}
-    for rows in data.observations:
+    for rows in data.all_observations:
         name, stated = getattr(rows.kind, "frame", None), getattr(rows.kind, "T_base_frame", None)
         if name is None or stated is None or "frame" not in rows.kind.allowed_unknown:
             continue

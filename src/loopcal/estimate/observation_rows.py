@@ -128,8 +128,10 @@ class ObservationRows:
 
     def weighted(self, weight: FloatArray) -> ObservationRows:
         """Return the rows with a factor (n,) or (t, n) on each pose's squares; linked poses share
-        it.
+        it. Rows of targets on the base belong to no pose and keep theirs.
         """
+        if self.kind.is_of_base:
+            return self
         linked = np.sqrt(weight)[..., self.poses_by_link]
         each = linked.prod(axis=-1) ** (1.0 / linked.shape[-1])
         return replace(self, whitener=self.whitener * np.atleast_2d(each)[:, :, None, None])

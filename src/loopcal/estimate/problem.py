@@ -270,7 +270,8 @@ class Problem:
 
         `linearization` is one of this problem, or of the same one with other weights: nuisance
         parameters and their elimination are taken from it. Uncertain poses are where the rows of
-        this problem put them at these nuisance parameters, unless a solution is given.
+        this problem put them at these nuisance parameters, unless a solution is given. Rows of
+        targets on the base are left out where readings are exact: they belong to no pose.
         """
         z, estimate = linearization.deviation, linearization.nuisance
         if solution is None:
@@ -278,7 +279,8 @@ class Problem:
             solution = self.solve(z, linearization.next_start, fixed, derivatives=True)
         at_nodes = None if estimate is None else estimate.elimination.at_nodes
         rows = self.poses.iterate_rows(solution, z, self.trials)
-        yield from spread_rows(self.poses, rows, self.parameters, self.nuisance, at_nodes)
+        spread = spread_rows(self.poses, rows, self.parameters, self.nuisance, at_nodes)
+        yield from map(self._select_rows_of_poses, spread)
 
     def rows_at(self, deviation: FloatArray, nuisance: FloatArray) -> Iterator[list[LeverageRows]]:
         """Give the rows like `leverage_rows`, but with nuisance parameters that are not eliminated:
@@ -289,7 +291,12 @@ class Problem:
         unknowns, p = self.nuisance, self.parameters
         apart = None if unknowns is None else partial(unknowns.keep_apart, p)
         rows = self.poses.iterate_rows(solution, deviation, self.trials)
-        yield from spread_rows(self.poses, rows, p, unknowns, apart)
+        spread = spread_rows(self.poses, rows, p, unknowns, apart)
+        yield from map(self._select_rows_of_poses, spread)
+
+    def _select_rows_of_poses(self, block: list[LeverageRows]) -> list[LeverageRows]:
+        """Return the rows of a block without those of targets on the base."""
+        return [r for r in block if r.kind < 0 or not self.rows[r.kind].kind.is_of_base]
 
     def count_leverage_rows(self, member: IntArray, count: int) -> IntArray:
         """Return how many rows `leverage_rows` gives of each of `count` blocks of poses.
@@ -304,7 +311,7 @@ class Problem:
                 blocks = member[first[group.components]]
                 total += height * np.bincount(blocks, minlength=count)
             return total
-        for r in self.rows:
+        for r in (r for r in self.rows if not r.kind.is_of_base):
             blocks = member[r.first_poses]
             total += np.bincount(blocks, minlength=count) * r.whitener.shape[-1]
         return total

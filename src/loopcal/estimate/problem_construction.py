@@ -27,6 +27,7 @@ from loopcal.measure import (
     make_readings_kind,
     resolve_reading_sigma,
 )
+from loopcal.measure.base_rows import anchor_rows
 from loopcal.measure.whitening import compute_whitener
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import Halving
@@ -53,13 +54,13 @@ def problem_of(
     rows = tuple(
         ObservationRows(
             o.kind,
-            o.rows,
+            anchor_rows(o, data.observations) if o.kind.is_of_base else o.rows,
             o.measured[None],
             o.whitener[None],
             nuisance.indices[i],
             nuisance.factor(i),
         )
-        for i, o in enumerate(data.observations)
+        for i, o in enumerate(data.all_observations)
         if len(o)
     )
     return make_problem(
@@ -70,12 +71,15 @@ def problem_of(
 def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
     """Return the problem of t simulated machines."""
     sensors, first = trials.instrument.sensors, trials.trial(0)
-    local = collect_nuisance_parameters(first.observations, first.labels)
+    local = collect_nuisance_parameters(first.all_observations, first.labels)
+    order = sorted(range(len(sensors)), key=lambda i: sensors[i].kind.is_of_base)  # stable
     rows = []
-    for i, (sensor, measured) in enumerate(zip(sensors, trials.measured, strict=True)):
+    for i, (number, o) in enumerate(zip(order, first.all_observations, strict=True)):
+        sensor, measured = sensors[number], trials.measured[number]
         kind, places, factor = sensor.kind, local.indices[i], local.factor(i)
         white = _compute_whiteners(sensor, measured)
-        rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places, factor))
+        poses = anchor_rows(o, first.observations) if kind.is_of_base else sensor.assigned_rows
+        rows.append(ObservationRows(kind, poses, measured, white, places, factor))
     recorded = trials.readings[None] if trials.recorded is None else trials.recorded
     return make_problem(
         free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 from loopcal.value_classes import dataclass, field
 
 if TYPE_CHECKING:
-    from loopcal.estimate.observation_rows import Residuals
+    from loopcal.estimate.observation_rows import ObservationRows, Residuals
     from loopcal.estimate.problem import Problem
     from loopcal.measure import Measurements
 
@@ -98,7 +98,7 @@ def label_residuals(
     residuals: tuple[Residuals, ...], data: Measurements, problem: Problem
 ) -> tuple[KindResiduals, ...]:
     """Return the residuals (t = 1) of every kind with labels; those of uncertain readings last."""
-    observations = [o for o in data.observations if len(o)]
+    observations = [o for o in data.all_observations if len(o)]
     present, context = [o.present for o in observations], [o.context for o in observations]
     if problem.is_uncertain:
         present.append(np.isfinite(data.readings))
@@ -107,19 +107,28 @@ def label_residuals(
         KindResiduals(
             kind=s.kind.name,
             components=tuple(column.name for column in s.kind.noise_columns),
-            poses=_label_rows(s.poses_by_link, data.labels),
+            poses=_label_rows(s, data.labels),
             raw=np.where(measured, r.raw[0], np.nan),
             whitened=r.whitened[0],
             context=columns,
             dimensions=tuple(column.dimension for column in s.kind.noise_columns),
-            readings=data.readings[s.poses_by_link[:, 0]],
+            readings=_take_readings(s, data.readings),
         )
         for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
     )
 
 
-def _label_rows(poses: IntArray, labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a label for each row: those of the poses (r, links) that it observed."""
+def _take_readings(rows: ObservationRows, readings: FloatArray) -> FloatArray:
+    """Return the readings (r, a) of the first pose of each row; NaN for targets on the base."""
+    of_first = readings[rows.poses_by_link[:, 0]]
+    return np.full_like(of_first, np.nan) if rows.kind.is_of_base else of_first
+
+
+def _label_rows(rows: ObservationRows, labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a label for each row: those of the poses that it observed, or "base"."""
+    poses = rows.poses_by_link
+    if rows.kind.is_of_base:
+        return (rows.kind.of,) * len(poses)
     if poses.shape[1] == 1:
         return tuple(map(labels.__getitem__, poses[:, 0].tolist()))
     return tuple("/".join(labels[i] for i in members) for members in poses.tolist())

@@ -74,7 +74,7 @@ def evaluate_measurements(
 
     Returns
     -------
-    evaluated : one `EvaluatedRows` for each kind, in order
+    evaluated : one `EvaluatedRows` for each kind, in order; those of targets on the base last
 
     Raises
     ------
@@ -84,7 +84,7 @@ def evaluate_measurements(
     collected = measurements.nuisance_parameters if nuisance is None else nuisance
     return tuple(
         _evaluate_kind(rows, T, collected.select(i, values), i, collected, joints or {})
-        for i, rows in enumerate(measurements.observations)
+        for i, rows in enumerate(measurements.all_observations)
     )
 
 

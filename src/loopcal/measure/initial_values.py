@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.measure.evaluation import evaluate_measurements, whiten_rows
-from loopcal.measure.kinds import Kind
+from loopcal.measure.kinds import Kind, Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
@@ -52,7 +52,10 @@ def guess_nuisance_values(
     if not collected.table.free.any():
         return collected.values()
     values = guess_nuisance_values_batch(
-        measurements, [o.measured[None] for o in measurements.observations], T[None], collected
+        measurements,
+        [o.measured[None] for o in measurements.all_observations],
+        T[None],
+        collected,
     )[0]
     return _refine_together(measurements, T, collected, values, joints)
 
@@ -71,7 +74,7 @@ def guess_nuisance_values_batch(
     Parameters
     ----------
     measurements : to which the rows belong.
-    measured : (t, r, c) of each kind.
+    measured : (t, r, c) of each kind; those of targets on the base last.
     T : (t | 1, n, 4, 4) T_base_platform.
     nuisance : see `guess_nuisance_values`.
     most : number of candidates of each set to refine, those with the lowest cost; default all.
@@ -88,14 +91,15 @@ def guess_nuisance_values_batch(
         values instead.
     """
     known = ~(nuisance.table.free & np.isnan(nuisance.table.tolerance))
+    observations = measurements.all_observations
     sets = max((len(m) for m in measured), default=len(T))
     values = np.tile(nuisance.values(), (sets, 1))
     for i, members, indices in _list_groups(measurements, nuisance):
         # a drift begins at zero: every row takes another part of it
-        is_kept = known[indices] | measurements.observations[i].kind.is_drift
+        is_kept = known[indices] | observations[i].kind.is_drift
         if is_kept.all():
             continue
-        chosen = measurements.observations[i].take(members)
+        chosen = observations[i].take(members)
         values[:, indices] = _refine_best_candidate(
             chosen,
             measured[i][:, members],
@@ -116,11 +120,13 @@ def _list_groups(
     of its rows that measured something, and the parameters.
 
     They are in the order of the observations. Of the same kind, the group with the most rows is
-    first, so that a file with few rows does not determine the parameters that it shares.
+    first, so that a file with few rows does not determine the parameters that it shares. Targets on
+    the base whose stated places determine a frame are before all others, since no pose is needed;
+    other targets on the base are last.
     """
-    kinds = [type(rows.kind) for rows in measurements.observations]
+    kinds = [_rank_kind(rows.kind) for rows in measurements.all_observations]
     groups = []
-    for i, rows in enumerate(measurements.observations):
+    for i, rows in enumerate(measurements.all_observations):
         if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
             continue
         counts = (rows.weight > 0.0) & rows.present.any(axis=1)
@@ -128,7 +134,16 @@ def _list_groups(
             counted = members[counts[members]]
             if len(counted):
                 groups.append((i, counted, indices))
-    return sorted(groups, key=lambda group: (kinds.index(kinds[group[0]]), -len(group[1])))
+    return sorted(
+        groups,
+        key=lambda group: (kinds[group[0]][0], kinds.index(kinds[group[0]]), -len(group[1])),
+    )
+
+
+def _rank_kind(kind: Kind) -> tuple[int, type[Kind]]:
+    """Return when the rows of a kind are used, and its class."""
+    is_first = isinstance(kind, Position) and kind.locates_frame
+    return (0 if is_first else 2 if kind.is_of_base else 1), type(kind)
 
 
 def _group_rows(indices: IntArray) -> list[tuple[IntArray, IntArray]]:

@@ -137,6 +137,9 @@ def make_random_stream(seed: Seed, trial: int, purpose: int = 0) -> np.random.Ge
 
 # --- sensors and instruments
 
+BASE_ROWS = 2
+"""How often a sensor measures targets on the base unless it states its rows."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
@@ -148,7 +151,8 @@ class Sensor:
     noise : Noise
     rows : (r,) or (r, l) int, optional
         Poses of each row. Default: every pose once. Where a row compares poses: each pose with the
-        next one, and the last with the first.
+        next one, and the last with the first. Targets on the base are measured twice by default,
+        before and after the poses; their rows belong to no pose, and only their number matters.
     session, group : text or (r,) text, optional
         See `Observations`.
 
@@ -207,6 +211,8 @@ class Sensor:
         return self.rows
 
     def _rows(self, n: int) -> IntArray:
+        if self.kind.is_of_base:
+            return np.zeros(BASE_ROWS if self.rows is None else len(self.rows), dtype=np.intp)
         if self.rows is not None:
             return check_rows(self.rows, self.kind)
         if self.kind.poses_per_row == 1:

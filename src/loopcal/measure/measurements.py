@@ -11,6 +11,7 @@ from loopcal.argument_types import check_seed, describe
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array, check_number, check_type, set_fields
+from loopcal.measure.base_rows import check_bodies
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
@@ -45,6 +46,10 @@ class Measurements(TableResult):
         the sigma of its actuators.
     stated_values : tuple of StatedValue, optional
         Priors and fixed values of nuisance parameters. Default: all are estimated from the data.
+    base_observations : tuple of Observations, optional
+        Rows of targets that are fixed to the base (kinds with `of="base"`). They belong to no pose:
+        whatever poses are taken, held out or weighted, these rows stay, and they are no errors of
+        poses.
     is_held_out : (n,) bool, optional
         Poses that are held out for validation, as the column `use` of a file states. A calibration
         validates on them, and no fit uses them. Default: none.
@@ -53,7 +58,8 @@ class Measurements(TableResult):
     ------
     DataError
         If shapes differ, a reading is not finite though its sigma is, a sigma is negative, a row
-        refers to a pose that does not exist, or a block is partly held out.
+        refers to a pose that does not exist, a block is partly held out, or a target is on the base
+        and on a platform.
     """
 
     robot_name: str
@@ -64,6 +70,7 @@ class Measurements(TableResult):
     reading_sigma: FloatArray | None = None
     stated_values: tuple[StatedValue, ...] = ()
     is_held_out: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    base_observations: tuple[Observations, ...] = ()
 
     def __post_init__(self) -> None:
         readings = _check_readings(self.readings, self.reading_sigma is not None)
@@ -91,6 +98,8 @@ class Measurements(TableResult):
             _check_poses(rows, n)
         set_fields(self, readings=readings, block=block, labels=labels)
         set_fields(self, observations=tuple(self.observations))
+        set_fields(self, base_observations=tuple(self.base_observations))
+        check_bodies(self.observations, self.base_observations)
         set_fields(self, is_held_out=_check_held_out(self.is_held_out, block, labels))
         if self.reading_sigma is not None:
             sigma = check_reading_sigma(self.reading_sigma, readings, labels)
@@ -100,6 +109,7 @@ class Measurements(TableResult):
         n, a = self.readings.shape
         lines = [f"Measurements of {self.robot_name!r}: {n} poses, {a} actuator readings each"]
         lines += [f"  {rows!r}" for rows in self.observations[:8]]
+        lines += [f"  {rows!r}" for rows in self.base_observations]
         if len(self.observations) > 8:
             lines.append(f"  and {len(self.observations) - 8} more")
         if self.reading_sigma is not None:
@@ -112,8 +122,14 @@ class Measurements(TableResult):
         return len(self.readings)
 
     @property
+    def all_observations(self) -> tuple[Observations, ...]:
+        """The observations of poses, then those of targets on the base."""
+        return (*self.observations, *self.base_observations)
+
+    @property
     def n_rows(self) -> int:
-        """Number of scalar residuals that count (present, weight above 0), over all kinds."""
+        """Number of scalar residuals of poses that count (present, weight above 0), over all kinds.
+        """
         return sum(rows.n_residuals for rows in self.observations)
 
     @property
@@ -131,7 +147,7 @@ class Measurements(TableResult):
     @property
     def nuisance_parameters(self) -> NuisanceParameters:
         """The nuisance parameters of the observations, with their stated values."""
-        return collect_nuisance_parameters(self.observations, self.labels, self.stated_values)
+        return collect_nuisance_parameters(self.all_observations, self.labels, self.stated_values)
 
     @property
     def context(self) -> Mapping[str, FloatArray]:
@@ -168,6 +184,7 @@ class Measurements(TableResult):
         Returns
         -------
         measurements : Measurements
+            With all rows of targets on the base.
 
         Raises
         ------

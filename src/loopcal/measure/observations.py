@@ -34,7 +34,8 @@ class Observations:
     kind : Kind
         With the robot's tool, see `Kind.with_tool`.
     rows : (r,) int
-        Index of the pose of each row; (r, l) for kinds that compare l poses.
+        Index of the pose of each row; (r, l) for kinds that compare l poses. A row of targets on
+        the base belongs to no pose: its number does not matter, and becomes 0.
     measured : (r, c) [SI]
         NaN where not measured.
     covariance : (r, m, m) or (m, m) [SI]
@@ -95,6 +96,7 @@ class Observations:
         if not kind.has_tool:
             raise DataError(f"the kind {kind.name!r} has no tool; use kind.with_tool(robot.tool)")
         rows = check_rows(self.rows, kind)
+        rows = np.zeros_like(rows) if kind.is_of_base else rows
         c, m, r = len(kind.columns), len(kind.noise_columns), len(rows)
         measured = check_array(
             self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True

@@ -86,15 +86,18 @@ class Trials:
 
     def trial(self, i: int) -> Measurements:
         """Return the measurements of one trial."""
-        observations = tuple(
+        observations = [
             Observations.from_sigma(
                 s.kind, s.assigned_rows, measured[i], s.noise.sigma, s.session, s.group
             )
             for s, measured in zip(self.instrument.sensors, self.measured, strict=True)
-        )
-        readings = self.readings if self.recorded is None else self.recorded[i]
+        ]
         return Measurements(
-            self.robot_name, readings, observations, reading_sigma=self.reading_sigma
+            self.robot_name,
+            self.readings if self.recorded is None else self.recorded[i],
+            tuple(rows for rows in observations if not rows.kind.is_of_base),
+            reading_sigma=self.reading_sigma,
+            base_observations=tuple(rows for rows in observations if rows.kind.is_of_base),
         )
 
 
@@ -285,7 +288,7 @@ def replace_measured_values(
     data : Measurements
         Poses and rows; their measured values are ignored.
     instrument : Instrument
-        A sensor with its noise for each of `data.observations`, in their order.
+        A sensor with its noise for each of `data.all_observations`, in their order.
     seed : int
         Of the noise.
 
@@ -304,11 +307,15 @@ def replace_measured_values(
         )
     sensors = tuple(
         replace(sensor, rows=rows.rows, session=rows.session, group=rows.group)
-        for sensor, rows in zip(instrument.sensors, data.observations, strict=True)
+        for sensor, rows in zip(instrument.sensors, data.all_observations, strict=True)
     )
     how = {"controller": robot.nominal, "reading_sigma": data.reading_sigma}
     measured = simulate(robot, nominal.T, Instrument(sensors), seed, **how)
-    filled = replace(data, observations=measured.observations)
+    filled = replace(
+        data,
+        observations=measured.observations,
+        base_observations=measured.base_observations,
+    )
     if robot.program.sigma is None:
         return filled
     # redundant actuators of the true machine cannot all have the readings of the controller
@@ -338,6 +345,8 @@ def _measure_sensor(
     values = nuisance.select(k, nuisance.table.nominal[None])
     drawn = np.stack([of_trial[k] for of_trial in noise])
     measured = kind.measure(safe[:, rows], drawn, values, kind.stack_joints(joints, rows))
+    if kind.is_of_base:
+        return measured
     complete = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
     return np.where(complete[..., None], measured, np.nan)
 

@@ -144,7 +144,9 @@ class NuisanceElimination:
         values = self.local.values()
         kinds = [
             (o, i, self.tree.cluster[places].max(axis=1, initial=-1))
-            for i, (o, places) in enumerate(zip(data.observations, self.local.indices, strict=True))
+            for i, (o, places) in enumerate(
+                zip(data.all_observations, self.local.indices, strict=True)
+            )
             if len(o) and places.shape[1]
         ]
         for c in range(int(self.tree.cluster.max(initial=-1)) + 1):
@@ -175,7 +177,11 @@ class NuisanceElimination:
             tuple(np.searchsorted(used, places) for places in of_kinds),
             tuple(None if factor is None else factor[members] for factor, members in parts),
         )
-        part = replace(data, observations=tuple(rows for rows, _, _ in chosen))
+        part = replace(
+            data,
+            observations=tuple(rows for rows, _, _ in chosen if not rows.kind.is_of_base),
+            base_observations=tuple(rows for rows, _, _ in chosen if rows.kind.is_of_base),
+        )
         values[used] = guess_nuisance_values(part, T, setup, joints)
 
     def keep_apart(

@@ -208,7 +208,7 @@ def _usable_rows(
         for r in rows
         if not r.nuisance.shape[1]
         and r.kind.poses_per_row == 1
-        and not r.kind.sensed_joints
+        and not (r.kind.sensed_joints or r.kind.is_of_base)
         and len(r.poses)
     ]
     return [(r, _rows_of_poses(r, pose)) for r in usable]

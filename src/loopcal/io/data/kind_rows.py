@@ -136,7 +136,10 @@ def read_observations(
     entry = _select_rows(table, entry, members)
     links, rows = entry.kind.poses_per_row, entry.rows
     measured, covariance = _read_values(table, robot, entry)
-    poses = np.array([members[row] for row in rows], dtype=np.intp).reshape(-1, links)
+    if entry.kind.is_of_base:
+        poses, pose_context = np.zeros((len(rows), 1), dtype=np.intp), {}
+    else:
+        poses = np.array([members[row] for row in rows], dtype=np.intp).reshape(-1, links)
     beside = {}
     for name in dict.fromkeys([*context, *pose_context]):
         values = context[name][rows] if name in context else np.full(len(rows), np.nan)
@@ -217,7 +220,7 @@ def _read_robot_kind(
 
 def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...]]) -> KindRows:
     """Return only the rows that measure: those of two poses, for a kind that compares poses."""
-    links = entry.kind.poses_per_row
+    links = 0 if entry.kind.is_of_base else entry.kind.poses_per_row
     if links > 1 and "kind" not in table.units:
         entry = replace(entry, rows=entry.rows[[len(members[row]) > 1 for row in entry.rows]])
     for row in entry.rows:

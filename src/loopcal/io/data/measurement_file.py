@@ -5,6 +5,8 @@
     # noise: {rx: 5 urad, ry: 5 urad, rz: 5 urad, x: 1 um, y: 1 um, z: 1 um}
     pose,q1 [mm],..,q6 [mm],rx [mrad],..,z [mm]        columns: `columns.RULES`
 
+Rows of a kind `of: base` belong to no pose: their cells of poses and readings are empty.
+
 Several kinds share a file under `kinds: {label: {kind: ..}}`; the column `kind` then holds the
 label. Several files are one set of measurements, joined by the names of poses: a file without a
 kind only holds readings, a file without readings refers to the poses of others, and a pose in two
@@ -26,6 +28,7 @@ from loopcal.io.core.csv_table import Table, read_table, read_template, require_
 from loopcal.io.core.references import find_reference
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.data.columns import get_dimension, read_context
+from loopcal.io.data.base_targets import check_base_targets, find_base_rows
 from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
 from loopcal.io.data.nuisance_settings import read_stated_values
 from loopcal.io.data.pose_rows import read_pose_rows
@@ -113,11 +116,13 @@ def _join_tables(
     if not any(kinds):
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
-    poses = read_pose_rows(tables, robot)
+    check_base_targets(tables, kinds)
+    of_base = [find_base_rows(t, of_file) for t, of_file in zip(tables, kinds, strict=True)]
+    poses = read_pose_rows(tables, robot, of_base)
     context = [read_context(table) for table in tables]
-    of_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
+    beside_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
     read = [
-        [read_observations(table, robot, entry, members, beside, of_poses) for entry in of_file]
+        [read_observations(table, robot, entry, members, beside, beside_poses) for entry in of_file]
         for table, of_file, members, beside in zip(
             tables, kinds, poses.members, context, strict=True
         )
@@ -129,17 +134,22 @@ def _join_tables(
         if of_file
     ]
     with name_files(*(table.path for table in tables)):
+        every = [entry for of_file in read for entry in of_file]
+        of_poses, on_base = (
+            [entry for entry in every if entry[0].kind.is_of_base == flag] for flag in (False, True)
+        )
         data = Measurements(
             robot.name,
             poses.readings,
-            tuple(rows for of_file in read for rows, _ in of_file),
+            tuple(rows for rows, _ in of_poses),
             poses.block,
             poses.labels,
             poses.sigma,
             read_stated_values(settings, poses.labels),
             read_held_out(tables, poses),
+            tuple(rows for rows, _ in on_base),
         )
-        places = [places for of_file in read for _, places in of_file]
+        places = [places for _, places in of_poses]
         check_strokes(data, robot, allow=allow_outside_stroke, places=_place_poses(data, places))
         check_duplicates(data, allow=allow_duplicates, places=places)
     is_named = _find_named_poses(kinds, read, poses.members, len(poses.labels))
@@ -334,7 +344,8 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
     table = read_template(path)
     kinds = read_kinds(table, robot)
     groups, poses = table.text("group"), table.pose_names()
-    apart = len({frozenset(poses[row] for row in entry.rows) for entry in kinds}) > 1
+    moving = [entry for entry in kinds if not entry.kind.is_of_base]
+    apart = len({frozenset(poses[row] for row in entry.rows) for entry in moving}) > 1
     for entry in kinds:
         parameters = [
             parameter.name
@@ -363,6 +374,7 @@ def build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
     from loopcal.measure import Gaussian, Instrument, Sensor
 
+    check_base_targets((table,), (kinds,))
     sensors = []
     for entry in kinds:
         for column in entry.kind.noise_columns:

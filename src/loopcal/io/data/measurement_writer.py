@@ -107,15 +107,16 @@ def format_measurements(
 
     require_robot(robot)
     _refuse_names(data)
-    kinds = [rows.kind for rows in data.observations]
+    observations = data.all_observations
+    kinds = [rows.kind for rows in observations]
     check_redundancy(robot, kinds)
     labels, known = _label_kinds(kinds), list_columns(robot, kinds)
-    tables = [_tabulate_rows(rows, robot) for rows in data.observations]
+    tables = [_tabulate_rows(rows, robot) for rows in observations]
     reading_noise, of_poses = _tabulate_poses(data, robot)
     texts = [
         format_kind(rows.kind, noise, robot.tool, rows.is_noise_assumed)
         | ({} if rows.instrument is None else {"instrument": format_instrument(rows.instrument)})
-        for rows, (noise, _) in zip(data.observations, tables, strict=True)
+        for rows, (noise, _) in zip(observations, tables, strict=True)
     ]
     lines = _format_settings(robot, list(zip(labels, texts, strict=True)), remark)
     knowledge = format_stated_values(data.stated_values, data.nuisance_parameters.table.entries)
@@ -126,21 +127,22 @@ def format_measurements(
     names = ["pose", *([USE_COLUMN.name] if has_use else [])]
     names += [*(["block"] if len(set(data.block.tolist())) < data.n_poses else [])]
     for name in ("session", "group"):
-        is_stated = any((getattr(rows, name) != "").any() for rows in data.observations)
+        is_stated = any((getattr(rows, name) != "").any() for rows in observations)
         names += [name] if is_stated else []
     names += [*(["kind"] if len(kinds) > 1 else []), *of_poses]
-    names += [name for rows in data.observations for name in rows.context]
+    names += [name for rows in observations for name in rows.context]
     names += [name for _, table in tables for name in table]
     _refuse_columns(name for _, table in tables for name in table)
     columns: list[Column] = [known.get(n, ContextColumn(n)) for n in dict.fromkeys(names)]
     lines.append(format_row(column.header for column in columns))
 
     body: list[tuple[list[int], dict[str, Any]]] = []
-    for label, rows, (_, table) in zip(labels, data.observations, tables, strict=True):
+    for label, rows, (_, table) in zip(labels, observations, tables, strict=True):
         for i in np.flatnonzero(rows.weight):  # rows of weight 0 are not written
             cells = {name: values[i] for name, values in {**rows.context, **table}.items()}
             cells |= {"kind": label, "session": rows.session[i], "group": rows.group[i]}
-            body.append((np.atleast_1d(rows.rows[i]).tolist(), cells))
+            poses = [] if rows.kind.is_of_base else np.atleast_1d(rows.rows[i]).tolist()
+            body.append((poses, cells))
     measured = {poses[0] for poses, _ in body if len(poses) == 1}
     body = [([pose], {}) for pose in range(data.n_poses) if pose not in measured] + body
     for poses, cells in body:
@@ -228,9 +230,10 @@ def format_data_sheet(
     data = Measurements(
         robot.name,
         np.asarray(readings),
-        tuple(rows),
+        tuple(of_sensor for of_sensor in rows if not of_sensor.kind.is_of_base),
         labels=tuple(labels),
         is_held_out=np.array([] if is_held_out is None else is_held_out, dtype=bool),
+        base_observations=tuple(of_sensor for of_sensor in rows if of_sensor.kind.is_of_base),
     )
     return format_measurements(data, robot, states_use=is_held_out is not None)
 
@@ -248,7 +251,7 @@ def _refuse_names(data: Measurements) -> None:
     """Raise DataError for names of poses, sessions and groups that a file cannot hold."""
     names = [("pose", name) for name in data.labels]
     for what in ("session", "group"):
-        names += [(what, n) for rows in data.observations for n in getattr(rows, what).tolist()]
+        names += [(what, n) for rows in data.all_observations for n in getattr(rows, what).tolist()]
     for what, name in dict.fromkeys(names):
         if (fault := find_fault(name)) is not None:
             raise DataError(fault)

@@ -25,7 +25,7 @@ from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextColumn, list_columns
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SMALLEST_SD, find_sd_fault
 from loopcal.value_classes import dataclass
 
@@ -72,19 +72,23 @@ class _FilePoses:
     unread: frozenset[str]
 
 
-def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
+def read_pose_rows(
+    tables: Sequence[Table], robot: Mechanism, of_base: Sequence[BoolArray]
+) -> PoseRows:
     """Read the columns `pose` and `block`, and those of readings or commanded coordinates.
 
     Parameters
     ----------
     tables : of all files. robot : its actuators name the readings.
+    of_base : (rows,) of each file, rows that measure the base and belong to no pose.
 
     Raises
     ------
     FileError : a pose without readings or with contradicting ones, an unknown pose in a comparison.
     DataError : a commanded pose that the controller cannot reach.
     """
-    files = [_read_file(table, robot, several=len(tables) > 1) for table in tables]
+    several = len(tables) > 1
+    files = [_read_file(*each, robot, several) for each in zip(tables, of_base, strict=True)]
     read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
     for i, file in enumerate(files):
@@ -101,14 +105,20 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
                 raise file.table.row_error(row, sentence)
         _refuse_contradictions(file, files, repeated)
     if not origin:
-        raise tables[0].row_error(0, "no row has readings; add a row with readings for each pose")
+        why = "no row has readings; add a row with readings for each pose"
+        if all(rows.all() for rows in of_base):
+            why = (
+                "all rows measure targets on the base, so that there is no pose; give the file of "
+                "the poses, too"
+            )
+        raise tables[0].row_error(0, why)
     alone = {name: (i,) for i, name in enumerate(origin)}
     members = tuple(
         tuple(
-            alone.get(cell) or _find_members(file.table, row, cell, alone)
+            () if is_base[row] else alone.get(cell) or _find_members(file.table, row, cell, alone)
             for row, cell in enumerate(file.names)
         )
-        for file in files
+        for file, is_base in zip(files, of_base, strict=True)
     )
     begin = np.cumsum([0, *(len(file.names) for file in files)])
     file, row = np.array(tuple(origin.values())).T
@@ -127,15 +137,22 @@ def has_readings(table: Table, robot: Mechanism) -> bool:
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
 
 
-def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
-    """Read the poses of one file."""
+def _read_file(
+    table: Table, is_base: BoolArray, robot: Mechanism, several: bool
+) -> _FilePoses:
+    """Read the poses of one file, which the rows (rows,) of the base do not name."""
     from loopcal.measure import solve_commanded_poses
 
+    _refuse_poses_of_base(table, is_base, robot)
+    if is_base.all() and len(is_base):
+        nothing = np.full((len(table), len(robot.actuators)), np.nan)
+        names = ("",) * len(table)
+        return _FilePoses(table, names, {}, nothing, nothing, frozenset(), frozenset())
     if several and "pose" not in table.units:
         sentence = "files are joined by the names of poses, and this file names none"
         raise table.header_error(f"{sentence}; add a column 'pose'")
     names = TextColumn("pose").parse(table) if "pose" in table.units else table.pose_names()
-    first = _find_first_rows(table, names)
+    first = _find_first_rows(table, names, is_base)
     blank = np.full((len(names), len(robot.actuators)), np.nan)
     if several and not has_readings(table, robot):
         return _FilePoses(table, names, first, blank, blank, frozenset(), frozenset())
@@ -148,7 +165,9 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
         if controller is not None
         else f", or state '{READING_NOISE}', so that empty means not read"
     )
-    begin = np.array([first.get(name, -1) for name in names])
+    begin = np.array(
+        [-1 if base else first.get(name, -1) for name, base in zip(names, is_base, strict=True)]
+    )
     if not may_be_absent:
         _refuse_empty_cells(
             table, columns, rows, begin, several, hint if controller is None else ""
@@ -209,10 +228,26 @@ def _refuse_other_readings(
         raise table.row_error(int(row), f"{sentence}; correct them, or rename one of the two poses")
 
 
-def _find_first_rows(table: Table, names: tuple[str, ...]) -> dict[str, int]:
-    """Return pose -> its first row, in the order of the file."""
+def _refuse_poses_of_base(table: Table, is_base: BoolArray, robot: Mechanism) -> None:
+    """Raise FileError where a row of the base names a pose, its use or block, or has readings."""
+    actuators = [actuator.name for actuator in robot.actuators]
+    names = ("pose", "use", "block", *actuators, *(COMMANDED + name for name in robot.controlled))
+    for name in (name for name in names if name in table.units):
+        cells = table.text(name)
+        for row in np.flatnonzero(is_base).tolist():
+            if cells[row]:
+                sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
+                raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
+
+
+def _find_first_rows(
+    table: Table, names: tuple[str, ...], is_base: BoolArray
+) -> dict[str, int]:
+    """Return pose -> its first row, in the order of the file; rows of the base name none."""
     first: dict[str, int] = {}
     for row, name in enumerate(names):
+        if is_base[row]:
+            continue
         if not name:
             raise table.row_error(row, "column 'pose' is empty; write a name or a number")
         if LINK not in name:

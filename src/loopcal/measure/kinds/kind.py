@@ -77,8 +77,10 @@ class Kind(ABC):
         Setup items that `unknown` may list.
     unknown : tuple of str
         Setup items that are unknown.
+    measures_points : bool
+        Whether it measures targets, which may be fixed to the base (`of: base`).
     of : str
-        The stage of a chain whose platform is measured; empty for the end platform.
+        The stage of a chain whose platform is measured, or "base"; empty for the end platform.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every kind is a dataclass
@@ -87,6 +89,7 @@ class Kind(ABC):
     changes_with_pose: ClassVar[bool] = True
     mixes_components: ClassVar[bool] = False
     wraps_angles: ClassVar[bool] = True
+    measures_points: ClassVar[bool] = False
     description: ClassVar[str] = ""
     length_error: ClassVar[str] = "length"
     angle_error: ClassVar[str] = "angle"
@@ -101,7 +104,9 @@ class Kind(ABC):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
-        stage_platforms.check_stage(self.name, self.of, self.poses_per_row)
+        stage_platforms.check_stage(
+            self.name, self.of, self.poses_per_row, self.measures_points
+        )
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
@@ -128,6 +133,11 @@ class Kind(ABC):
     def target_columns(self) -> Mapping[str, tuple[int, ...]]:
         """The measured objects by name, with the indices of their columns."""
         return {self.name: tuple(range(len(self.columns)))}
+
+    @property
+    def is_of_base(self) -> bool:
+        """Whether its targets are fixed to the base, so that its rows depend on no pose."""
+        return self.of == stage_platforms.BASE
 
     @property
     def sensed_joints(self) -> tuple[str, ...]:

@@ -73,10 +73,12 @@ def make_direction_item(name: str, direction: FloatArray) -> SetupItem:
     return SetupItem(make_parameters(name, DIRECTION_AXES, Dimension.ANGLE), {name: direction})
 
 
-def make_points_item(names: Sequence[str], points: FloatArray) -> SetupItem:
+def make_points_item(
+    names: Sequence[str], points: FloatArray, scope: str = "session"
+) -> SetupItem:
     """Return points that are stated as (k, 3): three coordinates of each."""
     of_each = (
-        make_parameters(name, POSITION_AXES, Dimension.LENGTH, point)
+        make_parameters(name, POSITION_AXES, Dimension.LENGTH, point, scope)
         for name, point in zip(names, points, strict=True)
     )
     return SetupItem(tuple(parameter for parameters in of_each for parameter in parameters))

@@ -105,7 +105,7 @@ class Bearing(TargetKind):
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the station by resection, with the targets at their stated places."""
         _, _, points, angles = self.collect_points(T, measured)
-        if "frame" not in self.unknown or len(angles) < 4:
+        if "frame" not in self.unknown or len(angles) < 4 or self.is_of_base:
             return self.nominal_values[None]
         frames = solve_resection(self.convert_to_rays(angles), points)
         return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frames)})

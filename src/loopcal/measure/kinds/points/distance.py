@@ -93,7 +93,7 @@ class Distance(LengthKind):
             If all points are coplanar and the stated anchor does not say on which side it is.
         """
         _, _, points, distances = self.collect_points(T, measured)
-        if "anchor" not in self.unknown or len(distances) < 4:
+        if "anchor" not in self.unknown or len(distances) < 4 or self.is_of_base:
             return self.nominal_values[None]
         inside = self.to_frame(points)
         with_offset = "offset" in self.unknown

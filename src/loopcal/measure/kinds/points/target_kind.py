@@ -50,12 +50,15 @@ class TargetKind(Kind):
     frame : str
         Name of the frame. Kinds that use the same name share its parameters.
     of : str
-        Stage of a chain on whose platform the targets are; default: the end platform.
+        Stage of a chain on whose platform the targets are; default: the end platform. "base": the
+        targets are fixed to the base. Their rows belong to no pose, and unknown ones keep their
+        places in all sessions.
 
     Raises
     ------
     DataError
-        If shapes do not fit, a name occurs twice, or `unknown` lists something that is not allowed.
+        If shapes do not fit, a name occurs twice, `unknown` lists something that is not allowed, or
+        places of targets on the base are neither stated nor unknown.
     """
 
     targets: tuple[str, ...] = ("target",)
@@ -65,6 +68,7 @@ class TargetKind(Kind):
     frame: str = "frame"
     of: str = ""
 
+    measures_points: ClassVar[bool] = True
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
     per_target: ClassVar[tuple[Column, ...]]
 
@@ -79,6 +83,11 @@ class TargetKind(Kind):
             places = [self.places] if one else self.places
             shape = (len(targets), 3)
             set_fields(self, places=check_array(places, "the places of the targets", shape))
+        elif self.is_of_base and "targets" not in self.unknown:
+            raise DataError(
+                f"the places of {', '.join(targets)} on the base are neither stated nor unknown; "
+                "state `places` in the base frame, or list targets in `unknown`"
+            )
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with its targets at the origin of the tool, or of the stage's platform,
@@ -117,7 +126,9 @@ class TargetKind(Kind):
         places = np.zeros((len(self.targets), 3)) if self.places is None else self.places
         return {
             "frame": setup.make_frame_item(self.frame, self.T_base_frame),
-            "targets": setup.make_points_item(self.targets, places),
+            "targets": setup.make_points_item(
+                self.targets, places, "machine" if self.is_of_base else "session"
+            ),
         }
 
     @abstractmethod
