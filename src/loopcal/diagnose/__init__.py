@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from loopcal.diagnose.fit_checks.start_values import (
         compare_stored_geometry as compare_stored_geometry,
     )
+    from loopcal.diagnose.frame_drift import estimate_frame_drifts as estimate_frame_drifts
+    from loopcal.diagnose.frame_drift import report_base_targets as report_base_targets
     from loopcal.diagnose.frame_motions import NO_MOTION as NO_MOTION
     from loopcal.diagnose.frame_motions import FrameMotions as FrameMotions
     from loopcal.diagnose.frame_motions import find_frame_motions as find_frame_motions
@@ -117,6 +119,7 @@ else:
             "loopcal.diagnose.fit_checks.start_values": """
                 StartCheck StartVerdict check_start_values compare_stored_geometry
             """,
+            "loopcal.diagnose.frame_drift": "estimate_frame_drifts report_base_targets",
             "loopcal.diagnose.frame_motions": """
                 NO_MOTION FrameMotions find_frame_motions interpret_fit twist_weights
             """,

@@ -24,6 +24,8 @@ IMPORTANCE = (
     "gates.poses-unreachable",
     "gates.errors-grew",
     "noise.residuals-too-large",
+    "residuals.frame-moved",
+    "residuals.base-targets-moved",
     "gates.limit-exceeded",
     "gates.limit-not-measured",
     "conformity.fails",

@@ -66,7 +66,8 @@ class GroupRows:
     rows : (N, r, o + p) whitened, machine columns in tolerances; NaN where a pose is not reached.
     members : (N, k) indices of the poses of each group.
     nuisance : names of the o nuisance parameters of the instrument.
-    nuisance_prior : (o, o + p) rows of their stated tolerances.
+    nuisance_prior : (b, o + p) rows of their stated tolerances and of targets on the base, which do
+        not depend on the choice of poses.
     """
 
     rows: FloatArray
@@ -130,6 +131,7 @@ def linearize_groups(
     rows = np.concatenate(blocks)
     prior = np.zeros((len(nuisance), rows.shape[2]))
     prior[:, : len(nuisance)] = np.diag(weight)
+    prior = np.concatenate([prior, _linearize_base(mounted, nuisance, rows.shape[2])])
     return GroupRows(rows, members, nuisance.table.names, prior)
 
 
@@ -198,16 +200,47 @@ def find_group_motions(
 def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters:
     """Return the nuisance parameters of the instrument."""
     count = int(members.max()) + 1
-    sensors = tuple(
+    of_poses = (
         replace(sensor, rows=rows).assign_rows(count)
         for sensor, rows in _assign_poses(mounted, members)
     )
+    sensors = (*of_poses, *_list_base_sensors(mounted))
     return collect_nuisance_parameters(sensors, tuple(str(i) for i in range(count)))
 
 
 def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple[Sensor, IntArray]]:
-    """Return each sensor with the poses of its rows, group by group."""
-    return [(s, members.ravel() if s.kind.poses_per_row == 1 else members) for s in mounted.sensors]
+    """Return each sensor of poses with the poses of its rows, group by group."""
+    return [
+        (s, members.ravel() if s.kind.poses_per_row == 1 else members)
+        for s in mounted.sensors
+        if not s.kind.is_of_base
+    ]
+
+
+def _list_base_sensors(mounted: Instrument) -> tuple[Sensor, ...]:
+    """Return the sensors that measure targets on the base, with their rows."""
+    return tuple(s.assign_rows(1) for s in mounted.sensors if s.kind.is_of_base)
+
+
+def _linearize_base(
+    mounted: Instrument, nuisance: NuisanceParameters, width: int
+) -> FloatArray:
+    """Return the whitened rows (b, width) of targets on the base: nuisance columns come first."""
+    rows, sensors = [np.zeros((0, width))], _list_base_sensors(mounted)
+    for sensor, number in zip(sensors, range(-len(sensors), 0), strict=True):
+        kind, r = sensor.kind, len(sensor.assigned_rows)
+        T = np.broadcast_to(np.eye(4), (1, r, 4, 4))
+        values = nuisance.table.nominal[None][:, nuisance.indices[number]]
+        measured = kind.measure(T, np.zeros((1, r, len(kind.noise_columns))), values)
+        slopes = kind.evaluate(T, measured, values).nuisance
+        if slopes is None:
+            continue
+        white = slopes[0] / sensor.noise.sigma[:, None]
+        wide = np.zeros((*white.shape[:2], width))
+        columns = np.broadcast_to(nuisance.indices[number][:, None, :], white.shape)
+        np.put_along_axis(wide, columns, white, axis=-1)
+        rows.append(wide.reshape(-1, width))
+    return np.concatenate(rows)
 
 
 def _linearize_block(

@@ -19,7 +19,7 @@ from loopcal.findings import report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, check_closure
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
-from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.decomposition import Decomposition, are_nonzero
 from loopcal.planning.candidates import Candidates, check_listed_poses, draw_candidates
 from loopcal.planning.constraints import Constraints
 from loopcal.planning.design import (
@@ -119,7 +119,10 @@ class PlanningProblem:
     @cached_property
     def n_unknowns(self) -> int:
         """Number of equations needed: parameters, or observable ones with nuisance parameters."""
-        stated = int(np.any(self.groups.nuisance_prior != 0.0, axis=1).sum())
+        known = self.groups.nuisance_prior
+        length = np.linalg.norm(known, axis=0)
+        s = np.linalg.svd(known / np.where(length > 0.0, length, 1.0), compute_uv=False)
+        stated = int(are_nonzero(s).sum()) if s.size else 0
         nuisance = self.space.nuisance.shape[1] - stated
         return max(len(self.free), int(self.observable.rank[0]) + max(nuisance, 0))
 
@@ -285,7 +288,14 @@ def name_groups(poses_per_group: int) -> str:
 
 
 def _require_plain_sensors(instrument: Instrument) -> None:
-    """Refuse sensors that measure some poses only, or in sessions or groups."""
+    """Refuse sensors that measure some poses only, or in sessions or groups, and an instrument that
+    measures nothing but the base.
+    """
+    if all(sensor.kind.is_of_base for sensor in instrument.sensors):
+        raise DataError(
+            "the instrument only measures targets on the base, which no choice of poses changes; "
+            "add what it measures of the platform"
+        )
     if any(sensor.rows is not None for sensor in instrument.sensors):
         raise DataError(
             "an instrument for planning measures every pose; leave out the rows of its sensors"

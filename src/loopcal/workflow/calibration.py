@@ -14,6 +14,7 @@ from loopcal.diagnose import (
     compute_reading_errors,
     examine_fit,
     interpret_fit,
+    report_base_targets,
 )
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
 from loopcal.errors import DataError
@@ -230,6 +231,7 @@ def _report(
         *check_split_instruments(split),
         *report_freedoms(fit, fitted),
         *report_scale(fit, fitted),
+        *report_base_targets(fitted),
         start.finding,
         *examined,
         *(() if result.choice is None else (result.choice.finding,)),

@@ -42,6 +42,9 @@ NEXT_WITH_VALUES = {
 }
 """Next step of a good calibration whose values are not recommended."""
 
+BASE_MOVED = ("residuals.frame-moved", "residuals.base-targets-moved")
+"""Findings that an instrument or a target on the base moved."""
+
 DEPENDENT = (
     "residuals.drift",
     "residuals.trend",
@@ -115,6 +118,8 @@ def choose_next_step(
         return report_finding("workflow.next-check-height-sign")
     if verdict is Verdict.CALIBRATED:
         return report_finding(NEXT_WITH_VALUES.get(recommendation, "workflow.next-use-result"))
+    if any(finding.code in BASE_MOVED for finding in findings):
+        return report_finding("workflow.next-check-base-targets")
     wrong = [f.data["poses"] for f in findings if f.code == BLUNDERS[0]]
     if wrong and verdict is not Verdict.RESERVATIONS:
         labels = tuple(dict.fromkeys(label for poses in wrong for label in poses))

@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the frame of an instrument moved within a session, by repeated targets on the base.
+
+In the frame of the instrument, k targets on the base are at `x = p + c + w x (p - m) + t`: mean
+places p with corrections c, the center m of the targets, and a small motion (w, t) of each
+measurement. That of the first one is 0. If the frame keeps its place in a session, all are. By how
+much the whitened sum of squares grows with this condition is a chi-square of six degrees of freedom
+for each further measurement.
+
+Whether the targets kept their distances is what remains if each measurement of any session may move
+freely; each is first brought to the others by its best rigid motion, which may be large. No robot,
+no pose and no stated place of a target enters. The noise is the stated one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.geometry.alignment import FLATNESS, align_point_sets
+from loopcal.measure import Measurements, Observations, Position
+from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import find_unit
+
+LEVEL = 0.01
+"""Probability of reporting anything although no frame and no target moved, of each of both tests.
+"""
+
+TINY = 1e-99
+"""Probabilities below this are not written."""
+
+RANK = 1e-9
+"""Singular values of whitened rows with scaled columns, relative to the largest, that are zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameDrift:
+    """The largest motion of the frame of an instrument from the first measurement of a session.
+
+    Attributes
+    ----------
+    frame, session : their names. targets : on the base.
+    row : number of the measurement in its session at which the motion is most significant, from 1.
+    rows : number of measurements of the session.
+    shift, shift_sd : displacement at the center of the targets [m]. angle, angle_sd : [rad].
+    chi_square, degrees : of the test that the frame kept its place in the whole session.
+    p_value : probability of a larger chi-square without motion.
+    """
+
+    frame: str
+    session: str
+    targets: tuple[str, ...]
+    row: int
+    rows: int
+    shift: float
+    shift_sd: float
+    angle: float
+    angle_sd: float
+    chi_square: float
+    degrees: int
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeTest:
+    """The test whether targets on the base kept their distances in all measurements.
+
+    Attributes
+    ----------
+    frame : in which they were measured. targets : on the base.
+    suspects : targets without each of which the noise explains the others. With three targets there
+        is often more than one.
+    chi_square, degrees : of what no motion of frames explains.
+    p_value : probability of a larger chi-square if no target moved.
+    """
+
+    frame: str
+    targets: tuple[str, ...]
+    suspects: tuple[str, ...]
+    chi_square: float
+    degrees: int
+    p_value: float
+
+
+class _Repeats(NamedTuple):
+    """E measurements of the same k targets: points (E, k, 3) [m], NaN where missing, whiteners
+    (E, 3 k, 3 k) of their rows, and sessions (E,).
+    """
+
+    kind: Position
+    points: FloatArray
+    whitener: FloatArray
+    session: list[str]
+
+
+class _Solution(NamedTuple):
+    """Unknowns (c,) of whitened rows, a root (c, r) of their covariance, and the sum of squares."""
+
+    values: FloatArray
+    root: FloatArray
+    cost: float
+
+
+def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Finding, ...]:
+    """Return findings on frames that moved within a session, and on targets that moved.
+
+    Parameters
+    ----------
+    angle : symbol of the unit in which angles are reported.
+    """
+    shapes = compare_shapes(data)
+    changed = [shape for shape in shapes if shape.p_value * len(shapes) < LEVEL]
+    drifts = estimate_frame_drifts(_leave_out(data, changed))
+    shown = find_unit(angle)
+    findings = [
+        report_finding(
+            "residuals.base-targets-moved",
+            targets=shape.targets,
+            suspects=shape.suspects,
+            chi_square=shape.chi_square,
+            degrees=shape.degrees,
+        )
+        for shape in changed
+    ]
+    findings += [
+        report_finding(
+            "residuals.frame-moved",
+            frame=drift.frame,
+            session=drift.session,
+            row=drift.row,
+            rows=drift.rows,
+            shift=Quantity(1e3 * drift.shift, "mm"),
+            shift_sd=Quantity(1e3 * drift.shift_sd, "mm"),
+            angle=Quantity(drift.angle / shown.factor_to_si, shown.symbol),
+            angle_sd=Quantity(drift.angle_sd / shown.factor_to_si, shown.symbol),
+            p_value=drift.p_value,
+            tiny=drift.p_value < TINY,
+        )
+        for drift in drifts
+        if drift.p_value * len(drifts) < LEVEL
+    ]
+    return tuple(findings)
+
+
+def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements:
+    """Return the measurements without targets that moved; without all where it is open which."""
+    kept = []
+    for rows in data.base_observations:
+        kind, measured = rows.kind, np.array(rows.measured)
+        for shape in changed:
+            if isinstance(kind, Position) and (kind.frame, kind.targets) == (shape.frame, shape.targets):
+                known = len(shape.suspects) == 1
+                for name in shape.suspects if known else kind.targets:
+                    measured[:, list(kind.target_columns[name])] = np.nan
+        kept.append(replace(rows, measured=measured))
+    return replace(data, base_observations=tuple(kept))
+
+
+def estimate_frame_drifts(data: Measurements) -> tuple[FrameDrift, ...]:
+    """Return the motion of each frame in each session with at least two measurements of at least
+    three targets on the base that are not collinear.
+    """
+    drifts = []
+    for repeats in _list_repeats(data):
+        for session in dict.fromkeys(repeats.session):
+            chosen = [i for i, name in enumerate(repeats.session) if name == session]
+            if len(chosen) > 1:
+                own = repeats._replace(
+                    points=repeats.points[chosen],
+                    whitener=repeats.whitener[chosen],
+                    session=[session] * len(chosen),
+                )
+                drifts.append(_estimate_drift(own))
+    return tuple(drifts)
+
+
+def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
+    """Return the tests of all targets on the base that were measured together at least twice."""
+    tests = []
+    for repeats in _list_repeats(data):
+        kind, aligned = repeats.kind, _align_each(repeats)
+        rows, values, _ = _build_rows(aligned)
+        is_seen = np.isfinite(repeats.points).all(axis=2)
+        full, degrees = _solve_without(rows, values, is_seen)
+        if degrees <= 0:
+            continue
+        suspects = []
+        for i, name in enumerate(kind.targets):
+            cost, left = _solve_without(rows, values, is_seen, i)
+            if degrees > left > 0 and compute_chi_square_tail(left, cost) > LEVEL:
+                suspects.append(name)
+        tail = float(compute_chi_square_tail(degrees, full))
+        tests.append(ShapeTest(kind.frame, kind.targets, tuple(suspects), full, degrees, tail))
+    return tuple(tests)
+
+
+def _list_repeats(data: Measurements) -> Iterator[_Repeats]:
+    """Give the measurements of the same targets in frames of one name, in their order."""
+    groups: dict[tuple[str, tuple[str, ...]], list[Observations]] = {}
+    for rows in data.base_observations:
+        if isinstance(rows.kind, Position):
+            groups.setdefault((rows.kind.frame, rows.kind.targets), []).append(rows)
+    for alike in groups.values():
+        kind = alike[0].kind
+        assert isinstance(kind, Position)
+        order = [_order_rows(rows) for rows in alike]
+        pairs = list(zip(alike, order, strict=True))
+        measured = np.concatenate([rows.measured[i] for rows, i in pairs])
+        points = measured.reshape(len(measured), -1, 3)
+        used = [i for i, each in enumerate(points) if _spans_plane(each)]
+        if len(used) > 1:
+            whitener = np.concatenate([rows.whitener[i] for rows, i in pairs])
+            session = np.concatenate([rows.session[i] for rows, i in pairs])
+            yield _Repeats(kind, points[used], whitener[used], session[used].tolist())
+
+
+def _order_rows(rows: Observations) -> IntArray:
+    """Return the rows that count in the order of their time if all state it, else as they are."""
+    counted = np.flatnonzero(rows.weight > 0.0)
+    time = rows.context.get("time")
+    if time is None or not np.isfinite(time[counted]).all():
+        return counted
+    return counted[np.argsort(time[counted], kind="stable")]
+
+
+def _spans_plane(points: FloatArray) -> bool:
+    """Return whether at least three of points (k, 3) are measured and not collinear."""
+    seen = points[np.isfinite(points).all(axis=1)]
+    if len(seen) < 3:
+        return False
+    extent = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+    return bool(extent[1] > FLATNESS * extent[0])
+
+
+def _align_each(repeats: _Repeats) -> _Repeats:
+    """Return the measurements, each moved to the first one with which it shares enough targets."""
+    points, whitener = repeats.points.copy(), repeats.whitener.copy()
+    for i in range(1, len(points)):
+        for first in points[:i]:
+            both = np.isfinite(first + points[i]).all(axis=1)
+            if _spans_plane(np.where(both[:, None], first, np.nan)):
+                T = align_point_sets(points[i, both], first[both])
+                points[i] = points[i] @ T[:3, :3].T + T[:3, 3]
+                back = np.kron(np.eye(len(first)), T[:3, :3].T)  # to the axes of its noise
+                whitener[i] = whitener[i] @ back
+                break
+    return repeats._replace(points=points, whitener=whitener)
+
+
+def _build_rows(repeats: _Repeats) -> tuple[FloatArray, FloatArray, float]:
+    """Return whitened rows (E, 3 k, 3 k + 6) by the places and by the motion of the measurement (w
+    times the radius of the targets, t), whitened values (E, 3 k), and the radius [m].
+    """
+    points, (E, k) = repeats.points, repeats.points.shape[:2]
+    is_seen = np.isfinite(points)
+    count = np.maximum(is_seen.sum(axis=0), 1)
+    place = np.where(is_seen, points, 0.0).sum(axis=0) / count
+    arm = place - place.mean(axis=0)
+    radius = float(np.sqrt((arm**2).sum(axis=1).mean()))
+    identity = np.broadcast_to(np.eye(3), (k, 3, 3))
+    by_motion = np.concatenate([-geometry.hat(arm) / radius, identity], axis=-1)
+    columns = np.concatenate([np.eye(3 * k), by_motion.reshape(3 * k, 6)], axis=1)
+    values = np.where(is_seen, points - place, 0.0).reshape(E, 3 * k, 1)
+    return repeats.whitener @ columns, (repeats.whitener @ values)[..., 0], radius
+
+
+def _spread_motions(rows: FloatArray) -> FloatArray:
+    """Return rows (E 3 k, 3 k + 6 (E - 1)) in which every measurement but the first has a motion of
+    its own.
+    """
+    E, m = rows.shape[:2]
+    spread = np.zeros((E, m, m + 6 * (E - 1)))
+    spread[:, :, :m] = rows[:, :, :m]
+    for i in range(1, E):
+        spread[i, :, m + 6 * (i - 1) : m + 6 * i] = rows[i, :, m:]
+    return spread.reshape(E * m, -1)
+
+
+def _solve(A: FloatArray, b: FloatArray) -> _Solution:
+    """Return the least-squares solution of whitened rows A x = b, of smallest length."""
+    length = np.linalg.norm(A, axis=0)
+    scale = np.where(length > 0.0, length, 1.0)
+    u, s, vt = np.linalg.svd(A / scale, full_matrices=False)
+    used = s > RANK * s[0]
+    root = (vt[used].T / s[used]) / scale[:, None]
+    part = u[:, used].T @ b
+    rest = b - u[:, used] @ part
+    return _Solution(root @ part, root, float(rest @ rest))
+
+
+def _estimate_drift(repeats: _Repeats) -> FrameDrift:
+    """Return the motion of one frame in one session."""
+    rows, values, radius = _build_rows(repeats)
+    E, m = values.shape
+    free, b = _solve(_spread_motions(rows), values.ravel()), values.ravel()
+    still = _solve(rows[:, :, :m].reshape(E * m, m), b)
+    chi_square, degrees = still.cost - free.cost, free.root.shape[1] - still.root.shape[1]
+    best, largest = 1, -1.0
+    for i in range(1, E):
+        chosen = slice(m + 6 * (i - 1), m + 6 * i)
+        size = _compute_significance(free.values[chosen], free.root[chosen])
+        best, largest = (i, size) if size > largest else (best, largest)
+    chosen = slice(m + 6 * (best - 1), m + 6 * best)
+    motion, root = free.values[chosen], free.root[chosen]
+    angle, angle_sd = _measure_length(motion[:3] / radius, root[:3] / radius)
+    shift, shift_sd = _measure_length(motion[3:], root[3:])
+    tail = float(compute_chi_square_tail(degrees, chi_square))
+    kind = repeats.kind
+    where = (kind.frame, repeats.session[0], kind.targets, best + 1, E)
+    return FrameDrift(*where, shift, shift_sd, angle, angle_sd, chi_square, degrees, tail)
+
+
+def _compute_significance(motion: FloatArray, root: FloatArray) -> float:
+    """Return the squared length of a motion (6,) in units of its uncertainty, of root (6, r)."""
+    u, s, _ = np.linalg.svd(root, full_matrices=False)
+    return float((((u.T @ motion) / s) ** 2).sum())
+
+
+def _measure_length(vector: FloatArray, root: FloatArray) -> tuple[float, float]:
+    """Return the length of a vector (3,) and its standard deviation along the vector."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length if length > 0.0 else np.eye(3)[0]
+    return length, float(np.linalg.norm(along @ root))
+
+
+def _solve_without(
+    rows: FloatArray, values: FloatArray, is_seen: BoolArray, target: int = -1
+) -> tuple[float, int]:
+    """Return the sum of squares of whitened rows (E, 3 k, ..) without one of the targets, each
+    measurement moving freely, and its degrees of freedom. `is_seen` (E, k) targets.
+    """
+    is_kept = np.arange(is_seen.shape[1]) != target
+    kept = np.repeat(is_kept, 3)
+    columns = np.concatenate([kept, np.ones(6, dtype=bool)])
+    left = rows[:, kept][:, :, columns]
+    solved = _solve(_spread_motions(left), values[:, kept].ravel())
+    return solved.cost, 3 * int(is_seen[:, is_kept].sum()) - solved.root.shape[1]
