@@ -61,8 +61,8 @@ def list_moving_targets(kind: Kind, others: Iterable[Kind]) -> tuple[str, ...]:
     moving = {
         target
         for other in others
-        if other.measures_points and not other.is_of_base
-        for target in other.target_columns
+        if not other.is_of_base
+        for target in getattr(other, "targets", ())
     }
     return tuple(target for target in kind.target_columns if target in moving)
 

@@ -88,6 +88,8 @@ class TargetKind(Kind):
                 f"the places of {', '.join(targets)} on the base are neither stated nor unknown; "
                 "state `places` in the base frame, or list targets in `unknown`"
             )
+        elif self.is_of_base:
+            set_fields(self, places=np.zeros((len(targets), 3)))
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with its targets at the origin of the tool, or of the stage's platform,

@@ -51,6 +51,7 @@ class SurfaceKind(TargetKind):
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "surface", "targets")
     changes_with_pose: ClassVar[bool] = False
+    measures_points: ClassVar[bool] = False
     length_error: ClassVar[str] = "gap"
 
     def __post_init__(self) -> None:
