@@ -145,7 +145,24 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
         for drift in drifts
         if drift.p_value * len(drifts) < LEVEL
     ]
+    if unused := _list_unused_sessions(data):
+        names = tuple(f"session {name!r}" if name else "rows without a session" for name in unused)
+        findings.append(report_finding("data.base-session-unused", sessions=names))
     return tuple(findings)
+
+
+def _list_unused_sessions(data: Measurements) -> tuple[str, ...]:
+    """Return the sessions with targets on the base in an unknown frame, but without a pose."""
+    used = {name for rows in data.observations for name in rows.session.tolist()}
+    return tuple(
+        dict.fromkeys(
+            name
+            for rows in data.base_observations
+            if "frame" in rows.kind.unknown
+            for name in rows.session.tolist()
+            if name not in used
+        )
+    )
 
 
 def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements:
@@ -154,7 +171,10 @@ def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements
     for rows in data.base_observations:
         kind, measured = rows.kind, np.array(rows.measured)
         for shape in changed:
-            if isinstance(kind, Position) and (kind.frame, kind.targets) == (shape.frame, shape.targets):
+            if isinstance(kind, Position) and (kind.frame, kind.targets) == (
+                shape.frame,
+                shape.targets,
+            ):
                 known = len(shape.suspects) == 1
                 for name in shape.suspects if known else kind.targets:
                     measured[:, list(kind.target_columns[name])] = np.nan

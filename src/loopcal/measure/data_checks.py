@@ -155,17 +155,18 @@ def check_duplicates(
     allow : bool
         True accepts them.
     places : sequence of sequence of str
-        Place of each row of each of the observations, such as `data.csv:12`, for the message.
+        Place of each row of each of the observations, those of the base last, such as
+        `data.csv:12`, for the message.
 
     Raises
     ------
     DataError
-        `data.duplicate-rows`, with the two poses and their places.
+        `data.duplicate-rows`, with the two poses and their places, or `data.duplicate-base-rows`.
     """
     if allow:
         return
-    places_of = dict(zip(map(id, measurements.observations), places, strict=False))
-    for alike in _group_equal_kinds(measurements.observations):
+    places_of = dict(zip(map(id, measurements.all_observations), places, strict=False))
+    for alike in _group_equal_kinds(measurements.all_observations):
         poses = np.concatenate(
             [rows.rows.reshape(len(rows), rows.kind.poses_per_row) for rows in alike]
         )
@@ -183,14 +184,12 @@ def check_duplicates(
         pair = _find_equal_rows(np.nan_to_num(content, nan=1e300), texts)
         if pair is not None:
             lines = [place for rows in alike for place in places_of.get(id(rows), ())]
-            raise DataError(
-                report_finding(
-                    "data.duplicate-rows",
-                    poses=tuple(measurements.labels[poses[i, 0]] for i in pair),
-                    kind=alike[0].kind.name,
-                    places=tuple(lines[i] for i in pair) if lines else (),
-                )
-            )
+            where = tuple(lines[i] for i in pair) if lines else ()
+            described: dict[str, Any] = {"kind": alike[0].kind.name, "places": where}
+            if alike[0].kind.is_of_base:
+                raise DataError(report_finding("data.duplicate-base-rows", **described))
+            labels = tuple(measurements.labels[poses[i, 0]] for i in pair)
+            raise DataError(report_finding("data.duplicate-rows", poses=labels, **described))
 
 
 def _find_equal_rows(content: FloatArray, texts: Sequence[TextArray]) -> tuple[int, int] | None:

@@ -52,10 +52,7 @@ def guess_nuisance_values(
     if not collected.table.free.any():
         return collected.values()
     values = guess_nuisance_values_batch(
-        measurements,
-        [o.measured[None] for o in measurements.all_observations],
-        T[None],
-        collected,
+        measurements, [o.measured[None] for o in measurements.all_observations], T[None], collected
     )[0]
     return _refine_together(measurements, T, collected, values, joints)
 
@@ -135,8 +132,7 @@ def _list_groups(
             if len(counted):
                 groups.append((i, counted, indices))
     return sorted(
-        groups,
-        key=lambda group: (kinds[group[0]][0], kinds.index(kinds[group[0]]), -len(group[1])),
+        groups, key=lambda group: (kinds[group[0]][0], kinds.index(kinds[group[0]]), -len(group[1]))
     )
 
 

@@ -128,8 +128,7 @@ class Measurements(TableResult):
 
     @property
     def n_rows(self) -> int:
-        """Number of scalar residuals of poses that count (present, weight above 0), over all kinds.
-        """
+        """Number of scalar residuals of poses that count: present, with a weight above 0."""
         return sum(rows.n_residuals for rows in self.observations)
 
     @property

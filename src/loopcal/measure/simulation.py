@@ -312,9 +312,7 @@ def replace_measured_values(
     how = {"controller": robot.nominal, "reading_sigma": data.reading_sigma}
     measured = simulate(robot, nominal.T, Instrument(sensors), seed, **how)
     filled = replace(
-        data,
-        observations=measured.observations,
-        base_observations=measured.base_observations,
+        data, observations=measured.observations, base_observations=measured.base_observations
     )
     if robot.program.sigma is None:
         return filled

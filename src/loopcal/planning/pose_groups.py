@@ -222,9 +222,7 @@ def _list_base_sensors(mounted: Instrument) -> tuple[Sensor, ...]:
     return tuple(s.assign_rows(1) for s in mounted.sensors if s.kind.is_of_base)
 
 
-def _linearize_base(
-    mounted: Instrument, nuisance: NuisanceParameters, width: int
-) -> FloatArray:
+def _linearize_base(mounted: Instrument, nuisance: NuisanceParameters, width: int) -> FloatArray:
     """Return the whitened rows (b, width) of targets on the base: nuisance columns come first."""
     rows, sensors = [np.zeros((0, width))], _list_base_sensors(mounted)
     for sensor, number in zip(sensors, range(-len(sensors), 0), strict=True):

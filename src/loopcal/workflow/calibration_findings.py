@@ -92,7 +92,7 @@ def report_repeats(split: DataSplit) -> list[Finding]:
 def check_split_instruments(split: DataSplit) -> list[Finding]:
     """Return the instruments that were not validly calibrated when they measured."""
     held_out = () if split.held_out is None else split.held_out.observations
-    return check_instruments((*split.fitted.observations, *held_out))
+    return check_instruments((*split.fitted.all_observations, *held_out))
 
 
 def report_scale(fit: Identification, data: Measurements) -> list[Finding]:

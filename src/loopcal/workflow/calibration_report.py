@@ -151,7 +151,7 @@ class CalibrationReport(TableResult):
     def instruments(self) -> tuple[InstrumentRecord, ...]:
         """The stated instruments of all measurements, each once."""
         held_out = () if self.split.held_out is None else self.split.held_out.observations
-        return list_instruments((*self.split.fitted.observations, *held_out))
+        return list_instruments((*self.split.fitted.all_observations, *held_out))
 
     @property
     def top_findings(self) -> tuple[Finding, ...]:

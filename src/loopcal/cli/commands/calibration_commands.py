@@ -260,7 +260,7 @@ def validate(
     if not allow_fitted_data:
         reused = report_reused_rows(calibrated.fitted_rows, measurements)
         noted += [] if reused is None else [reused]
-    noted += check_instruments(measurements.observations)
+    noted += check_instruments(measurements.all_observations)
     for finding in noted:
         terminal.print_note(str(finding))
     validation = validate_robot(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.errors import DataError
+from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.text_file import name_files
@@ -209,8 +209,16 @@ def _read_robot_kind(
 ) -> Kind:
     """Return a kind of the settings, mounted on the robot's tool; refuse what it cannot measure."""
     from loopcal.measure import check_redundancy
+    from loopcal.measure.kinds.stage_platforms import BASE
 
     kind = read_kind(file, node, place).with_tool(robot.tool)
+    stages = [stage.name for stage in robot.stages]
+    if kind.of and not kind.is_of_base and kind.of not in stages:
+        known = f"a stage ({', '.join(stages)}), or base" if stages else "base"
+        sentence = (
+            f"{robot.name!r} has no stage {kind.of!r}{suggest_names(kind.of, [*stages, BASE])}"
+        )
+        raise file.error(f"{sentence}; `of` is {known}", (*place, "of"))
     try:
         check_redundancy(robot, (kind,))
     except DataError as error:

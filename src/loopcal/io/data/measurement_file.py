@@ -27,8 +27,8 @@ from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, read_table, read_template, require_columns
 from loopcal.io.core.references import find_reference
 from loopcal.io.core.text_file import as_path, name_files
-from loopcal.io.data.columns import get_dimension, read_context
 from loopcal.io.data.base_targets import check_base_targets, find_base_rows
+from loopcal.io.data.columns import get_dimension, read_context
 from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
 from loopcal.io.data.nuisance_settings import read_stated_values
 from loopcal.io.data.pose_rows import read_pose_rows
@@ -151,6 +151,7 @@ def _join_tables(
         )
         places = [places for _, places in of_poses]
         check_strokes(data, robot, allow=allow_outside_stroke, places=_place_poses(data, places))
+        places += [places_of_base for _, places_of_base in on_base]
         check_duplicates(data, allow=allow_duplicates, places=places)
     is_named = _find_named_poses(kinds, read, poses.members, len(poses.labels))
     return data if is_named.all() else data.take(is_named)
@@ -206,7 +207,7 @@ def list_unfilled_files(path: Paths, data: Measurements) -> tuple[Path, ...]:
     ----------
     path : the files. data : that were read from them.
     """
-    sources = {rows.source for rows in data.observations}
+    sources = {rows.source for rows in data.all_observations}
     tables = (table for table in _read_tables(path) if has_measured_values(table))
     return tuple(table.path for table in tables if str(table.path) not in sources)
 

@@ -22,6 +22,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.references import find_reference
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
+from loopcal.io.data.base_targets import refuse_poses_of_base
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextColumn, list_columns
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism
@@ -137,13 +138,11 @@ def has_readings(table: Table, robot: Mechanism) -> bool:
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
 
 
-def _read_file(
-    table: Table, is_base: BoolArray, robot: Mechanism, several: bool
-) -> _FilePoses:
+def _read_file(table: Table, is_base: BoolArray, robot: Mechanism, several: bool) -> _FilePoses:
     """Read the poses of one file, which the rows (rows,) of the base do not name."""
     from loopcal.measure import solve_commanded_poses
 
-    _refuse_poses_of_base(table, is_base, robot)
+    refuse_poses_of_base(table, is_base, robot)
     if is_base.all() and len(is_base):
         nothing = np.full((len(table), len(robot.actuators)), np.nan)
         names = ("",) * len(table)
@@ -228,21 +227,7 @@ def _refuse_other_readings(
         raise table.row_error(int(row), f"{sentence}; correct them, or rename one of the two poses")
 
 
-def _refuse_poses_of_base(table: Table, is_base: BoolArray, robot: Mechanism) -> None:
-    """Raise FileError where a row of the base names a pose, its use or block, or has readings."""
-    actuators = [actuator.name for actuator in robot.actuators]
-    names = ("pose", "use", "block", *actuators, *(COMMANDED + name for name in robot.controlled))
-    for name in (name for name in names if name in table.units):
-        cells = table.text(name)
-        for row in np.flatnonzero(is_base).tolist():
-            if cells[row]:
-                sentence = f"this row measures the base and belongs to no pose, but column {name!r}"
-                raise table.row_error(row, f"{sentence} is {cells[row]!r}; leave it empty")
-
-
-def _find_first_rows(
-    table: Table, names: tuple[str, ...], is_base: BoolArray
-) -> dict[str, int]:
+def _find_first_rows(table: Table, names: tuple[str, ...], is_base: BoolArray) -> dict[str, int]:
     """Return pose -> its first row, in the order of the file; rows of the base name none."""
     first: dict[str, int] = {}
     for row, name in enumerate(names):

@@ -104,9 +104,7 @@ class Kind(ABC):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
-        stage_platforms.check_stage(
-            self.name, self.of, self.poses_per_row, self.measures_points
-        )
+        stage_platforms.check_stage(self.name, self.of, self.poses_per_row, self.measures_points)
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
@@ -325,14 +323,8 @@ class Kind(ABC):
 
         Parameters
         ----------
-        T : (t, r, 4, 4)
-            True T_base_platform.
-        noise : (t, r, m)
-            In the noise columns.
-        nuisance : (t or 1, r or 1, u), optional
-            Default: nominal.
-        joints : (t, r, j), optional
-            Default: zero.
+        T : (t, r, 4, 4) true T_base_platform. noise : (t, r, m) in the noise columns.
+        nuisance : (t or 1, r or 1, u), default nominal. joints : (t, r, j), default zero.
 
         Returns
         -------

@@ -73,9 +73,7 @@ def make_direction_item(name: str, direction: FloatArray) -> SetupItem:
     return SetupItem(make_parameters(name, DIRECTION_AXES, Dimension.ANGLE), {name: direction})
 
 
-def make_points_item(
-    names: Sequence[str], points: FloatArray, scope: str = "session"
-) -> SetupItem:
+def make_points_item(names: Sequence[str], points: FloatArray, scope: str = "session") -> SetupItem:
     """Return points that are stated as (k, 3): three coordinates of each."""
     of_each = (
         make_parameters(name, POSITION_AXES, Dimension.LENGTH, point, scope)

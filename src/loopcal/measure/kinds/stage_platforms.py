@@ -16,7 +16,6 @@ from loopcal.measure.kinds.rows import Evaluation
 from loopcal.mechanism import name_platform_entries
 from loopcal.typing import FloatArray
 
-
 BASE = "base"
 """Name of the base among the bodies that a kind may be `of`; no stage has it."""
 
