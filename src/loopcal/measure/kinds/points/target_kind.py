@@ -50,9 +50,9 @@ class TargetKind(Kind):
     frame : str
         Name of the frame. Kinds that use the same name share its parameters.
     of : str
-        Stage of a chain on whose platform the targets are; default: the end platform. "base": the
-        targets are fixed to the base. Their rows belong to no pose, and unknown ones keep their
-        places in all sessions.
+        Stage of a chain on whose platform the targets are; default: the end platform. "base" (of
+        the kinds position, bearing and distance): the targets are fixed to the base. Their rows
+        belong to no pose, and unknown ones keep their places in all sessions.
 
     Raises
     ------
