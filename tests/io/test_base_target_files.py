@@ -73,7 +73,7 @@ def test_both_kinds_share_a_file(write, tmp_path):
     before, after = data.base_observations[0], again.base_observations[0]
     np.testing.assert_allclose(after.measured, before.measured, rtol=1e-12)
     assert after.session.tolist() == before.session.tolist()
-    assert after.kind.targets == ("N1", "N2", "N3")
+    assert tuple(after.kind.target_columns) == ("N1", "N2", "N3")
 
 
 def test_unknown_places_may_have_a_prior(write):

@@ -15,7 +15,7 @@ no pose and no stated place of a target enters. The noise is the stated one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from loopcal.measure import Measurements, Observations, Position
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import find_unit
+from loopcal.value_classes import dataclass
 
 LEVEL = 0.01
 """Probability of reporting anything although no frame and no target moved, of each of both tests.
@@ -154,6 +155,8 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
 def _list_unused_sessions(data: Measurements) -> tuple[str, ...]:
     """Return the sessions with targets on the base in an unknown frame, but without a pose."""
     used = {name for rows in data.observations for name in rows.session.tolist()}
+    if not used:
+        return ()
     return tuple(
         dict.fromkeys(
             name
@@ -206,7 +209,7 @@ def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
     for repeats in _list_repeats(data):
         kind, aligned = repeats.kind, _align_each(repeats)
         rows, values, _ = _build_rows(aligned)
-        is_seen = np.isfinite(repeats.points).all(axis=2)
+        is_seen = np.asarray(np.isfinite(repeats.points).all(axis=2))
         full, degrees = _solve_without(rows, values, is_seen)
         if degrees <= 0:
             continue
