@@ -74,7 +74,9 @@ def read(path: Path, options: ImportOptions) -> Imported:
         return mechanism.locate(frame if body == platform else choose_link(mechanism, body))[1]
 
     try:
-        paths = find_stage_paths(mechanism.graph, platform, locate_frame)
+        paths = find_stage_paths(
+            mechanism.graph, platform, locate_frame, mechanism.measure_rounding
+        )
         if paths.outside and options.platform is None:
             finding = report_finding(
                 "files.motors-outside", motors=paths.outside, platform=platform
@@ -186,6 +188,14 @@ def _report_structure(mechanism: UrdfMechanism, paths: StagePaths, frame: str) -
     yield report_finding(
         "files.urdf-home", residual=f"{residual:.1g} m", frame=frame, freedoms=paths.freedoms
     )
+    repair = paths.repair
+    if repair.gap or repair.angle:
+        yield report_finding(
+            "files.loops-rounded",
+            gap=Quantity(repair.gap * 1e3, "mm"),
+            angle=Quantity(repair.angle, "rad"),
+            turn=Quantity(repair.turn, "rad"),
+        )
     if len(paths.stages) > 1:
         names = list_stage_names(mechanism, paths)
         loops = (isinstance(stage, ClosedStage) for stage in paths.stages)

@@ -11,7 +11,8 @@ the example-parallel-robots collection.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal
@@ -83,6 +84,17 @@ class UrdfMechanism:
         """Return the rigid body of a link, and T_body_link (4, 4)."""
         body, T = self.bodies.locate(self.urdf.find_body(link))
         return body, T @ self.urdf.place_in_body(link)
+
+    def measure_rounding(self, bodies: Collection[str]) -> tuple[float, float]:
+        """Return the rounding error of all origins that join or are on bodies [m, rad]."""
+        ends = [end for constraint in self.urdf.constraints for end in constraint.ends]
+        chosen = [
+            *(j for j in self.urdf.joints.values() if self.locate(j.child)[0] in bodies),
+            *(end for end in ends if self.locate(end.parent)[0] in bodies),
+        ]
+        return math.hypot(*(j.rounding[0] for j in chosen)), math.hypot(
+            *(j.rounding[1] for j in chosen)
+        )
 
     def list_links(self, body: str) -> tuple[str, ...]:
         """Return the links of a rigid body."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field  # noqa: TID251 some can be changed
 from pathlib import Path
@@ -16,6 +17,8 @@ from loopcal.typing import FloatArray
 
 SAME_AXIS = 1e-9
 """Difference of two axes that count as the same [1]."""
+ROUNDED = 4
+"""Decimals from which a number counts as rounded, such as 1.5708 for a right angle."""
 KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
 CONSTRAINTS = {
     "fixed": "",
@@ -39,6 +42,7 @@ class UrdfJoint:
     origin : (4, 4) T_parent_joint [m]. axis : (3,) unit vector. limits : [rad or m].
     line : of the joint, from 1. start, end : bytes of its origin's tag, -1 without.
     mimic : the joint that it follows, factor and offset [rad or m]; None without.
+    rounding : error of its origin and axis by the rounding of their numbers [m, rad].
     """
 
     name: str
@@ -52,6 +56,7 @@ class UrdfJoint:
     start: int
     end: int
     mimic: tuple[str, float, float] | None = None
+    rounding: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,10 @@ def build_joint(joint: OpenElement, raw: bytes, path: Path) -> UrdfJoint:
             for key, default in (("multiplier", "1"), ("offset", "0"))
         )
         followed = mimic.get("joint", ""), factor, offset
-    return UrdfJoint(name, kind, parent, child, T, axis, limits, line, start, end, followed)
+    rounding = _measure_rounding(elements, "origin", "axis")
+    return UrdfJoint(
+        name, kind, parent, child, T, axis, limits, line, start, end, followed, rounding
+    )
 
 
 def build_constraint(constraint: OpenElement, raw: bytes, path: Path) -> UrdfConstraint:
@@ -134,6 +142,8 @@ def build_constraint(constraint: OpenElement, raw: bytes, path: Path) -> UrdfCon
             None,
             line,
             *_find_tag(constraint, f"{end}_origin", raw),
+            None,
+            _measure_rounding(elements, f"{end}_origin", f"{end}_axis"),
         )
         for end, link in zip(("parent", "child"), links, strict=True)
     )
@@ -155,6 +165,31 @@ def build_constraint(constraint: OpenElement, raw: bytes, path: Path) -> UrdfCon
             action = "turn child_origin so that both frames share the axis, or leave child_axis out"
             raise FileError(f"{sentence}; {action}", path, line)
     return UrdfConstraint(name, kind, (first, second), (axes["parent"], axes["child"]), line)
+
+
+def _measure_rounding(
+    elements: Mapping[str, Mapping[str, str]], origin: str, axis: str
+) -> tuple[float, float]:
+    """Return the units of the last digits of an origin and an axis, as roots of sums of squares.
+
+    Rounding errors are uniform in half a unit, so that this is 3.5 times the standard deviation of
+    their sum. A number with fewer than ROUNDED decimals is a dimension that somebody chose, and is
+    exact.
+    """
+    place, direction = elements.get(origin, {}), elements.get(axis, {})
+    lengths, angles = (place.get("xyz", ""),), (place.get("rpy", ""), direction.get("xyz", ""))
+    length, angle = (
+        math.hypot(*(_get_unit(number) for text in texts for number in text.split()))
+        for texts in (lengths, angles)
+    )
+    return length, angle
+
+
+def _get_unit(number: str) -> float:
+    """Return the unit of the last digit of a number; 0 where it has few decimals."""
+    mantissa, _, exponent = number.lower().partition("e")
+    decimals = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    return 10.0**-decimals if decimals >= ROUNDED else 0.0
 
 
 def _find_tag(element: OpenElement, name: str, raw: bytes) -> tuple[int, int]:

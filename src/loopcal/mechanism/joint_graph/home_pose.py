@@ -9,7 +9,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.findings import Quantity, report_finding
 from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
-from loopcal.mechanism.joint_graph.loop_closure import CLOSURE_RANK_TOLERANCE, JointGraph
+from loopcal.mechanism.joint_graph.loop_closure import CLOSURE_RANK_TOLERANCE, JointGraph, Placement
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
 from loopcal.value_classes import dataclass
@@ -22,6 +22,9 @@ SAME = 1e-6
 
 DRAWN = 1e-3
 """Largest joint value of a pose that counts as the drawn one [rad, sizes]."""
+
+WEAK = 1e-3
+"""Singular value of the closures, relative to the largest, below which a step leaves it out [1]."""
 
 NEAR, NEAR_RANGE = 4, 0.15
 """Number of poses near a pose, and range of their motors [rad, sizes]."""
@@ -165,28 +168,42 @@ def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
-    """Return the finding of loops that do not close: the worst closure of the best pose."""
+def approach_closure(graph: JointGraph, starts: FloatArray) -> FloatArray:
+    """Return joint values (n, j) near starts (n, j) at which the loops are open the least.
+
+    Directions that hardly change the closures are left out of the steps.
+    """
     sizes = np.where(graph.turns, 1.0, graph.size)
     q = starts
     for _ in range(STARTS):
         residual, rows = graph.linearize(q)
-        step = -(np.linalg.pinv(rows, rcond=1e-3) @ residual[:, :, None])[:, :, 0]
+        step = -(np.linalg.pinv(rows, rcond=WEAK) @ residual[:, :, None])[:, :, 0]
         largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
         q = q + step * np.minimum(1.0, 0.3 / largest) * sizes
+    return q
+
+
+def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> tuple[float, float]:
+    """Return the distance [m] and angle [rad] between both sides of a closing joint."""
+    A = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
+    B = (graph.get_place(placement, joint.body_b) @ joint.T_b)[0]
+    gap = B[:3, 3] - A[:3, 3]
+    if joint.kind == "S":
+        return float(np.linalg.norm(gap)), 0.0
+    a, b = A[:3, :3] @ joint.axis, B[:3, :3] @ joint.axis
+    if joint.kind == "P":
+        gap = gap - a * (a @ gap)
+    angle = float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+    return float(np.linalg.norm(gap)), angle
+
+
+def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
+    """Return the finding of loops that do not close: the worst closure of the best pose."""
+    q = approach_closure(graph, starts)
     best = q[[int(np.argmin((graph.linearize(q)[0] ** 2).sum(axis=1)))]]
     placement = graph.place(best)
-    gaps = []
-    for joint in graph.closing:
-        A = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
-        B = (graph.get_place(placement, joint.body_b) @ joint.T_b)[0]
-        gaps.append((float(np.linalg.norm(A[:3, 3] - B[:3, 3])), A, B, joint))
-    gap, A, B, joint = max(gaps, key=lambda entry: entry[0])
-    angle = 0.0
-    if joint.kind != "S":
-        angle = float(
-            np.arccos(np.clip((A[:3, :3] @ joint.axis) @ (B[:3, :3] @ joint.axis), -1, 1))
-        )
+    gaps = [(measure_gap(graph, placement, joint), joint) for joint in graph.closing]
+    (gap, angle), joint = max(gaps, key=lambda entry: entry[0])
     return report_finding(
         "files.loops-open",
         closure=joint.name,

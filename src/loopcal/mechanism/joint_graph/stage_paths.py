@@ -39,6 +39,7 @@ from loopcal.mechanism.joint_graph.limb_paths import (
     place_limbs,
 )
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
+from loopcal.mechanism.joint_graph.rounded_loops import Repair, repair_rounded_loops
 from loopcal.typing import FloatArray
 from loopcal.value_classes import dataclass, replace
 
@@ -100,6 +101,7 @@ class StagePaths:
     graph : what is between base and platform. home : joint values (j,). platform : its body.
     stages : from the base on. motions : what motors and passive joints can do at home.
     dangling : joints that were left out. outside : motors among them.
+    repair : what was done to loops with rounded numbers.
     """
 
     graph: JointGraph
@@ -109,6 +111,7 @@ class StagePaths:
     motions: Freedoms
     dangling: tuple[str, ...]
     outside: tuple[str, ...]
+    repair: Repair
 
     @cached_property
     def freedoms(self) -> tuple[str, ...]:
@@ -125,18 +128,24 @@ class StagePaths:
 
 
 def find_stage_paths(
-    whole: JointGraph, platform: str, locate_frame: Callable[[str], FloatArray]
+    whole: JointGraph,
+    platform: str,
+    locate_frame: Callable[[str], FloatArray],
+    measure_rounding: Callable[[tuple[str, ...]], tuple[float, float]] = lambda _: (0.0, 0.0),
 ) -> StagePaths:
     """Return the stages at the nearest home pose in which the motors hold the platform firmly.
 
-    `locate_frame` gives the frame (4, 4) of a body that is the platform of a stage.
+    `locate_frame` gives the frame (4, 4) of a body that is the platform of a stage,
+    `measure_rounding` the rounding errors [m, rad] of numbers that describe some bodies.
 
     Raises
     ------
     MechanismError : the loops do not close, a limb branches, no limbs join base and platform, or no
         motor holds a joint between them; a finding with the joints.
     """
-    graph = keep_path(whole, platform)
+    kept = keep_path(whole, platform)
+    repair = _repair_blocks(kept, find_blocks(kept, platform), measure_rounding)
+    graph = repair.graph
     blocks = find_blocks(graph, platform)
     _refuse_passive_blocks(blocks, platform)
     if all(block.is_serial for block in blocks):
@@ -161,10 +170,10 @@ def find_stage_paths(
         else:
             closed = place_limbs(block, values, paths, is_complete, frame)
             stages.append(ClosedStage(closed, mount, _align_frame(closed, frame)))
-    names = {joint.name for joint in graph.joints}
+    names = {joint.name for joint in kept.joints}
     dangling = tuple(joint.name for joint in whole.joints if joint.name not in names)
     outside = tuple(name for name in whole.motors if name not in graph.motors)
-    return StagePaths(graph, home, platform, tuple(stages), motions, dangling, outside)
+    return StagePaths(graph, home, platform, tuple(stages), motions, dangling, outside, repair)
 
 
 def list_possible_platforms(graph: JointGraph) -> tuple[str, ...]:
@@ -198,6 +207,30 @@ def _refuse_passive_blocks(blocks: tuple[Block, ...], platform: str) -> None:
             names = tuple(joint.name for joint in block.graph.joints)
             finding = report_finding("files.joints-not-held", joints=names, platform=platform)
             raise MechanismError(finding)
+
+
+def _repair_blocks(
+    graph: JointGraph,
+    blocks: tuple[Block, ...],
+    measure_rounding: Callable[[tuple[str, ...]], tuple[float, float]],
+) -> Repair:
+    """Return the mechanism with the rounded loops of its blocks repaired, and the largest gaps."""
+    repairs = [
+        repair_rounded_loops(block.graph, measure_rounding(block.graph.bodies))
+        for block in blocks
+        if not block.is_serial
+    ]
+    joints = {joint.name: joint for repair in repairs for joint in repair.graph.joints}
+    tree, closing = (
+        tuple(joints.get(joint.name, joint) for joint in some)
+        for some in (graph.tree, graph.closing)
+    )
+    return Repair(
+        replace(graph, tree=tree, closing=closing),
+        max((repair.gap for repair in repairs), default=0.0),
+        max((repair.angle for repair in repairs), default=0.0),
+        max((repair.turn for repair in repairs), default=0.0),
+    )
 
 
 def _choose_home(
@@ -245,17 +278,18 @@ def _turn_base(block: Block) -> tuple[Block, FloatArray]:
 
 
 def _align_frame(paths: LimbPaths, T_body_frame: FloatArray) -> FloatArray:
-    """Return a frame (4, 4) of the platform whose axes are those of the base at home.
+    """Return a frame (4, 4) of the platform with only those angles at home that it can change.
 
-    It is the given one where the platform turns about all axes or none, or where it has only
-    angles at home that it can change: a robot file states no others.
+    A robot file states no others. It is the given frame where the platform turns about all axes or
+    none.
     """
     turns = [name in paths.freedoms for name in AXES[:3]]
     place = paths.graph.get_place(paths.graph.place(paths.home[None]), paths.platform)[0]
     angles = geometry.matrix_to_euler((place @ T_body_frame)[:3, :3], "xyz")
     if not any(turns) or np.abs(angles[np.logical_not(turns)]).max(initial=0.0) < ALONG:
         return T_body_frame
-    return geometry.make_pose(place[:3, :3].T, T_body_frame[:3, 3])
+    R = geometry.euler_to_matrix(np.where(turns, angles, 0.0), "xyz")
+    return geometry.make_pose(place[:3, :3].T @ R, T_body_frame[:3, 3])
 
 
 def _describe_branch(whole: JointGraph, block: Block, platform: str) -> object:
