@@ -14,7 +14,7 @@ import numpy as np
 
 from loopcal.estimate.poses.smooth_errors import SmoothErrors
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism import Mechanism, ParameterUnits
+from loopcal.mechanism import Mechanism, ParameterUnits, refuse_free_breaking_parameters
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -124,7 +124,14 @@ class FreeParameters:
 
 
 def select_free_parameters(robot: Mechanism) -> FreeParameters:
-    """Return the free parameters of a robot with their tolerances, stated or default."""
+    """Return the free parameters of a robot with their tolerances, stated or default.
+
+    Raises
+    ------
+    MechanismError
+        The robot is over-constrained, and its loops do not close with other values of some.
+    """
+    refuse_free_breaking_parameters(robot)
     table = robot.parameters
     places = np.flatnonzero(table.free)
     stated = table.tolerance[places]

@@ -28,7 +28,7 @@ from loopcal.measure.readings import (
     select_joint_values,
     solve_commanded_poses,
 )
-from loopcal.mechanism import Mechanism, Status, forward
+from loopcal.mechanism import Mechanism, Status, forward, refuse_drawn_errors
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.value_classes import dataclass, replace
 
@@ -127,8 +127,11 @@ def sample_truth(
     ------
     DataError
         If there is no such distribution.
+    MechanismError
+        If the robot is over-constrained, so that its loops do not close with such errors.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
+    refuse_drawn_errors(robot)
     if distribution not in get_args(Distribution):
         raise DataError(f"distribution is {distribution!r}; give 'normal' or 'uniform'")
     table = robot.parameters

@@ -68,6 +68,11 @@ if TYPE_CHECKING:
     from loopcal.mechanism.kinematics import jacobian as jacobian
     from loopcal.mechanism.kinematics import make_solution as make_solution
     from loopcal.mechanism.model import Mechanism as Mechanism
+    from loopcal.mechanism.over_constraint import fix_breaking_parameters as fix_breaking_parameters
+    from loopcal.mechanism.over_constraint import refuse_drawn_errors as refuse_drawn_errors
+    from loopcal.mechanism.over_constraint import (
+        refuse_free_breaking_parameters as refuse_free_breaking_parameters,
+    )
     from loopcal.mechanism.parameter_units import ParameterUnits as ParameterUnits
     from loopcal.mechanism.platform_coordinates import POSITION as POSITION
     from loopcal.mechanism.platform_coordinates import TILT as TILT
@@ -145,6 +150,9 @@ else:
                 make_solution
             """,
             "loopcal.mechanism.model": "Mechanism",
+            "loopcal.mechanism.over_constraint": """
+                fix_breaking_parameters refuse_drawn_errors refuse_free_breaking_parameters
+            """,
             "loopcal.mechanism.parameter_units": "ParameterUnits",
             "loopcal.mechanism.platform_coordinates": """
                 POSITION TILT check_coordinates compare_coordinates pose_from_coordinates

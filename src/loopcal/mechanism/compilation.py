@@ -27,6 +27,7 @@ from loopcal.mechanism.mobility import (
     refuse_uncontrolled,
 )
 from loopcal.mechanism.model import Mechanism, SlotMap
+from loopcal.mechanism.over_constraint import report_over_constraint
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.possible_values import check_nominal_values
 from loopcal.mechanism.sensitivity import differentiate_pose
@@ -108,7 +109,9 @@ def _compile(
     )
     if robot.is_serial and not robot.controlled:
         return replace(robot, home_state=_place_at_start(robot))
-    return check_mobility(replace(robot, home_state=_find_home(robot)))
+    robot = replace(robot, home_state=_find_home(robot))
+    check_mobility(robot)
+    return report_over_constraint(robot, _compile)
 
 
 def compute_characteristic_length(assembly: Assembly) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.errors import MechanismError
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import report_finding
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
@@ -41,8 +41,8 @@ MAIN_SHARE = 0.3
 """Components below this share of the largest one are left out of the description of a motion."""
 
 
-def check_mobility(robot: Mechanism) -> Mechanism:
-    """Return the robot with its findings about mobility at home.
+def check_mobility(robot: Mechanism) -> None:
+    """Refuse actuators that cannot move and hold the platform at home.
 
     Raises
     ------
@@ -91,13 +91,9 @@ def check_mobility(robot: Mechanism) -> Mechanism:
             f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
             f"{movable}"
         )
-    if len(A) > independent:
-        repeated = _report_repeated(names, len(A) - independent, motions)
-        robot = replace(robot, findings=(*robot.findings, repeated))
     _check_controlled(robot, movable, scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0])
     if robot.has_open_sums:
         _check_open_sums(robot, scale)
-    return robot
 
 
 def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
@@ -112,18 +108,6 @@ def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
             "can move while all sums are constant; correct the weights of `sum:`, or state another "
             "`home:`"
         )
-
-
-def _report_repeated(names: Sequence[str], count: int, motions: FloatArray) -> Finding:
-    """Return the finding of closure equations that repeat others.
-
-    motions : (f, m) what the platform can do with free actuators. If these are motions in single
-    freedoms, the finding names them.
-    """
-    largest = np.abs(motions).max(axis=0)
-    used = [n for n, part in zip(names, largest, strict=True) if part > RANK * largest.max()]
-    freedoms = tuple(used) if len(used) == len(motions) else ()
-    return report_finding("mechanism.repeated-equations", count=count, freedoms=freedoms)
 
 
 def _check_controlled(robot: Mechanism, movable: int, D: FloatArray) -> None:

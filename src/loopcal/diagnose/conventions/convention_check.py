@@ -52,7 +52,7 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
-from loopcal.mechanism import Mechanism, forward
+from loopcal.mechanism import Mechanism, fix_breaking_parameters, forward
 from loopcal.presentation import HtmlResult
 from loopcal.value_classes import dataclass, replace
 
@@ -194,6 +194,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     """
     check_types(robot, data)
     check_actuators(data, robot)
+    robot = fix_breaking_parameters(robot)  # no data contain other values of them
     free = select_free_parameters(robot)
     known = _select_known_readings(data, is_redundant(free))
     if known is None:

@@ -12,7 +12,7 @@ from loopcal.diagnose.conventions.selection import ALLOWED
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, describe_outside_strokes
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, fix_breaking_parameters
 
 
 def explain_outside_strokes(
@@ -41,7 +41,9 @@ def explain_outside_strokes(
     inside = [one for one in candidates if describe_outside_strokes(one.apply(data), robot) is None]
     if not inside or not check.other_misfit <= ALLOWED:
         return None
-    comparison = judge_data(select_free_parameters(robot), inside[0].apply(data))
+    comparison = judge_data(
+        select_free_parameters(fix_breaking_parameters(robot)), inside[0].apply(data)
+    )
     if comparison is None:
         return None
     return report_finding(
