@@ -126,6 +126,7 @@ struct Machine {
             rows.push_back((size_t)(LIMBS * shape.rows * ((int64_t)solved.size() + freedoms + count + joints + 1)));
         }
         structure[2] = displacements;
+        structure.push_back(0);  // may_stay_open
     }
 };
 

@@ -37,6 +37,7 @@ struct Program {
     const double *sigma;  // (drives,), null without redundancy
     double size;
     Group *group;
+    bool may_stay_open;  // whether a least-squares solution counts as closed
 
     // `memory` for as many groups as whole[0] states
     Program(const int64_t *whole, const double *real, Group *memory) : group(memory) {
@@ -64,6 +65,7 @@ struct Program {
             o.pitch = real, real += o.limbs * o.joints;
             o.length = real, real += o.limbs;
         }
+        may_stay_open = *i != 0 || has_sigma;
     }
 
     int placed() const {

@@ -256,7 +256,7 @@ class Solver {
             end |= near;
         }
         Mask closed = settled;
-        if (!program_.sigma) closed &= now.residual <= 1e4 * RESIDUAL * size;
+        if (!program_.may_stay_open) closed &= now.residual <= 1e4 * RESIDUAL * size;
         Lanes reason = select(closed, splat(CONVERGED), splat(STALLED));
         reason = select(broken, splat(NOT_FINITE), reason);
         reason = select(near, splat(NEAR_GOAL), reason);

@@ -164,7 +164,7 @@ def test_planar_robot_with_six_freedoms_is_solved_and_reported_as_redundant():
     assert flat.findings == ()
     (finding,) = whole.findings
     assert finding.code == "mechanism.repeated-equations"
-    assert finding.data == {"count": 6, "freedoms": ("rz", "x", "y")}
+    assert (finding.data["count"], finding.data["freedoms"]) == (6, ("rz", "x", "y"))
     asked = np.random.default_rng(0).uniform((-0.06, -0.06, -0.45), (0.06, 0.06, 0.45), (300, 3))
     result = inverse(flat, asked)
     result = result.take(result.converged)
@@ -187,7 +187,7 @@ def test_redundant_equations_are_reported_when_no_freedoms_avoid_them():
     robot = build(replace(assembly, parameters=(), maps=(), controlled=("x", "y", "yaw")))
     (finding,) = robot.findings
     assert finding.code == "mechanism.repeated-equations"
-    assert finding.data == {"count": 6, "freedoms": ()}
+    assert (finding.data["count"], finding.data["freedoms"]) == (6, ())
 
 
 def build_spherical_3rrr():

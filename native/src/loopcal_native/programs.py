@@ -55,6 +55,7 @@ def _flatten(program: Program, free: bool) -> FlatProgram:
         origins = group.links[:, :, :3, 3]
         reals[-1] = np.concatenate([reals[-1], origins], axis=2)
         reals += [group.pitch, group.length]
+    whole.append(program.may_stay_open)
     numbers = np.concatenate([np.asarray(a, np.float64).ravel() for a in reals])
     return FlatProgram(np.array(whole, np.int64), numbers, tuple(unknown))
 

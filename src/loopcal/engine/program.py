@@ -106,6 +106,8 @@ class Program:
     n_displacements, n_joints : lengths of e and of q.
     sigma : (n_joints,) standard deviations of q that weigh redundant actuators; None without
         redundancy.
+    may_stay_open : whether the least-squares solution of more closure equations than unknowns
+        counts as closed, whatever gap it leaves. It is so with redundant actuators, too.
     """
 
     groups: tuple[Group, ...]
@@ -114,6 +116,7 @@ class Program:
     n_displacements: int
     n_joints: int
     sigma: tuple[float, ...] | None = None
+    may_stay_open: bool = False
 
     def list_drives(self, joints: tuple[FloatArray, ...]) -> FloatArray:
         """Return values (t, n, a) of the actuated joints, of those of groups (t, n, k, J + 1)."""

@@ -203,7 +203,7 @@ class Assembly:
 
     Attributes
     ----------
-    name, source : for people. limbs, actuators : in the order of readings and tables.
+    name, source : for people. limbs, actuators : in the order of tables.
     freedoms : those of the platform, of AXES in base axes. controlled : coordinates in which the
         machine is commanded.
     home : (4, 4) T_base_platform of the home pose; only its controlled coordinates must be exact.
@@ -214,6 +214,7 @@ class Assembly:
     common_errors : errors that several parameters share.
     stages : of a chain, each after the one that it is attached to; the fields above are those of
         all stages together, with the name of the stage before the name of a limb or parameter.
+    closure : of over-constrained loops, `exact` or `least-squares`.
     """
 
     name: str
@@ -231,6 +232,7 @@ class Assembly:
     stored_parameters: tuple[str, ...] = ()
     common_errors: tuple[CommonError, ...] = ()
     stages: tuple[AttachedStage, ...] = ()
+    closure: str = "exact"
 
     @cached_property
     def driven_joints(self) -> tuple[str, ...]:

@@ -158,7 +158,7 @@ def inverse_trials(
     `compute_readings` gives the readings of the states.
     """
     state = close_at_coordinates(robot, values, target, start)
-    if count_shared_drives(robot.program):
+    if needs_readings(robot.program):
         return state
     return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
@@ -172,8 +172,18 @@ def close_at_coordinates(
         return without_poses(robot.home_state, max(len(values), len(target)))
     if robot.stages:
         return solve_readings(robot, values, target, begin, forward_trials, differentiate_pose)
-    if count_shared_drives(robot.program):
-        return _inverse_with_shared_drives(robot, values, target, begin)
+    if needs_readings(robot.program):
+        return _inverse_by_readings(robot, values, target, begin)
+    return _close_with_free_actuators(robot, values, target, begin, start)
+
+
+def _close_with_free_actuators(
+    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State, start: State | None
+) -> State:
+    """Return states (t, n) at controlled coordinates, with every actuated joint free.
+
+    start : as given; without it the platform begins as commanded, where its coordinates state it.
+    """
     e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
     T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
@@ -238,20 +248,28 @@ def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> Floa
     return readings_from_joints(joints, tau, robot.slots.frequency)
 
 
+def needs_readings(program: Program) -> bool:
+    """Return whether the inverse solution is one for readings: joints with a shared drive would
+    part, and where loops may stay open, a free actuator would take a part of the gap.
+    """
+    return program.may_stay_open or count_shared_drives(program) > 0
+
+
 def count_shared_drives(program: Program) -> int:
     """Return the number of driven joints beyond one for each actuator."""
     driven = sum(int((columns >= 0).sum()) for g in program.groups for columns in g.actuator)
     return driven - program.n_joints
 
 
-def _inverse_with_shared_drives(
+def _inverse_by_readings(
     robot: Mechanism, values: FloatArray, target: FloatArray, begin: State
 ) -> State:
     """Return states (t, n) at controlled coordinates (t | 1, n, c) by their readings.
 
-    Newton's method begins with each joint free and the platform as commanded in all its freedoms,
-    which the limbs of many machines can reach one by one; elsewhere, such as where the platform's
-    orientation follows its position, at the start.
+    Newton's method begins with each joint free, which is almost right where loops may stay open.
+    With shared drives the platform is then as commanded in all its freedoms, which the limbs of
+    many machines can reach one by one; elsewhere, such as where the platform's orientation follows
+    its position, the method begins at the start.
     """
     if not begin.closure_sign.any():
         # the guess of a home that is searched for has no sign yet
@@ -265,17 +283,18 @@ def _inverse_with_shared_drives(
         begin,
         forward_trials,
         differentiate_pose,
-        partial(_solve_as_commanded, robot),
+        partial(_propose_state, robot),
     )
 
 
-def _solve_as_commanded(
-    robot: Mechanism, values: FloatArray, target: FloatArray, start: State
-) -> State:
-    """Return states with every joint free and the platform as commanded; all are (1, R) or (R, 1).
+def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, start: State) -> State:
+    """Return states with every joint free at targets (R, c); all are (1, R) or (R, 1).
 
-    Coordinates that are not controlled are those of the start.
+    With shared drives, coordinates that are not controlled are those of the start.
     """
+    if not count_shared_drives(robot.program):
+        shaped = target.reshape(*start.T.shape[:2], -1)
+        return _close_with_free_actuators(robot, values, shaped, start, start)
     e, _ = robot.slots(values)
     names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
     T = pose_from_coordinates(target, robot.controlled, start.T.reshape(-1, 4, 4))

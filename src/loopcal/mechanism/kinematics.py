@@ -22,8 +22,8 @@ from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.batch_kinematics import (
     close_at_coordinates,
     compute_readings,
-    count_shared_drives,
     forward_trials,
+    needs_readings,
 )
 from loopcal.mechanism.limb_rows import name_passive_joints, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
@@ -322,7 +322,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     flat = state.T.reshape(-1, 4, 4)
     _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)
-    if robot.stages or count_shared_drives(robot.program):
+    if robot.stages or needs_readings(robot.program):
         q = compute_readings(robot, values, state)
         D = differentiate_pose(robot, values, q, state).readings
         return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))

@@ -135,24 +135,28 @@ def _stack_displacements(
 def report_over_constraint(
     robot: Mechanism, compile_assembly: Callable[[Assembly], Mechanism]
 ) -> Mechanism:
-    """Return the robot with a finding of its closure equations that repeat others, if any do.
+    """Return the robot with a finding of its closure equations that repeat others, if any do, and
+    with loops that may stay open where its file asks for the least-squares closure.
 
     compile_assembly : returns the robot of an assembly, to try fewer freedoms.
     """
+    asks = robot.assembly.closure == "least-squares"
     rows = _linearize(robot, robot.home_state)[0]
     numbers = np.arange(len(robot.assembly.limbs))
     count = len(rows.find_repeated(numbers))
     if not count:
-        return robot
+        without = (report_finding("mechanism.closure-without-effect"),) if asks else ()
+        return replace(robot, findings=(*robot.findings, *without))
     finding = report_finding(
         "mechanism.repeated-equations",
         count=count,
         tolerance=RANK,
-        closes=False,
+        closes=asks,
         repeated=_list_repeated(robot, rows),
         freedoms=_find_sufficient_freedoms(robot, compile_assembly),
     )
-    return replace(robot, findings=(*robot.findings, finding))
+    program = replace(robot.program, may_stay_open=asks)
+    return replace(robot, program=program, findings=(*robot.findings, finding))
 
 
 def _list_repeated(robot: Mechanism, rows: _Rows) -> tuple[dict[str, Any], ...]:
@@ -249,7 +253,7 @@ def _find_sufficient_freedoms(
     if len(names) == len(freedoms):
         return ()
     try:
-        flat = compile_assembly(replace(robot.assembly, freedoms=names))
+        flat = compile_assembly(replace(robot.assembly, freedoms=names, closure="exact"))
     except MechanismError:
         return ()
     return () if is_over_constrained(flat) else names
@@ -335,7 +339,7 @@ def _detect_breaking(robot: Mechanism) -> BoolArray:
     breaks = np.zeros(len(robot.parameters), bool)
     for stage in robot.stages:
         breaks[stage.parameters] = _detect_breaking(stage.robot)
-    if robot.stages or not is_over_constrained(robot):
+    if robot.stages or robot.program.may_stay_open or not is_over_constrained(robot):
         return breaks
     numbers, d = np.arange(len(robot.assembly.limbs)), robot.program.n_displacements
     slopes = robot.slots.jacobian(robot.parameters.nominal[None])[0, :d]

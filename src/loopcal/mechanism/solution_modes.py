@@ -22,9 +22,9 @@ from loopcal.mechanism.batch_kinematics import (
     close_at_joints,
     compute_closure_sign,
     compute_readings,
-    count_shared_drives,
     determine_platform,
     forward_trials,
+    needs_readings,
 )
 from loopcal.mechanism.mode_paths import SAME_JOINTS, connect_states, measure_distance, repeat_poses
 from loopcal.mechanism.model import Mechanism
@@ -86,7 +86,7 @@ def reach_coordinates(
     arrives : (n,) rows whose readings are known to lead from the start to their pose.
     """
     values, target = robot.values[None], target[None]
-    is_plain = not (robot.stages or robot.is_serial or count_shared_drives(robot.program))
+    is_plain = not (robot.stages or robot.is_serial or needs_readings(robot.program))
     if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
         return close_at_coordinates(robot, values, target, start), None
     e, _ = robot.slots(values)

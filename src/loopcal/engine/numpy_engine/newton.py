@@ -129,7 +129,8 @@ def _iterate(
 ) -> Solved:
     """Iterate one chunk until every row has converged, is near its goal (3, 4, N), or failed."""
     size, N = equations.program.size, coordinates.shape[1]
-    may_stay_open = equations.program.sigma is not None
+    program = equations.program
+    may_stay_open = program.may_stay_open or program.sigma is not None
     status, steps, alive = np.full(N, EXHAUSTED, np.int8), np.zeros(N, np.int64), np.arange(N)
     # share of the full step, length of the last applied step, steps in a row at rounding level
     share, applied, at_rounding = np.ones(N), np.full(N, np.inf), np.zeros(N)

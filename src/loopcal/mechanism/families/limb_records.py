@@ -355,6 +355,7 @@ class LimbsFile:
     error_model: Literal["ideal", "complete"] = "ideal"
     parameters: tuple[NamedParameter, ...] = ()
     tolerances: LinkTolerances = field(default_factory=LinkTolerances)
+    closure: Literal["exact", "least-squares"] = "exact"
 
 
 def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:

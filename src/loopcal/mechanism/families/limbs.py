@@ -91,7 +91,7 @@ class Limbs(LimbsFile, RobotRecord):
     actuators : drives by name; a drive that is not listed reads the joint value. In a limb with
         copies, `q` means q1, q2, ..
     limbs : from base to platform. error_model, parameters : see the module. tolerances : of the
-        complete model.
+        complete model. closure : how over-constrained loops close.
     """
 
     family = "limbs"
@@ -119,13 +119,14 @@ class Limbs(LimbsFile, RobotRecord):
         if self.error_model == "complete":
             errors = self._complete(copies, drives).without_effects_of(errors) + errors
         self._check(tuple(drives))
-        return self.assemble(
+        assembly = self.assemble(
             (member.placed.limb for member in copies),
             (build_actuator(name, drive) for name, drive in drives.items()),
             errors,
             freedoms=self.freedoms,
             controlled=self.controlled,
         )
+        return replace(assembly, closure=self.closure)
 
     def _check(self, drives: tuple[str, ...]) -> None:
         idle = [

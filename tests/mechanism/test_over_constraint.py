@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Over-constrained machines: repeated equations, what opens loops, the least-squares closure."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal import engine, geometry
+from loopcal.diagnose import identifiability
+from loopcal.engine import numpy_engine
+from loopcal.errors import MechanismError
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    build,
+    differentiate_pose,
+    forward,
+    forward_trials,
+    inverse,
+)
+from loopcal.mechanism.over_constraint import (
+    find_breaking_parameters,
+    find_nearby_states,
+    find_over_constraint,
+    fix_breaking_parameters,
+)
+from loopcal.mechanism.states import driven_values
+from tests.over_constrained import (
+    EXECHON,
+    FOUR_BAR,
+    close_by_least_squares,
+    load_text,
+    solve_exechon,
+)
+from tests.zoo import move_base, place
+
+BOTH = pytest.mark.parametrize("text", [EXECHON, FOUR_BAR], ids=["exechon", "four-bar"])
+
+
+def get_data(robot: Mechanism) -> dict:
+    """Return the data of the finding of repeated equations."""
+    finding = find_over_constraint(robot)
+    assert finding is not None
+    return dict(finding.data)
+
+
+def name_axis(turns: bool, name: str) -> dict:
+    """Return a repeated direction along an axis of the base."""
+    return {"turns": turns, "name": name, "vector": ()}
+
+
+def test_second_limb_of_an_exechon_head_repeats_a_translation_and_a_rotation(
+    tmp_path: Path,
+) -> None:
+    data = get_data(load_text(tmp_path, EXECHON))
+    assert (data["count"], data["tolerance"], data["freedoms"]) == (2, 1e-9, ())
+    # both limbs are in the plane y = 0 and turn about x and y only
+    directions = (name_axis(False, "y"), name_axis(True, "z"))
+    assert data["repeated"] == ({"limb": "right", "others": ("left",), "directions": directions},)
+
+
+def test_four_bar_in_space_repeats_what_its_plane_needs_once(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, FOUR_BAR)
+    data = get_data(robot)
+    directions = (name_axis(False, "y"), name_axis(True, "x"), name_axis(True, "z"))
+    assert data["repeated"] == ({"limb": "rocker", "others": ("crank",), "directions": directions},)
+    # at home it moves along x alone; on its way it also turns and moves along z
+    assert data["freedoms"] == ("ry", "x", "z")
+    flat = build(replace(robot.assembly, freedoms=data["freedoms"]))
+    assert find_over_constraint(flat) is None
+    q = np.deg2rad(np.linspace(-20, 20, 9))[:, None]
+    assert_allclose(forward(flat, q).T, forward(robot, q).T, atol=1e-12)
+
+
+def test_directions_of_a_machine_at_any_angle_are_vectors(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, EXECHON)
+    turned = place((0.1, -0.2, 0.3), (0.4, 0.5, -0.6))
+    moved = build(replace(move_base(robot.assembly, turned), controlled=("x", "y", "z")))
+    (entry,) = get_data(moved)["repeated"]
+    shift, turn = entry["directions"]
+    for direction, axis in ((shift, turned[:3, 1]), (turn, turned[:3, 2])):
+        assert abs(np.abs(np.dot(direction["vector"], axis)) - 1) < 1e-3  # vectors have 3 digits
+    assert (shift["turns"], turn["turns"]) == (False, True)
+
+
+@BOTH
+def test_loops_stay_closed_with_other_values_exactly_of_parameters_that_are_not_named(
+    text: str, tmp_path: Path
+) -> None:
+    robot = load_text(tmp_path, text)
+    breaking = find_breaking_parameters(robot)
+    near = find_nearby_states(robot)
+    q = driven_values(robot.program, near)
+    assert q.shape[1] == 5  # home and four poses near it
+    table, closes = robot.parameters, []
+    for i in range(len(table)):
+        values = table.nominal.copy()
+        values[i] += 5 * table.tolerance[i]
+        state = forward_trials(robot, values[None], q, near, follow=False)
+        closes.append(bool((state.status == Status.CONVERGED).all()))
+    opened = tuple(name for name, ok in zip(table.names, closes, strict=True) if not ok)
+    assert opened == breaking
+    assert 0 < len(breaking) < len(table)
+    assert find_breaking_parameters(fix_breaking_parameters(robot)) == ()
+
+
+@BOTH
+def test_errors_that_open_the_loops_are_neither_drawn_nor_identified(
+    text: str, tmp_path: Path
+) -> None:
+    robot = load_text(tmp_path, text)
+    with pytest.raises(MechanismError) as refusal:
+        sample_truth(robot, 1, 0)
+    assert refusal.value.code == "mechanism.drawn-errors-open-loops"
+    instrument = Instrument((Sensor(Pose(), Gaussian(np.array([50e-6] * 3 + [1e-5] * 3))),))
+    data = simulate(robot, robot.home[None], instrument, 0)
+    with pytest.raises(MechanismError) as refusal:
+        identifiability(robot, data)
+    assert refusal.value.code == "mechanism.free-parameters-open-loops"
+    assert find_breaking_parameters(robot)[0] in str(refusal.value)
+    rest = fix_breaking_parameters(robot)
+    assert np.isfinite(sample_truth(rest, 2, 0)).all()
+    assert identifiability(rest, data).n_parameters == int(rest.parameters.free.sum())
+
+
+def draw(robot: Mechanism, poses: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return values (2, p) of drawn errors, and readings (1, n, a) of poses in the workspace."""
+    ranges = np.array(list(robot.assembly.workspace.values()))
+    asked = np.random.default_rng(3).uniform(ranges[:, 0], ranges[:, 1], (poses, len(ranges)))
+    return sample_truth(robot, 2, 5), inverse(robot, asked).q[None]
+
+
+def test_least_squares_closure_agrees_with_an_independent_minimization(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, close_by_least_squares(EXECHON))
+    values, q = draw(robot, 2)
+    state = forward_trials(robot, values, q)
+    assert (state.status == Status.CONVERGED).all()
+    assert (state.residual > 1e-5).all()  # [m] the loops are open
+    for t, n in ((0, 0), (1, 1)):
+        own = solve_exechon(robot, values[t], q[0, n], state.T[t, n])
+        assert_allclose(state.T[t, n], own, atol=1e-9 * robot.size)  # [m, rad]
+
+
+@BOTH
+def test_engines_agree_on_the_least_squares_closure(text: str, tmp_path: Path) -> None:
+    robot = load_text(tmp_path, close_by_least_squares(text))
+    values, q = draw(robot, 7)
+    e, _ = robot.slots(values)
+    joints = q + robot.slots(values)[1][:, None, :, 0]  # the offset is the first term
+    own = numpy_engine.solve(robot.program, e, joints, robot.home_state)
+    other = engine.solve(robot.program, e, joints, robot.home_state)
+    assert (own.status == engine.CONVERGED).all()
+    assert (other.status == engine.CONVERGED).all()
+    assert_allclose(other.T, own.T, atol=1e-11)
+    assert_allclose(other.residual, own.residual, rtol=1e-9)
+
+
+@BOTH
+def test_forward_kinematics_of_open_loops_returns_commanded_coordinates(
+    text: str, tmp_path: Path
+) -> None:
+    robot = load_text(tmp_path, close_by_least_squares(text))
+    true = robot.with_values(draw(robot, 1)[0][0])
+    ranges = np.array(list(robot.assembly.workspace.values()))
+    asked = np.random.default_rng(4).uniform(ranges[:, 0], ranges[:, 1], (8, len(ranges)))
+    solution = inverse(true, asked)
+    assert solution.converged.all()
+    assert_allclose(forward(true, solution.q).T, solution.T, atol=1e-11)
+    again = inverse(true, solution.T)
+    assert_allclose(again.q, solution.q, atol=1e-9)
+
+
+@BOTH
+def test_derivatives_of_open_loops_agree_with_differences(text: str, tmp_path: Path) -> None:
+    robot = load_text(tmp_path, close_by_least_squares(text))
+    values, q = draw(robot, 3)
+    state = forward_trials(robot, values, q)
+    D = differentiate_pose(robot, values, q, state)
+    h = 1e-5
+
+    def differ(shift_values: np.ndarray, shift_q: np.ndarray) -> np.ndarray:
+        ends = [
+            forward_trials(robot, values + s * shift_values, q + s * shift_q, state).T
+            for s in (h, -h)
+        ]
+        return geometry.pose_difference(*ends) / (2 * h)
+
+    for i, unit in enumerate(np.eye(values.shape[1])):
+        # [m/rad, 1] a step of 1e-5 has an error of about 1e-10 times the third derivative
+        assert_allclose(D.parameters[..., i], differ(unit, 0 * q[0, 0]), atol=2e-7)
+    for i, unit in enumerate(np.eye(q.shape[2])):
+        assert_allclose(D.readings[..., i], differ(0 * values[0], unit), atol=2e-7)
+
+
+def test_least_squares_closure_without_repeated_equations_changes_nothing(tmp_path: Path) -> None:
+    text = FOUR_BAR.replace("controlled:", "freedoms: [ry, x, z]\ncontrolled:")
+    plain = load_text(tmp_path, text)
+    asked = load_text(tmp_path, close_by_least_squares(text))
+    assert plain.findings == ()
+    assert [f.code for f in asked.findings] == ["mechanism.closure-without-effect"]
+    assert asked.program.may_stay_open is False
+    q = np.deg2rad(np.linspace(-20, 20, 5))[:, None]
+    assert_allclose(forward(asked, q).T, forward(plain, q).T, atol=0)
