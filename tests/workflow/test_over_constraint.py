@@ -62,7 +62,6 @@ def test_stated_chi_square_is_the_cost_at_the_stated_estimate(text: str, tmp_pat
     assert fit.rank == len(fit.names)
 
 
-@pytest.mark.slow
 def test_chi_square_of_twenty_calibrations_is_that_of_the_noise(tmp_path: Path) -> None:
     robot = load_text(tmp_path, close_by_least_squares(EXECHON))
     poses, draws = draw_poses(robot, 15, 1), 20

@@ -184,17 +184,15 @@ def differentiate(
     e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
     inputs : how parameters and readings move e and q.
 
-    Redundant actuators are weighted by the standard deviations of the program. Where loops may stay
-    open, the derivatives are those of the least-squares closure, and NumPy computes them for every
-    engine. Singular rows have infinities or NaN.
+    Redundant actuators are weighted by the standard deviations of the program. Singular rows have
+    infinities or NaN.
 
     Returns
     -------
     by_parameter, by_reading : (t, n, 6, p) and (t, n, 6, n_joints) twist of the platform per unit
         of each, zero outside its freedoms.
     """
-    own = numpy_engine if program.may_stay_open else get_current_engine()
-    return own.differentiate(program, e, q, state, inputs)
+    return get_current_engine().differentiate(program, e, q, state, inputs)
 
 
 def fold_poses(
@@ -217,5 +215,4 @@ def fold_poses(
         was observed are finite. Its rows are zero elsewhere.
     """
     arguments = program, e, q, state, inputs, observed
-    own = numpy_engine if program.may_stay_open else get_current_engine()
-    return own.fold_poses(factor, *arguments)
+    return get_current_engine().fold_poses(factor, *arguments)

@@ -11,7 +11,6 @@ and no reading can close them again. Derivation: docs/theory/over-constraint.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,11 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials
+from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.value_classes import dataclass, replace
 
 RANK = 1e-9
 """Relative size below which a singular value of the closure equations counts as zero.

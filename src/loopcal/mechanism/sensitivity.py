@@ -20,6 +20,7 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.open_closure import differentiate_open, fold_open_poses
 from loopcal.mechanism.parameter_units import ParameterUnits
 from loopcal.mechanism.stages.chain_kinematics import (
     differentiate_end,
@@ -63,6 +64,8 @@ def differentiate_pose(
 ) -> PoseSensitivity:
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
+    Of loops that may stay open, the derivatives are those of the least-squares closure.
+
     `columns` : the parameters and their units; all parameters in SI without it. Rows of singular
     states have infinities or NaN.
     """
@@ -76,7 +79,9 @@ def differentiate_pose(
         joints = joints_from_readings(q, tau, robot.slots.frequency)
         chosen = robot.all_parameters if columns is None else columns
         inputs = chosen.linearize(values, tau, q)
-        derivatives = engine.differentiate(robot.program, e, joints, state, inputs)
+        is_open = robot.program.may_stay_open
+        differentiate = differentiate_open if is_open else engine.differentiate
+        derivatives = differentiate(robot.program, e, joints, state, inputs)
         if robot.has_sums:
             by_parameters, by_joints = derivatives
             turns = differentiate_joints_by_readings(robot, values, q)
@@ -105,7 +110,8 @@ def fold_pose_rows(
     e, tau = robot.slots(values)
     joints = joints_from_readings(q, tau, robot.slots.frequency)
     inputs = columns.linearize(values, tau, q)
-    return engine.fold_poses(factor, robot.program, e, joints, state, inputs, observed)
+    fold_poses = fold_open_poses if robot.program.may_stay_open else engine.fold_poses
+    return fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,8 @@ import numpy as np
 
 from loopcal.engine.numpy_engine.closure import Chain, cross, dot, place_links
 from loopcal.engine.numpy_engine.householder import back_substitute, triangularize
-from loopcal.engine.numpy_engine.input_entries import pick_rows, select_entries
-from loopcal.engine.numpy_engine.open_closure import differentiate_open
 from loopcal.engine.program import LENGTH, PITCH, Group, ParameterMap, Program, State
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, IntArray
 
 CHUNK = 1024
 """Rows differentiated together."""
@@ -29,13 +27,11 @@ def differentiate(
     program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
 ) -> tuple[FloatArray, FloatArray]:
     """Differentiate the platform; see `loopcal.engine.differentiate`."""
-    if program.may_stay_open:
-        return differentiate_open(program, e, q, state, inputs)
     t, n = state.T.shape[:2]
     p, a, m = inputs.pattern.parameters, program.n_joints, len(program.freedoms)
     T = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0)
     limbs = [
-        (place_links(g, e), g.insert_driven(values, q), select_entries(g, inputs))
+        (place_links(g, e), g.insert_driven(values, q), _select_entries(g, inputs))
         for g, values in zip(program.groups, state.joints, strict=True)
     ]
     by_parameter, by_reading = np.zeros((t * n, 6, p)), np.zeros((t * n, 6, a))
@@ -52,7 +48,7 @@ def differentiate(
                 A.append(closed.freedoms)
                 columns = closed.columns.transpose(3, 0, 1, 2)
                 moving.append(entries.by_parameter(columns, p, trial, pose))
-                readings = pick_rows(inputs.readings, trial, pose)
+                readings = _pick(inputs.readings, trial, pose)
                 driving.append(entries.by_reading(columns, readings, group))
                 sigma.append(_deviations(program, group, closed))
             weights = 1.0 / np.concatenate(sigma) if program.sigma else None
@@ -66,6 +62,73 @@ def differentiate(
                 else:
                     part[:, freedoms] = np.matmul(steps, right)
     return by_parameter.reshape(t, n, 6, p), by_reading.reshape(t, n, 6, a)
+
+
+class _Entries(NamedTuple):
+    """Entries of a map that move the k limbs of a group, sorted by limb and parameter.
+
+    limb, column, parameter : (z,); columns are the slots, then the driven joints. coefficient :
+    (t | 1, z). basis : (t | 1, n | 1, z), one for displacements. driven : the driven joints.
+    """
+
+    limb: IntArray
+    column: IntArray
+    parameter: IntArray
+    coefficient: FloatArray
+    basis: FloatArray
+    driven: tuple[int, ...]
+
+    def by_parameter(
+        self, columns: FloatArray, p: int, trial: IntArray, pose: IntArray
+    ) -> FloatArray:
+        """Return the rows of all limbs by p parameters, (N, r k, p), of columns (N, r, c, k)."""
+        N, r, c, k = columns.shape
+        factor = _pick(self.basis, trial, pose) * _pick(self.coefficient, trial)
+        values = columns.reshape(N, r, c * k)[..., self.column * k + self.limb] * factor[:, None]
+        target = self.limb * p + self.parameter
+        begin = np.flatnonzero(np.diff(target, prepend=-1))
+        if len(begin) < len(target):  # several entries of one parameter in one limb
+            values, target = np.add.reduceat(values, begin, axis=2), target[begin]
+        out = np.zeros((N, r, k * p))
+        out[..., target] = values
+        return out.reshape(N, r * k, p)
+
+    def by_reading(self, columns: FloatArray, readings: FloatArray, group: Group) -> FloatArray:
+        """Return the rows by a readings, (N, r k, a), of columns (N, r, c, k)."""
+        N, r, _, k = columns.shape
+        out = np.zeros((N, r, k, readings.shape[-1]))
+        for i, j in enumerate(self.driven):
+            actuator = group.actuator[j]
+            slopes = columns[:, :, len(group.slots) + i] * readings[:, None, actuator]
+            out[:, :, np.arange(k), actuator] += slopes
+        return out.reshape(N, r * k, -1)
+
+
+def _pick(array: FloatArray, *rows: IntArray) -> FloatArray:
+    """Return the rows of an array whose leading axes may be 1 and then broadcast."""
+    return array[
+        tuple(i if length > 1 else 0 * i[:1] for i, length in zip(rows, array.shape, strict=False))
+    ]
+
+
+def _select_entries(group: Group, inputs: ParameterMap) -> _Entries:
+    """Return the entries of a group."""
+    pattern, slots = inputs.pattern, len(group.slots)
+    place, parameter = pattern.displacements.T
+    own = np.flatnonzero((place >= group.columns.start) & (place < group.columns.stop))
+    limb, column = np.divmod(place[own] - group.columns.start, max(slots, 1))
+    ones = np.ones((*inputs.basis.shape[:2], len(own)))
+    parts = [(limb, column, parameter[own], inputs.displacements[:, own], ones)]
+    driven = tuple(np.flatnonzero(group.actuator[:, 0] >= 0).tolist())
+    joint, function, parameter = pattern.joints.T
+    for i, j in enumerate(driven):
+        limb, own = np.nonzero(group.actuator[j][:, None] == joint)
+        basis = inputs.basis[:, :, joint[own], function[own]]
+        column = np.full(len(own), slots + i)
+        parts.append((limb, column, parameter[own], inputs.joints[:, own], basis))
+    arrays = [np.concatenate(of_all, axis=-1) for of_all in zip(*parts, strict=True)]
+    order = np.lexsort((arrays[2], arrays[0]))
+    return _Entries(*(array[..., order] for array in arrays), driven=driven)
 
 
 class _ClosedRows(NamedTuple):
