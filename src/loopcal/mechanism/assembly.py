@@ -203,17 +203,16 @@ class Assembly:
 
     Attributes
     ----------
-    name, source : for people. limbs, actuators : in the order of tables.
+    name, source : for people. limbs, actuators : in the order of readings and tables.
     freedoms : those of the platform, of AXES in base axes. controlled : coordinates in which the
         machine is commanded.
     home : (4, 4) T_base_platform of the home pose; only its controlled coordinates must be exact.
     tool : (4, 4) T_platform_tool. workspace : coordinate -> (low, high) [m, rad].
     parameters, maps, shared : the unknowns and their maps.
-    stored_parameters : names of the parameters that the controller of the machine stores, so that a
-        calibration can be entered there; empty where they are not known.
+    stored_parameters : names of the parameters that the controller stores; empty if not known.
     common_errors : errors that several parameters share.
     stages : of a chain, each after the one that it is attached to; the fields above are those of
-        all stages together, with the name of the stage before the name of a limb or parameter.
+        all stages together, with the name of the stage before those of limbs and parameters.
     closure : of over-constrained loops, `exact` or `least-squares`.
     """
 
