@@ -131,12 +131,13 @@ def _look_up(name: str, data: Mapping[str, Any]) -> Any:
     """Return the value of a field: data, a phrase, or the text of another finding."""
     if not name.endswith("()"):
         return _PYTHON.get_field(name, (), data)[0]
-    from loopcal.findings.catalog import conformity_phrases, find_entry, phrases
+    from loopcal.findings.catalog import conformity_phrases, find_entry, mechanism_phrases, phrases
 
     name = name.removesuffix("()")
     if "." in name:
         return find_entry(name).word(data)
-    module = phrases if hasattr(phrases, name) else conformity_phrases
+    modules = phrases, conformity_phrases, mechanism_phrases
+    module = next(m for m in modules if hasattr(m, name))
     return getattr(module, name)(data)
 
 

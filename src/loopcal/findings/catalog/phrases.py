@@ -364,21 +364,6 @@ def impossible_motions(data: Data) -> str:
     return ", ".join(motion({"motion": freedoms}) for freedoms in data["motions"])
 
 
-def repeated_constraints(data: Data) -> str:
-    """Return which limbs prevent which motions that other limbs prevent, too."""
-    words = []
-    for entry in data["repeated"]:
-        prevented = [
-            f"{'rotation about' if d['turns'] else 'translation along'} "
-            + (d["name"] or "({:g}, {:g}, {:g})".format(*d["vector"]))
-            for d in entry["directions"]
-        ]
-        others = list_names(list(entry["others"]))
-        verb = "do together" if len(entry["others"]) > 1 else "does"
-        words.append(f"limb {entry['limb']} prevents {list_names(prevented)}, as {others} {verb}")
-    return "; ".join(words)
-
-
 def violations(data: Data) -> str:
     """Return violated constraints with their counts, such as `tilt above 12 deg (34)`."""
     words = []
