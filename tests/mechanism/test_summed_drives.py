@@ -11,8 +11,8 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from loopcal.errors import FileError, MechanismError
-from loopcal.io.robot.robot_file import load_robot
-from loopcal.measure import select_joint_values
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, select_joint_values, simulate
 from loopcal.mechanism import (
     Mechanism,
     Status,
@@ -24,9 +24,11 @@ from loopcal.mechanism import (
     forward,
     forward_trials,
     inverse,
+    jacobian,
     sample_workspace,
     solve_at_pose,
 )
+from loopcal.workflow import calibrate
 from tests.jacobians import central_difference, check_jacobian
 from tests.zoo import load_cached_robot
 
@@ -95,6 +97,24 @@ stages:
 """
 
 
+PLATE = """format: 1
+family: limbs
+name: plate
+units: {length: mm, angle: deg}
+freedoms: [x, y, rz]
+controlled: [x, y, yaw]
+actuators:
+  q1: {reads: length, sum: {m: 1, n: 1}, unknown: [weight.n], weights: {sd: 0.001}}
+  q2: {reads: length, sum: {m: 1, k: 2}}
+  q3: {reads: length, sum: {n: 1, h: 2}}
+limbs:
+  - {name: M, tip: [-1000, 800, 0], ending: distance, attach: [-150, -100, 0], actuated: m}
+  - {name: N, tip: [1000, 800, 0], ending: distance, attach: [-150, 100, 0], actuated: n}
+  - {name: K, tip: [-1000, -700, 0], ending: distance, attach: [150, -100, 0], actuated: k}
+  - {name: H, tip: [1000, -700, 0], ending: distance, attach: [150, 100, 0], actuated: h}
+"""
+
+
 def load_text(folder: Path, text: str) -> Mechanism:
     """Return the robot of a file with this text."""
     path = folder / "robot.yaml"
@@ -155,6 +175,71 @@ def test_a_joint_is_read_alone_and_in_a_sum(tmp_path: Path) -> None:
     T = forward(robot, q).T
     np.testing.assert_allclose(T[:, 0, 3], x, rtol=0, atol=1e-12)
     np.testing.assert_allclose(T[:, 0, 0], np.cos(yaw), rtol=0, atol=1e-12)
+
+
+def read_shipped(name: str) -> str:
+    """Return the file of a shipped robot."""
+    return list_shipped_robots()[name].read_text("utf-8")
+
+
+def test_a_differential_moves_a_closed_loop_like_its_motors(tmp_path: Path) -> None:
+    text = read_shipped("five-bar")
+    for name, sign in (("left", 1), ("right", -1)):
+        old = f"  {name}: {{reads: angle, "
+        text = text.replace(old, f"{old}sum: {{left: 1, right: {sign}}}, ")
+    robot, plain = load_text(tmp_path, text), load_cached_robot("five-bar")
+    sample = sample_workspace(plain, 100, seed=2)
+    left, right = sample.solution.q.T
+    q = np.column_stack([left + right, left - right])
+    solved = forward(robot, q)
+    assert solved.converged.all()
+    np.testing.assert_allclose(solved.T, sample.solution.T, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(inverse(robot, solved.T).q, q, rtol=0, atol=1e-11)
+    half = np.array([[0.5, 0.5], [0.5, -0.5]])
+    slope = jacobian(plain, sample.solution.q).readings @ half
+    np.testing.assert_allclose(jacobian(robot, q).readings, slope, rtol=0, atol=1e-11)
+
+
+def test_a_shared_drive_can_be_in_sums(tmp_path: Path) -> None:
+    text = read_shipped("linear-delta-6")
+    old = text[text.index("  q: {reads") :].split("\n")[0]
+    new = """  m1: {reads: length, sum: {q1: 1, q2: 1}}
+  m2: {reads: length, sum: {q1: 1, q2: -1}}
+  m3: {reads: length, sum: {q2: 0.25, q3: 1}}"""
+    robot, plain = (
+        load_text(tmp_path, text.replace(old, new)),
+        load_cached_robot("linear-delta-6"),
+    )
+    there = inverse(plain, np.array([[0.02, -0.03, 0.1], [0.0, 0.05, 0.05]]))
+    height = 0.493326149 - there.q
+    wanted = height @ np.array([[1, 1, 0], [1, -1, 0], [0, 0.25, 1]]).T
+    solved = forward(robot, wanted)
+    assert solved.converged.all()
+    np.testing.assert_allclose(solved.T, there.T, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(inverse(robot, there.T).q, wanted, rtol=0, atol=1e-10)
+
+
+def test_the_complete_error_model_has_the_offsets_of_the_sums(tmp_path: Path) -> None:
+    text = f"{PLATE}error_model: complete\ntolerances: {{lengths: {{sd: 1}}, angles: {{sd: 1}}}}\n"
+    robot = load_text(tmp_path, text)
+    offsets = [name for name in robot.parameters.names if name.endswith(".offset")]
+    assert offsets == ["q1.offset", "q2.offset", "q3.offset"]
+
+
+def test_uncertain_readings_of_sums_are_estimated(tmp_path: Path) -> None:
+    robot = load_cached_robot("pulley-3")
+    noise = Gaussian(np.repeat([5e-5, 1e-5], 3))  # [rad, m]
+    instrument = Instrument((Sensor(Pose("rotation-vector"), noise),))
+    coordinates = sample_workspace(robot, 30, seed=3).coordinates
+    truth = draw_errors(robot, 4)
+    data = simulate(truth, coordinates, instrument, 5, reading_sigma=np.full(3, 1e-5))
+    report = calibrate(robot, data)
+    spread = report.identification.standard_deviations
+    error = (report.robot.values - truth.values) / spread
+    # 14 values with the mean square 1 +- sqrt(2 / 14), 2.6 times that
+    assert np.mean(error**2) < 1 + 2.6 * np.sqrt(2 / 14)
+    assert report.reading_errors is not None
+    assert [error.name for error in report.reading_errors] == ["q1", "q2", "q3"]
 
 
 def test_the_arm_on_the_page_of_robots_is_that_of_its_formula(tmp_path: Path, root: Path) -> None:
@@ -373,22 +458,6 @@ def test_sums_of_a_stage_are_solved_in_the_chain(tmp_path: Path) -> None:
 # --- mistakes
 
 
-PLATE = """format: 1
-family: limbs
-name: plate
-units: {length: mm, angle: deg}
-freedoms: [x, y, rz]
-controlled: [x, y, yaw]
-actuators:
-  q1: {reads: length, sum: {m: 1, n: 1}, unknown: [weight.n], weights: {sd: 0.001}}
-  q2: {reads: length, sum: {m: 1, k: 2}}
-  q3: {reads: length, sum: {n: 1, h: 2}}
-limbs:
-  - {name: M, tip: [-1000, 800, 0], ending: distance, attach: [-150, -100, 0], actuated: m}
-  - {name: N, tip: [1000, 800, 0], ending: distance, attach: [-150, 100, 0], actuated: n}
-  - {name: K, tip: [-1000, -700, 0], ending: distance, attach: [150, -100, 0], actuated: k}
-  - {name: H, tip: [1000, -700, 0], ending: distance, attach: [150, 100, 0], actuated: h}
-"""
 SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, sum: {n: 1, h: 2}}"
 
 

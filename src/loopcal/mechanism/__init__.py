@@ -114,6 +114,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism.transmission import nominal_terms as nominal_terms
     from loopcal.mechanism.transmission import readings_from_joints as readings_from_joints
     from loopcal.mechanism.transmission import term_derivatives as term_derivatives
+    from loopcal.mechanism.transmission import transmit_readings as transmit_readings
     from loopcal.mechanism.triangle import TRIANGLE_TERMS as TRIANGLE_TERMS
     from loopcal.mechanism.triangle import compute_range as compute_range
     from loopcal.mechanism.triangle_anchors import locate_anchors as locate_anchors
@@ -172,7 +173,7 @@ else:
             "loopcal.mechanism.states": "Status compute_limb_frames driven_values select_poses",
             "loopcal.mechanism.transmission": """
                 TERMS WEIGHT harmonic_frequencies joint_slopes joints_from_readings nominal_terms
-                readings_from_joints term_derivatives
+                readings_from_joints term_derivatives transmit_readings
             """,
             "loopcal.mechanism.triangle": "TRIANGLE_TERMS compute_range",
             "loopcal.mechanism.triangle_anchors": "locate_anchors",

@@ -133,9 +133,15 @@ def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> Float
     The angle of a triangle drive is NaN where no angle reaches its length. Summed drives must have
     as many readings as joints.
     """
-    values = evaluate_sums(q, tau, w)
+    values = transmit_readings(q, tau, w)
     if (weights := select_weights(tau)) is not None:
         return apply_weights(invert_weights(weights), values)
+    return values
+
+
+def transmit_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return what the transmissions give (t, n, a): joint values, and of summed drives the sums."""
+    values = evaluate_sums(q, tau, w)
     triangles = find_triangles(tau)
     if len(triangles):
         values = np.array(values)
@@ -250,7 +256,7 @@ def _evaluate_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArra
 
 def _select_triangles(tau: FloatArray, triangles: IntArray) -> FloatArray:
     """Return the terms (t | 1, 1, k, 10) of triangles."""
-    return tau[:, None, triangles, len(TERMS) :]
+    return tau[:, None, triangles, len(TERMS) : len(ALL_TERMS)]
 
 
 def _differentiate_triangles(

@@ -8,7 +8,7 @@ import numpy as np
 from loopcal.engine import State
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import compute_limb_frames, driven_values
-from loopcal.mechanism.transmission import TERMS
+from loopcal.mechanism.transmission import ALL_TERMS, TERMS
 from loopcal.mechanism.triangle import turn_head
 from loopcal.typing import FloatArray
 from loopcal.value_classes import dataclass
@@ -31,6 +31,7 @@ class Anchors:
 def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
     """Return the anchors of all triangle drives at a state (1, n)."""
     column = {a.name: i for i, a in enumerate(robot.actuators) if a.is_triangle}
+    place = {name: i for i, name in enumerate(robot.assembly.driven_joints)}
     if not column:
         return ()
     _, tau = robot.slots(robot.values[None])
@@ -40,8 +41,8 @@ def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
     for i, limb in enumerate(robot.assembly.limbs):
         for j, joint in enumerate(limb.joints):
             if joint.actuator in column:
-                triangle = tau[0, column[joint.actuator], len(TERMS) :]
-                head = turn_head(angles[:, column[joint.actuator]], triangle)
+                triangle = tau[0, column[joint.actuator], len(TERMS) : len(ALL_TERMS)]
+                head = turn_head(angles[:, place[joint.actuator]], triangle)
                 foot = np.broadcast_to(triangle[:3], head.shape)
                 own, T = np.stack([foot, head], axis=1), frames[i][0, :, j]
                 points = own @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3]

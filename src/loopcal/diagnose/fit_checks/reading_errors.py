@@ -14,7 +14,7 @@ import numpy as np
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
-from loopcal.mechanism import Mechanism, joints_from_readings
+from loopcal.mechanism import Mechanism, transmit_readings
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 from loopcal.value_classes import dataclass
@@ -62,6 +62,10 @@ def compute_reading_errors(
     )
     limbs = robot.assembly.limbs
     turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
+    dimensions = [
+        Dimension.LENGTH if turning.isdisjoint(a.driven_joints) else Dimension.ANGLE
+        for a in robot.actuators
+    ]
     errors = []
     for i, actuator in enumerate(robot.actuators):
         if not compared[:, i].any():
@@ -74,7 +78,7 @@ def compute_reading_errors(
                 reading=float(np.sqrt(np.nanmean(reading[:, i] ** 2))),
                 reading_dimension=actuator.dimension,
                 joint=float(np.sqrt(np.nanmean(joint[:, i] ** 2))),
-                joint_dimension=Dimension.ANGLE if actuator.name in turning else Dimension.LENGTH,
+                joint_dimension=dimensions[i],
                 largest=float(joint[worst, i]),
                 pose=fit.poses.labels[worst],
             )
@@ -83,6 +87,6 @@ def compute_reading_errors(
 
 
 def _joint_values(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Return the values (n, a) of the driven joints at these readings."""
+    """Return the values (n, a) of the driven joints, or their sums, at these readings."""
     _, tau = robot.slots(robot.values[None])
-    return joints_from_readings(readings[None], tau, robot.slots.frequency)[0]
+    return transmit_readings(readings[None], tau, robot.slots.frequency)[0]

@@ -132,14 +132,15 @@ def join_stages(
                 "make it part of the mount of the next stage",
                 i,
             )
-        for actuator in stage.assembly.actuators:
-            if actuator.name in owner:
+        own = dict.fromkeys(n for a in stage.assembly.actuators for n in (a.name, *a.driven_joints))
+        for drive in own:
+            if drive in owner:
                 raise StageError(
-                    f"actuator {actuator.name!r} drives the stages {owner[actuator.name]!r} and "
-                    f"{stage.name!r}; give each stage its own drives",
+                    f"actuator {drive!r} drives the stages {owner[drive]!r} and {stage.name!r}; "
+                    "give each stage its own drives",
                     i,
                 )
-            owner[actuator.name] = stage.name
+        owner |= dict.fromkeys(own, stage.name)
     parts = [(stage.name, stage.assembly) for stage in stages]
     return Assembly(
         name,
