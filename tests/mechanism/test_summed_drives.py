@@ -97,6 +97,30 @@ stages:
 """
 
 
+ARM = """format: 1
+family: stages
+name: coupled-arm
+units: {length: mm, angle: deg}
+controlled: [x, z, yaw, roll]
+stages:
+  - {name: j1, joint: {kind: R, axis: z, start: 20}}
+  - name: wrist
+    mount: {x: 200}
+    family: limbs
+    actuators:
+      m4: {reads: angle, sum: {j4: 50}, gain: 50}
+      m5: {reads: angle, sum: {j5: 1, j4: 0.02}, unknown: [weight.j4], weights: {sd: 0.001}}
+      m6: {reads: angle, sum: {j6: 1, j5: -0.5, j4: 0.01}}
+    limbs:
+      - name: hand
+        ending: rigid
+        chain:
+          - {joint: R, name: d, axis: x, actuated: j4, start: 10}
+          - {joint: R, name: e, at: [200, 0, 0], axis: y, actuated: j5, start: 30}
+          - {joint: R, name: f, at: [80, 0, 0], axis: x, actuated: j6, start: 20}
+        tip: [20, 0, 0]
+"""
+
 PLATE = """format: 1
 family: limbs
 name: plate
@@ -420,6 +444,25 @@ def test_assembly_modes_of_sums_have_the_readings_of_home() -> None:
     for T in modes.T:
         y = np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
         np.testing.assert_allclose(compute_readings(robot, y, robot.values), home, atol=1e-9)
+
+
+def test_a_coupled_wrist_ends_a_chain(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, ARM)
+    q = np.random.default_rng(12).uniform(-1.5, 1.5, (50, 4))
+    solved = forward(robot, q)
+    weights = np.array([[50.0, 0.0, 0.0], [0.02, 1.0, 0.0], [0.01, -0.5, 1.0]])
+    for i, (first, *motors) in enumerate(q):
+        wrist = np.linalg.solve(weights, np.multiply([50.0, 1.0, 1.0], motors))
+        upper = Rotation.from_euler("ZX", [first, wrist[0]])
+        fore = upper * Rotation.from_euler("Y", wrist[1])
+        turn = fore * Rotation.from_euler("X", wrist[2])
+        end = upper.apply([0.4, 0, 0]) + fore.apply([0.1, 0, 0])
+        np.testing.assert_allclose(solved.T[i, :3, :3], turn.as_matrix(), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(solved.T[i, :3, 3], end, rtol=0, atol=1e-12)
+    near = forward(robot, inverse(robot, robot.home[None]).q + 0.1 * q[:10])
+    back = inverse(robot, near.T)
+    assert back.converged.all()
+    np.testing.assert_allclose(back.q, near.q, rtol=0, atol=1e-9)
 
 
 def test_the_sign_of_closure_is_that_of_the_derivative_of_the_sums() -> None:
