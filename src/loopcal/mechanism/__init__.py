@@ -60,14 +60,14 @@ if TYPE_CHECKING:
     from loopcal.mechanism.families.records import standard_deviation as standard_deviation
     from loopcal.mechanism.kinematics import Jacobian as Jacobian
     from loopcal.mechanism.kinematics import Solution as Solution
-    from loopcal.mechanism.kinematics import (
-        differentiate_by_coordinates as differentiate_by_coordinates,
-    )
     from loopcal.mechanism.kinematics import forward as forward
     from loopcal.mechanism.kinematics import inverse as inverse
     from loopcal.mechanism.kinematics import jacobian as jacobian
     from loopcal.mechanism.kinematics import make_solution as make_solution
     from loopcal.mechanism.model import Mechanism as Mechanism
+    from loopcal.mechanism.nearest_pose import (
+        differentiate_by_coordinates as differentiate_by_coordinates,
+    )
     from loopcal.mechanism.over_constraint import fix_breaking_parameters as fix_breaking_parameters
     from loopcal.mechanism.over_constraint import refuse_drawn_errors as refuse_drawn_errors
     from loopcal.mechanism.over_constraint import (
@@ -147,10 +147,10 @@ else:
                 Workspace match_parameter_names standard_deviation
             """,
             "loopcal.mechanism.kinematics": """
-                Jacobian Solution differentiate_by_coordinates forward inverse jacobian
-                make_solution
+                Jacobian Solution forward inverse jacobian make_solution
             """,
             "loopcal.mechanism.model": "Mechanism",
+            "loopcal.mechanism.nearest_pose": "differentiate_by_coordinates",
             "loopcal.mechanism.over_constraint": """
                 fix_breaking_parameters refuse_drawn_errors refuse_free_breaking_parameters
             """,

@@ -50,6 +50,8 @@ from loopcal.mechanism.transmission import (
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
+ITERATIONS = 60
+"""Newton steps of an inverse solution, each at most half of the robot's size."""
 ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
 
 
@@ -164,21 +166,35 @@ def inverse_trials(
 
 
 def close_at_coordinates(
-    robot: Mechanism, values: FloatArray, target: FloatArray, start: State | None = None
+    robot: Mechanism,
+    values: FloatArray,
+    target: FloatArray,
+    start: State | None = None,
+    follow: bool = True,
+    max_iterations: int = ITERATIONS,
 ) -> State:
-    """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states."""
+    """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states.
+
+    Without `follow`, and with few iterations, rows that fail cost less.
+    """
     begin = start or robot.home_state
     if not target.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(target)))
     if robot.stages:
-        return solve_readings(robot, values, target, begin, forward_trials, differentiate_pose)
+        functions = forward_trials, differentiate_pose
+        return solve_readings(robot, values, target, begin, *functions, follow=follow)
     if needs_readings(robot.program):
-        return _inverse_by_readings(robot, values, target, begin)
-    return _close_with_free_actuators(robot, values, target, begin, start)
+        return _inverse_by_readings(robot, values, target, begin, follow)
+    return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
 
 
 def _close_with_free_actuators(
-    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State, start: State | None
+    robot: Mechanism,
+    values: FloatArray,
+    target: FloatArray,
+    begin: State,
+    start: State | None,
+    max_iterations: int = ITERATIONS,
 ) -> State:
     """Return states (t, n) at controlled coordinates, with every actuated joint free.
 
@@ -189,7 +205,8 @@ def _close_with_free_actuators(
     T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
     if determine_platform(robot):
         limbs = robot.program.with_fixed_platform
-        return engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
+        start = replace(begin, T=T)
+        return engine.solve(limbs, e, guess, start, free=True, max_iterations=max_iterations)
     t, n = max(len(values), len(target)), target.shape[1]
     flat = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
 
@@ -198,7 +215,8 @@ def _close_with_free_actuators(
 
     guess = np.broadcast_to(guess, (t, n, len(robot.actuators)))
     T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
-    return engine.solve(robot.program, e, guess, replace(begin, T=T), command, free=True)
+    begin = replace(begin, T=T)
+    return engine.solve(robot.program, e, guess, begin, command, True, max_iterations)
 
 
 def determine_platform(robot: Mechanism) -> bool:
@@ -262,7 +280,7 @@ def count_shared_drives(program: Program) -> int:
 
 
 def _inverse_by_readings(
-    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State
+    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State, follow: bool
 ) -> State:
     """Return states (t, n) at controlled coordinates (t | 1, n, c) by their readings.
 
@@ -284,6 +302,7 @@ def _inverse_by_readings(
         forward_trials,
         differentiate_pose,
         partial(_propose_state, robot),
+        follow,
     )
 
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forward and inverse kinematics and the Jacobian of a robot, with a status for every row.
 
-A full pose that a machine with fewer freedoms cannot take is projected: Gauss-Newton on
-|log(R R*')|^2 size^2 + |t - t*|^2 along the controlled coordinates, with slopes from closure
-linearized with every actuator free. Source: docs/theory/kinematics.md.
+A full pose that a machine with fewer freedoms cannot take is projected (`nearest_pose`). Source:
+docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -14,23 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal import engine, geometry
+from loopcal import geometry
 from loopcal.engine import State
 from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.batch_kinematics import (
-    close_at_coordinates,
-    compute_readings,
-    forward_trials,
-    needs_readings,
-)
-from loopcal.mechanism.limb_rows import name_passive_joints, stack_platform_rows
+from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials
+from loopcal.mechanism.limb_rows import name_passive_joints
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.nearest_pose import controls_all, find_nearest_reachable
+from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.mechanism.solution_modes import reach_coordinates, solve_in_mode
-from loopcal.mechanism.states import Status, is_closed, replace_rows, select_poses, select_rows
+from loopcal.mechanism.states import Status, is_closed, select_poses
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
@@ -40,8 +35,6 @@ COMPROMISE = 1e-9
 """Residual [m] of a converged row above which its redundant readings contradict each other."""
 ROTATION = 1e-6
 """Largest deviation of R'R from the identity: the rounding of a file with seven digits."""
-PROJECTION_STEPS = 12
-"""Gauss-Newton steps of a projection."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -273,70 +266,13 @@ def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = Non
     )
 
 
-def find_nearest_reachable(
-    robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
-) -> State:
-    """Return states (t, n) with the reachable pose nearest to T (t | 1, n, 4, 4), without signs."""
-    state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
-    if _controls_all(robot) or not state.T.size:
-        return state
-    alive = is_closed(state.status)
-    for _ in range(PROJECTION_STEPS):
-        gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))
-        slope = np.nan_to_num(differentiate_by_coordinates(robot, values, state))  # of open rows
-        inverse_slope = np.linalg.pinv(slope * robot.twist_scale[:, None])
-        step = np.nan_to_num(inverse_slope @ (-gap * robot.twist_scale)[..., None])[..., 0]
-        moved = geometry.apply_twist(state.T, np.matmul(slope, step[..., None])[..., 0])
-        target = read_coordinates(moved, robot.controlled)
-        target[~alive] = np.nan
-        new = close_at_coordinates(robot, values, target, state)
-        alive &= is_closed(new.status)
-        rows = np.nonzero(alive)
-        state = replace_rows(state, *rows, select_rows(new, alive.shape, *rows))
-        if np.abs(step[alive]).max(initial=0.0) < 1e-12 * robot.size:
-            break
-    return state
-
-
 def _reach_pose(
     robot: Mechanism, T: FloatArray, start: State | None
 ) -> tuple[State, BoolArray | None]:
     """Return what `reach_coordinates` returns, for poses (n, 4, 4)."""
-    if _controls_all(robot):
+    if controls_all(robot):
         return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
     return find_nearest_reachable(robot, robot.values[None], T[None], start), None
-
-
-def _controls_all(robot: Mechanism) -> bool:
-    """Return whether the controlled coordinates state each freedom of the platform."""
-    return len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms)
-
-
-def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
-    """Return d twist / d coordinate (t, n, 6, c), every actuator free [1/m, 1].
-
-    Coordinates are in the units of `compare_coordinates`.
-    """
-    names, freedoms = robot.controlled, list(robot.program.freedoms)
-    t, n = state.T.shape[:2]
-    flat = state.T.reshape(-1, 4, 4)
-    _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
-    columns = columns.reshape(t, n, len(names), 6)
-    if robot.stages or needs_readings(robot.program):
-        q = compute_readings(robot, values, state)
-        D = differentiate_pose(robot, values, q, state).readings
-        return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))
-    e, _ = robot.slots(values)
-    unused = np.zeros((1, n, robot.program.n_joints))
-    rows = stack_platform_rows(engine.linearize(robot.program, e, unused, state, free=True))
-    both = np.concatenate([rows, columns[..., freedoms]], axis=2)
-    right = np.zeros((*both.shape[:3], len(names)))
-    right[:, :, rows.shape[2] :] = np.eye(len(names))
-    out = np.zeros((t, n, 6, len(names)))
-    good = np.asarray(np.isfinite(both).all(axis=(-1, -2)))
-    solved = np.matmul(np.linalg.pinv(both[good]), right[good])
-    out[good[..., None] & np.isin(np.arange(6), freedoms)] = solved.reshape(-1, len(names))
-    return out
 
 
 def check_arguments(function: str, robot: object, start: object = None) -> State | None:

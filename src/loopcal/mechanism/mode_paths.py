@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -48,34 +47,40 @@ Step = Callable[[IntArray, FloatArray, State], State]
 """Returns states (1, j) at shares (j,) of the paths of rows (j,), from states on these paths."""
 
 
-class Connection(NamedTuple):
-    """States (1, k), and whether (k,) a path of readings, else a path of poses leads to them."""
+def connect_by_readings(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
+    """Follow the straight paths of joint values from states `first` (1, k | 1) to `last` (1, k).
 
-    state: State
-    by_readings: BoolArray
-    by_poses: BoolArray
-
-
-def connect_states(robot: Mechanism, first: State, last: State) -> Connection:
-    """Look for safe paths from states `first` (1, k) or (1, 1) to states `last` (1, k).
-
-    They are the straight path of joint values, and where it does not lead to the pose that of
-    poses. No step meets a singularity. Passive joints become those at the end of the path.
+    Returns
+    -------
+    state : (1, k) the last states, with the passive joints at the end of a path.
+    connected : (k,) rows that a single safe step or a path without a singularity leads to.
     """
-    state, connected = last, contracts(robot, first, last)
-    repeated, ways = repeat_poses(first, len(connected)), [connected]
-    for path in (_move_readings, _move_poses):
-        rows = np.flatnonzero(~connected)
-        way = np.zeros_like(connected)
-        if len(rows):
-            start, goal = select_poses(repeated, rows), select_poses(last, rows)
-            end, arrived = _follow_path(robot, start, path(robot, start, goal))
-            arrived &= _is_same_pose(robot, end, goal)
-            way[rows] = arrived
-            state = _take_joints(robot, state, rows[arrived], select_poses(end, arrived))
-        connected = connected | way
-        ways.append(way)
-    return Connection(state, ways[0] | ways[1], ways[2])
+    return _connect(robot, first, last, contracts(robot, first, last), _move_readings)
+
+
+def connect_by_poses(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
+    """Follow the straight paths of poses, and return what `connect_by_readings` returns."""
+    return _connect(robot, first, last, np.zeros(last.T.shape[1], bool), _move_poses)
+
+
+def _connect(
+    robot: Mechanism,
+    first: State,
+    last: State,
+    connected: BoolArray,
+    path: Callable[[Mechanism, State, State], Step],
+) -> tuple[State, BoolArray]:
+    """Return the last states and which are connected by a kind of path, if not already."""
+    rows = np.flatnonzero(~connected)
+    if not len(rows):
+        return last, connected
+    start = select_poses(repeat_poses(first, len(connected)), rows)
+    goal = select_poses(last, rows)
+    end, arrived = _follow_path(robot, start, path(robot, start, goal))
+    arrived &= _is_same_pose(robot, end, goal)
+    connected = connected.copy()
+    connected[rows] = arrived
+    return _take_joints(robot, last, rows[arrived], select_poses(end, arrived)), connected
 
 
 def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
@@ -135,7 +140,8 @@ def _move_poses(robot: Mechanism, first: State, last: State) -> Step:
     def step(rows: IntArray, share: FloatArray, current: State) -> State:
         via = geometry.apply_twist(first.T[0, rows], share[:, None] * twist[rows])
         target = read_coordinates(via, robot.controlled)
-        return close_at_coordinates(robot, values, target[None], current)
+        cheap = {"follow": False, "max_iterations": ITERATIONS}
+        return close_at_coordinates(robot, values, target[None], current, **cheap)
 
     return step
 

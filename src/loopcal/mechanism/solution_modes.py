@@ -26,7 +26,14 @@ from loopcal.mechanism.batch_kinematics import (
     forward_trials,
     needs_readings,
 )
-from loopcal.mechanism.mode_paths import SAME_JOINTS, connect_states, measure_distance, repeat_poses
+from loopcal.mechanism.mode_paths import (
+    ITERATIONS,
+    SAME_JOINTS,
+    connect_by_poses,
+    connect_by_readings,
+    measure_distance,
+    repeat_poses,
+)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
 from loopcal.mechanism.reading_paths import clear_sign
@@ -57,22 +64,48 @@ def solve_in_mode(
     begin = start or robot.home_state
     state, arrives = solve(target, start)
     state, is_other = judge_modes(robot, state, begin, arrives)
+    state = _mark_other(state, is_other)
     rows = np.flatnonzero(is_other)
-    if not len(rows):
+    if not len(rows) or has_one_solution(robot):
         return state
-    state = replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
     first = select_poses(repeat_poses(begin, len(is_other)), rows)
     near, arrived = _follow_poses(robot, first, state.T[0, rows])
-    if not len(arrived):
+    near, rows = _select_new(robot, near, state, rows[arrived])
+    if not len(rows):
         return state
-    again, _ = solve(target[rows[arrived]], near)
-    if not robot.stages:  # what was judged is not judged again
-        is_new = measure_distance(robot, again, select_poses(state, rows[arrived])) > SAME_JOINTS
-        again, arrived = select_poses(again, is_new), arrived[is_new]
-    again, still_other = judge_modes(robot, again, select_poses(first, arrived))
+    again, rows = _select_new(robot, solve(target[rows], near)[0], state, rows)
+    if not len(rows):
+        return state
+    first = select_poses(repeat_poses(begin, len(is_other)), rows)
+    again, still_other = judge_modes(robot, again, first)
     good = (again.status[0] == Status.CONVERGED) & ~still_other
-    rows, new = rows[arrived[good]], select_poses(again, good)
+    rows, new = rows[good], select_poses(again, good)
     return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+
+
+def _select_new(
+    robot: Mechanism, again: State, state: State, rows: IntArray
+) -> tuple[State, IntArray]:
+    """Return the solutions (1, k) of rows (k,) that are not those of a state, and their rows.
+
+    What was judged is not judged again.
+    """
+    if robot.stages or not len(rows):
+        return again, rows
+    is_new = measure_distance(robot, again, select_poses(state, rows)) > SAME_JOINTS
+    return select_poses(again, is_new), rows[is_new]
+
+
+def _mark_other(state: State, is_other: BoolArray) -> State:
+    """Return a state (1, n) with the status of another mode in some rows (n,)."""
+    return replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
+
+
+def has_one_solution(robot: Mechanism) -> bool:
+    """Return whether a pose has one set of readings, whatever the start: those of driven rods."""
+    if robot.stages or not determine_platform(robot):
+        return False
+    return all(g.ending == "distance" and g.actuator[-1, 0] >= 0 for g in robot.program.groups)
 
 
 def reach_coordinates(
@@ -163,23 +196,31 @@ def _is_near(robot: Mechanism, a: State, b: State) -> BoolArray:
 def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
     """Return goals (1, k) of the right sign, and which of them `first` (1, k | 1) does not lead to.
 
-    Newton's method must lead to the pose of a goal from its readings, and a safe path too. Where it
-    needs a path of readings, this is the same path.
+    Newton's method must lead to the pose of a goal from its readings, and a safe path too. A path
+    of readings is both. Where it ends before its goal, forward kinematics may still return along
+    larger steps, and a path of poses exist.
     """
     returns, needs_path = _solve_from(robot, first, goal)
-    is_other = ~(returns | needs_path)
-    rows = np.flatnonzero(~is_other)
-    if not len(rows):
-        return goal, is_other
-    start = select_poses(repeat_poses(first, len(is_other)), rows)
-    found = connect_states(robot, start, select_poses(goal, rows))
-    is_other[rows] = ~(found.by_readings | found.by_poses)
-    state = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(found.state, len(rows), 1))
-    unsure = found.by_poses & needs_path[rows]
-    if unsure.any():
-        start, rows = select_poses(start, unsure), rows[unsure]
-        is_other[rows] = ~_solve_from(robot, start, select_poses(goal, rows), follow=True)[0]
-    return state, is_other
+    start, is_other = repeat_poses(first, len(returns)), np.ones(len(returns), bool)
+    rows = np.flatnonzero(returns | needs_path)
+    for connect in (connect_by_readings, connect_by_poses):
+        if not len(rows):
+            break
+        found, connected = connect(robot, *_select_both(start, goal, rows))
+        goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(found, len(rows), 1))
+        is_other[rows] = ~connected
+        rows = rows[~connected]
+        unsure = rows[needs_path[rows]]
+        if connect is connect_by_readings and len(unsure):
+            ends = _select_both(start, goal, unsure)
+            returns[unsure] = _solve_from(robot, *ends, follow=True)[0]
+            rows = rows[returns[rows]]
+    return goal, is_other
+
+
+def _select_both(first: State, goal: State, rows: IntArray) -> tuple[State, State]:
+    """Return rows of two states (1, n)."""
+    return select_poses(first, rows), select_poses(goal, rows)
 
 
 def _solve_from(
@@ -204,7 +245,8 @@ def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State,
     for i in range(1, STEPS + 1):
         via = geometry.apply_twist(first.T[0, alive], (i / STEPS) * twist[alive])
         target = read_coordinates(via, robot.controlled)
-        current = close_at_coordinates(robot, values, target[None], current)
+        cheap = {"follow": False, "max_iterations": ITERATIONS}
+        current = close_at_coordinates(robot, values, target[None], current, **cheap)
         closed = current.status[0] == Status.CONVERGED
         current, alive = select_poses(current, closed), alive[closed]
         if not len(alive):

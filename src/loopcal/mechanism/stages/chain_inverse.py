@@ -29,6 +29,7 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.stages.chain_kinematics import PoseDerivative
+from loopcal.mechanism.stages.chain_reach import measure_target_excess
 from loopcal.mechanism.stages.chain_state import find_carrying_actuators
 from loopcal.mechanism.states import Status, driven_values
 from loopcal.mechanism.transmission import joint_slopes, readings_from_joints
@@ -38,8 +39,9 @@ from loopcal.value_classes import dataclass, replace
 
 STEPS = 60
 """Newton steps of a row."""
-CLOSE = 1e-12
-"""Distance from the target coordinates, relative to the robot's size, of a solved row.
+CLOSE, CLOSE_ON_PATH = 1e-12, 1e-4
+"""Distance from the target coordinates, relative to the robot's size, of a solved row, and of one
+that only begins the next step of its path.
 
 A forward solution is known to 1e-13 of the size.
 """
@@ -48,6 +50,11 @@ LONGEST_STEP = 0.5
 SHORTEST_SHARE = 1e-3
 """Share of a step that must bring a row closer to its target; below it the target is not
 reachable from here."""
+PROGRESS, PROGRESS_STEPS = 0.5, 10
+"""Share of its distance from the target that a row must lose in so many steps, else it has stalled.
+
+In this time the longest steps turn a joint by 5 rad. Steps close to a stretched arm gain less.
+"""
 PATH_STEPS = 8
 """Steps of the path from the start's pose to a target."""
 
@@ -164,19 +171,24 @@ class _Rows:
         longest = np.maximum(length.max(axis=1, initial=0.0), LONGEST_STEP)
         return step * (LONGEST_STEP / longest)[:, None]
 
-    def iterate(self, q: FloatArray, begin: State) -> _Iterate:
+    def iterate(self, q: FloatArray, begin: State, on_path: bool = False) -> _Iterate:
         """Return the last iterates from readings q (R, a); a row has arrived if its gap is small.
 
         The status of a row that has not arrived says why.
         """
         size, R = self.robot.size, len(q)
+        close = (CLOSE_ON_PATH if on_path else CLOSE) * size
         done = now = self.evaluate(q, begin)
         rows, alive, share, steps = self, np.arange(R), np.ones(R), np.zeros(R, np.int64)
         status = np.full(R, EXHAUSTED, np.int8)
+        before = now.gap
         for count in range(STEPS + 1):
-            arrived = now.gap <= CLOSE * size
+            arrived = now.gap <= close
             broken = ~np.isfinite(now.gap)
             end = arrived | broken | (share < SHORTEST_SHARE)
+            if count % PROGRESS_STEPS == 0 and count:
+                end |= now.gap > PROGRESS * before
+                before = now.gap
             if end.any() or count == STEPS:
                 status[alive[end]] = np.where(broken, NOT_FINITE, STALLED)[end]
                 status[alive[arrived]] = CONVERGED
@@ -186,9 +198,9 @@ class _Rows:
                 if not len(keep) or count == STEPS:
                     break
                 rows, now = rows.select(keep), rows.take(now, keep)
-                alive, share = alive[keep], share[keep]
+                alive, share, before = alive[keep], share[keep], before[keep]
             trial = rows.evaluate(now.q + share[:, None] * now.step, now.state)
-            better = trial.gap <= np.maximum((1 - 1e-4 * share) * now.gap, CLOSE * size)
+            better = trial.gap <= np.maximum((1 - 1e-4 * share) * now.gap, close)
             share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
             if better.all():
                 now = trial
@@ -213,12 +225,13 @@ def solve_readings(
     solve: ForwardSolver,
     differentiate: PoseDerivative,
     propose: Proposal | None = None,
+    follow: bool = True,
 ) -> State:
     """Return states (t, n) at controlled coordinates (t | 1, n, c); marks rows that fail.
 
     Rows are independent of each other. `solve` and `differentiate` are the forward kinematics and
     the derivatives of any robot. With `propose`, rows begin at the states that it returns, if these
-    converged.
+    converged. Without `follow`, rows that fail are not solved again along a path.
     """
     t, n = max(len(values), len(target)), target.shape[1]
     if not n:
@@ -234,11 +247,7 @@ def solve_readings(
     joints = driven_values(robot.program, first)
     q = readings_from_joints(joints, tau, robot.slots.frequency).reshape(t * n, -1)
     start = rows.evaluate(q, first)
-    found = rows.iterate(*_begin_near_targets(rows, q, first, propose))
-    wrong = np.flatnonzero(_is_wrong(found, start.sign) & np.isfinite(wanted).all(axis=1))
-    if len(wrong):
-        again = _follow_path(rows.select(wrong), rows.take(start, wrong))
-        found = rows.put(found, wrong, again)
+    found = _solve_within_reach(rows, start, first, propose, follow)
     status = found.state.status.ravel()
     status = np.where(
         (status == CONVERGED) & _is_in_other_mode(found, start.sign),
@@ -254,6 +263,32 @@ def solve_readings(
         residual=np.where(status == CONVERGED, 0.0, left).reshape(shape),
     )
     return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
+
+
+def _solve_within_reach(
+    rows: _Rows, start: _Iterate, first: State, propose: Proposal | None, follow: bool
+) -> _Iterate:
+    """Return the last iterates of rows from their start, whose forward solution began at `first`.
+
+    Rows whose target is farther away than the links span stay at the start.
+    """
+    is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
+    found = replace(start, state=_mark_stalled(start.state))
+    near = np.flatnonzero(is_near)
+    if not len(near):
+        return found
+    own, begin = rows.select(near), rows.take(replace(start, state=first), near)
+    direct = own.iterate(*_begin_near_targets(own, begin.q, begin.state, propose))
+    found = rows.put(found, near, direct)
+    wrong = near[_is_wrong(rows.take(found, near), start.sign[near])]
+    if not (follow and len(wrong)):
+        return found
+    return rows.put(found, wrong, _follow_path(rows.select(wrong), rows.take(start, wrong)))
+
+
+def _mark_stalled(state: State) -> State:
+    """Return a state whose rows have stalled."""
+    return replace(state, status=np.full_like(state.status, STALLED))
 
 
 def _begin_near_targets(
@@ -299,7 +334,7 @@ def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:
         via = geometry.apply_twist(T[alive], (i / PATH_STEPS) * twist[alive])
         target = read_coordinates(via, robot.controlled)
         part, begin = rows.select(alive), rows.take(now, alive)
-        moved = replace(part, target=target).iterate(begin.q, begin.state)
+        moved = replace(part, target=target).iterate(begin.q, begin.state, i < PATH_STEPS)
         now = rows.put(now, alive, moved)
         alive = alive[~_is_wrong(moved, start.sign[alive])]
         if not len(alive):
