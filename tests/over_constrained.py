@@ -92,6 +92,27 @@ workspace: {x: [-80, 80]}
 """A planar four-bar linkage described in space, with four R joints."""
 
 
+RAILS = """format: 1
+family: limbs
+name: rails
+source: ours
+units: {length: mm, angle: deg}
+controlled: [z]
+limbs:
+  - name: left
+    ending: rigid
+    chain: [{joint: P, name: rail, at: [-100, 0, 0], axis: z, start: 200}]
+    attach: [-100, 0, 0]
+  - name: right
+    ending: rigid
+    chain: [{joint: P, name: rail, at: [100, 0, 0], axis: z, start: 200}]
+    attach: [100, 0, 0]
+  - {name: ram, ending: distance, actuated: q}
+home: {z: 200}
+"""
+"""A table on two parallel rails, moved by a cylinder."""
+
+
 def load_text(folder: Path, text: str) -> Mechanism:
     """Return the robot of the text of a file."""
     path = folder / "robot.yaml"

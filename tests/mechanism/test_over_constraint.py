@@ -21,6 +21,7 @@ from loopcal.mechanism import (
     forward,
     forward_trials,
     inverse,
+    propose_added_joints,
 )
 from loopcal.mechanism.over_constraint import (
     find_breaking_parameters,
@@ -32,6 +33,7 @@ from loopcal.mechanism.states import driven_values
 from tests.over_constrained import (
     EXECHON,
     FOUR_BAR,
+    RAILS,
     close_by_least_squares,
     load_text,
     solve_exechon,
@@ -205,3 +207,60 @@ def test_least_squares_closure_without_repeated_equations_changes_nothing(tmp_pa
     assert asked.program.may_stay_open is False
     q = np.deg2rad(np.linspace(-20, 20, 5))[:, None]
     assert_allclose(forward(asked, q).T, forward(plain, q).T, atol=0)
+
+
+def insert_line(text: str, added: dict) -> str:
+    """Return the text of a file with a line behind a joint of a limb."""
+    lines = text.splitlines()
+    limb = lines.index(f"  - name: {added['limb']}")
+    at = next(i for i in range(limb, len(lines)) if f"name: {added['joint']}," in lines[i])
+    return "\n".join([*lines[: at + 1], f"      {added['line']}", *lines[at + 1 :]]) + "\n"
+
+
+@BOTH
+def test_lines_that_free_joints_make_the_file_one_of_exact_constraint(
+    text: str, tmp_path: Path
+) -> None:
+    robot = load_text(tmp_path, text)
+    finding = propose_added_joints(robot)
+    assert finding is not None
+    assert finding.code == "mechanism.joints-to-free"
+    count = get_data(robot)["count"]
+    q = driven_values(robot.program, find_nearby_states(robot))
+    for chosen in finding.data["proposals"]:
+        assert len(chosen) == count  # one more freedom for each repeated equation
+        written = text
+        for added in reversed(chosen):
+            written = insert_line(written, added)
+        freer = load_text(tmp_path, written)
+        assert freer.findings == ()
+        assert find_breaking_parameters(freer) == ()
+        state = forward_trials(freer, sample_truth(freer, 3, 7), q, follow=False)
+        assert (state.status == Status.CONVERGED).all()
+        # with exact geometry it is the same machine
+        exact = forward_trials(freer, freer.values[None], q, follow=False)
+        whole = forward_trials(robot, robot.values[None], q, follow=False)
+        assert_allclose(exact.T, whole.T, atol=1e-11)
+
+
+def test_joint_that_would_only_spin_a_limb_is_not_proposed(tmp_path: Path) -> None:
+    finding = propose_added_joints(load_text(tmp_path, EXECHON))
+    assert finding is not None
+    # a sphere at the gimbal and one at the hinge of one limb would let it spin
+    joints = [{(a["limb"], a["joint"]) for a in chosen} for chosen in finding.data["proposals"]]
+    assert {("right", "hinge")} in joints
+    assert {("right", "gimbal"), ("right", "hinge")} not in joints
+
+
+def test_no_rotation_frees_a_table_on_two_rails(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, RAILS)
+    assert get_data(robot)["count"] == 5
+    finding = propose_added_joints(robot)
+    assert finding is not None
+    assert finding.code == "mechanism.no-joint-to-free"
+
+
+def test_a_machine_that_is_not_over_constrained_has_no_proposal(tmp_path: Path) -> None:
+    planar = FOUR_BAR.replace("controlled:", "freedoms: [ry, x, z]\ncontrolled:")
+    assert propose_added_joints(load_text(tmp_path, planar)) is None
+    assert propose_added_joints(load_text(tmp_path, close_by_least_squares(EXECHON))) is None

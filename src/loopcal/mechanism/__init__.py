@@ -49,6 +49,9 @@ if TYPE_CHECKING:
     from loopcal.mechanism.batch_kinematics import step_towards_closure as step_towards_closure
     from loopcal.mechanism.compilation import build as build
     from loopcal.mechanism.families import FAMILIES as FAMILIES
+    from loopcal.mechanism.families.joint_release import (
+        propose_added_joints as propose_added_joints,
+    )
     from loopcal.mechanism.families.records import AngleTolerance as AngleTolerance
     from loopcal.mechanism.families.records import LengthTolerance as LengthTolerance
     from loopcal.mechanism.families.records import Point as Point
@@ -142,6 +145,7 @@ else:
             """,
             "loopcal.mechanism.compilation": "build",
             "loopcal.mechanism.families": "FAMILIES",
+            "loopcal.mechanism.families.joint_release": "propose_added_joints",
             "loopcal.mechanism.families.records": """
                 AngleTolerance LengthTolerance Point PoseRecord RatioTolerance RobotRecord
                 Workspace match_parameter_names standard_deviation

@@ -259,6 +259,17 @@ def _find_sufficient_freedoms(
     return () if is_over_constrained(flat) else names
 
 
+def find_self_stress(robot: Mechanism) -> FloatArray:
+    """Return wrenches (r, limbs, m) that limbs exert in r self-stresses at home, by the freedoms of
+    the platform with rotations over the robot's size.
+    """
+    rows = _linearize(robot, robot.home_state)[0]
+    numbers = np.arange(len(robot.assembly.limbs))
+    stresses = rows.find_repeated(numbers)
+    own = [stresses[:, rows.limb == i] @ rows.A[rows.limb == i] for i in numbers]
+    return np.stack(own, axis=1)
+
+
 def find_nearby_states(robot: Mechanism) -> State:
     """Return home and closed poses near it (1, n), at the nominal values."""
     home, rng = robot.home_state, np.random.default_rng(0)

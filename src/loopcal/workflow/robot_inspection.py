@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import Mechanism, evaluate_limits, inverse
+from loopcal.mechanism import Mechanism, evaluate_limits, inverse, propose_added_joints
 from loopcal.typing import FloatArray
 from loopcal.value_classes import dataclass
 
@@ -69,6 +69,9 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
     limits = evaluate_limits(robot, robot.values[None], solution.q[None], solution.state)
     exceeded = tuple(limit.name for limit in limits if limit.margin[0, 0] < -ROUNDING)
     findings = list(robot.findings)
+    proposal = propose_added_joints(robot)
+    if proposal is not None:
+        findings.append(proposal)
     if exceeded:
         findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
     if not len(robot.parameters):

@@ -22,3 +22,16 @@ def repeated_constraints(data: Mapping[str, Any]) -> str:
         verb = "do together" if len(entry["others"]) > 1 else "does"
         words.append(f"limb {entry['limb']} prevents {list_names(prevented)}, as {others} {verb}")
     return "; ".join(words)
+
+
+def joints_to_free(data: Mapping[str, Any]) -> str:
+    """Return the lines to write behind joints, and the alternatives."""
+    alternatives = []
+    for chosen in data["proposals"]:
+        places = dict.fromkeys(f"{added['limb']}.{added['joint']}" for added in chosen)
+        parts = []
+        for place in places:
+            lines = [a["line"] for a in chosen if f"{a['limb']}.{a['joint']}" == place]
+            parts.append(f"behind {place} write `{'` and `'.join(lines)}`")
+        alternatives.append(list_names(parts))
+    return "; or ".join(alternatives)

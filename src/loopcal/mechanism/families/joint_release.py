@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which joints of an over-constrained machine can have more freedom, so that no equation repeats.
+
+With the combinations w of repeated equations, limb k exerts the wrench F = A_k'w_k on the platform.
+A joint more, with the twist x at the platform, frees the direction in which this wrench does work:
+x'F. Joints whose works are independent for all w, as many as equations that repeat others, leave
+none, and do not let the machine move in any other way. Joints that people replace are tried: R by
+U or C, U by S, P by C. The machine with these joints is then built, and must close with drawn
+errors of all parameters. Derivation: docs/theory/over-constraint.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from loopcal.errors import MechanismError
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families.limb_placement import frame_from_axis
+from loopcal.mechanism.families.limb_records import (
+    JointRecord,
+    LimbRecord,
+    Prismatic,
+    Revolute,
+    Spherical,
+    Universal,
+    axis_vector,
+)
+from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.over_constraint import (
+    find_nearby_states,
+    find_self_stress,
+    is_over_constrained,
+)
+from loopcal.mechanism.states import Status, compute_limb_frames, driven_values
+from loopcal.mechanism.transmission import readings_from_joints
+from loopcal.typing import FloatArray
+from loopcal.value_classes import dataclass, replace
+
+INDEPENDENT = 1e-6
+"""Smallest singular value of the works, relative to the largest, of independent joints."""
+SHOWN = 3
+"""Sets of joints that are proposed."""
+TRIED = 12
+"""Sets of joints that are built."""
+DEFAULT_ERROR = 1e-3
+"""Standard deviation of drawn errors without tolerance: of the robot's size, or in radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class AddedJoint:
+    """A joint that can be added behind another one.
+
+    limb, joint : names in the file. place : of the joint in its chain. record : the joint added.
+    works : (r, copies) of the twists of all copies of the limb with the r self-stresses.
+    """
+
+    limb: str
+    joint: str
+    place: int
+    record: Revolute | Prismatic
+    works: FloatArray
+
+    @property
+    def line(self) -> str:
+        """The line of the robot file."""
+        one = self.record
+        return f"- {{joint: {one.joint}, name: {one.name}, axis: {one.axis}}}"
+
+
+def propose_added_joints(robot: Mechanism) -> Finding | None:
+    """Return the finding of joints that make an over-constrained machine one of exact constraint,
+    or that none was found; None for other machines, and those that no `limbs` file describes.
+    """
+    record = getattr(robot.record, "record", robot.record)
+    is_exact = is_over_constrained(robot) and not robot.program.may_stay_open
+    if not (isinstance(record, Limbs) and is_exact and len(robot.program.freedoms) == 6):
+        return None
+    proposals = []
+    for chosen in _choose_sets(list(_list_candidates(robot, record)))[:TRIED]:
+        if _is_verified(robot, record, chosen):
+            proposals.append(tuple(_describe(added) for added in chosen))
+        if len(proposals) == SHOWN:
+            break
+    if not proposals:
+        return report_finding("mechanism.no-joint-to-free", name=robot.name)
+    return report_finding("mechanism.joints-to-free", proposals=tuple(proposals))
+
+
+def _describe(added: AddedJoint) -> dict[str, str]:
+    """Return an added joint for a finding."""
+    return {"limb": added.limb, "joint": added.joint, "line": added.line}
+
+
+def _list_candidates(robot: Mechanism, record: Limbs) -> Iterator[AddedJoint]:
+    """Yield the joints that can be added, joint by joint, rotations before slides."""
+    stress = find_self_stress(robot)  # (r, limbs, 6)
+    frames = compute_limb_frames(robot, robot.values[None], robot.home_state)
+    values = _list_joint_values(robot)
+    numbers = {limb.name: i for i, limb in enumerate(robot.assembly.limbs)}
+    center, scale = robot.home[:3, 3], 1 / robot.twist_scale
+    for limb in record.limbs:
+        count = 0 if limb.copies is None else limb.copies.count
+        members = [numbers[limb.name + str(i + 1)] for i in range(count)] or [numbers[limb.name]]
+        names = [joint.name for joint in robot.assembly.limbs[members[0]].joints]
+        element = -1
+        for place, joint in enumerate(limb.chain):
+            element += {"U": 2, "C": 2, "S": 3}.get(joint.joint, 1)
+            name = joint.name or names[element]
+            for added in _list_additions(joint, name):
+                axis = axis_vector(added.axis)
+                works = []
+                for i in members:
+                    T = frames[i][0, 0, element]
+                    turn, point = _follow_joint(robot, i, element, T, values[i][element])
+                    u = turn @ frame_from_axis(_last_axis(joint), name).T @ axis
+                    twist = np.concatenate([np.zeros(3), u])
+                    if added.joint == "R":
+                        twist = np.concatenate([u, np.cross(u, center - point)])
+                    # wrenches are those by freedoms over `scale`
+                    works.append(stress[:, i] @ (twist / scale))
+                yield AddedJoint(limb.name, name, place, added, np.array(works).T)
+
+
+def _list_joint_values(robot: Mechanism) -> dict[int, FloatArray]:
+    """Return the joint values (J + 1,) of each limb at home."""
+    pairs = zip(robot.program.groups, robot.home_state.joints, strict=True)
+    return {i: own[0, 0, k] for group, own in pairs for k, i in enumerate(group.limbs)}
+
+
+def _follow_joint(
+    robot: Mechanism, limb: int, element: int, T: FloatArray, value: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the rotation (3, 3) behind a joint and its point (3,), of the frame before it."""
+    turn, point = T[:3, :3], T[:3, 3]
+    if robot.assembly.limbs[limb].joints[element].kind == "P":
+        return turn, point + value * turn[:, 2]
+    c, s = np.cos(value), np.sin(value)
+    return turn @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), point
+
+
+def _last_axis(joint: JointRecord) -> FloatArray:
+    """Return the axis of the last single joint of a record."""
+    if isinstance(joint, Spherical):
+        return axis_vector("x")
+    return axis_vector(joint.axes[1] if isinstance(joint, Universal) else joint.axis)
+
+
+def _list_additions(joint: JointRecord, name: str) -> Iterator[Revolute | Prismatic]:
+    """Yield the joints that make a record one that people build: R to U, S or C, U to S, P to C."""
+    if isinstance(joint, Spherical) or getattr(joint, "actuated", None):
+        return
+    own = {joint.axis} if not isinstance(joint, Universal) else set(joint.axes)
+    used = set() if isinstance(joint, Prismatic) else own
+    for axis in ("x", "y", "z"):
+        if axis not in used and f"-{axis}" not in used:
+            yield Revolute("R", f"{name}-{axis}", axis=axis)
+    if isinstance(joint, Revolute) and joint.axis in ("x", "y", "z"):
+        yield Prismatic("P", f"{name}-slide", axis=joint.axis)
+
+
+def _choose_sets(candidates: list[AddedJoint]) -> list[list[AddedJoint]]:
+    """Return sets of joints of independent works that leave no self-stress, few joints first."""
+    ordered = sorted(candidates, key=lambda c: c.record.joint == "P")
+    found: dict[frozenset[int], list[AddedJoint]] = {}
+    for first in candidates:
+        own = [c for c in candidates if (c.limb, c.joint) == (first.limb, first.joint)]
+        chosen, works = [], np.zeros((len(first.works), 0))
+        for one in [first, *own, *ordered]:
+            more = np.concatenate([works, one.works], axis=1)
+            s = np.linalg.svd(more, compute_uv=False)
+            if more.shape[1] <= len(more) and s[-1] > INDEPENDENT * max(s[0], INDEPENDENT):
+                chosen, works = [*chosen, one], more
+        if works.shape[1] == len(works):
+            found.setdefault(frozenset(map(id, chosen)), chosen)
+
+    def count(chosen: list[AddedJoint]) -> tuple[int, int, int]:
+        slides = sum(c.record.joint == "P" for c in chosen)
+        return len({(c.limb, c.joint) for c in chosen}), len(chosen), slides
+
+    return sorted(found.values(), key=count)
+
+
+def _is_verified(robot: Mechanism, record: Limbs, chosen: list[AddedJoint]) -> bool:
+    """Return whether the machine with these joints moves as before, no equation repeats another,
+    and its loops close at home and near it with drawn errors of all parameters.
+    """
+    limbs = tuple(_add_joints(limb, chosen) for limb in record.limbs)
+    try:
+        freer = build(replace(record, limbs=limbs).assembly())
+    except MechanismError:
+        return False
+    if [f.code for f in freer.findings] != [
+        f.code for f in robot.findings if f.code != "mechanism.repeated-equations"
+    ]:
+        return False
+    table, rng = freer.parameters, np.random.default_rng(0)
+    unit = [DEFAULT_ERROR * (freer.size if p.dimension.value == "length" else 1.0)
+            for p in table.entries]  # fmt: skip
+    sd = np.where(np.isnan(table.tolerance), unit, table.tolerance)
+    values = table.nominal + sd * rng.standard_normal((2, len(table)))
+    joints = driven_values(robot.program, find_nearby_states(robot))
+    slots = robot.slots
+    q = readings_from_joints(joints, slots.terms[None], slots.frequency)
+    state = forward_trials(freer, values, q, follow=False)
+    return bool((state.status == Status.CONVERGED.value).all())
+
+
+def _add_joints(limb: LimbRecord, chosen: list[AddedJoint]) -> LimbRecord:
+    """Return a limb with joints added behind its own."""
+    chain: list[JointRecord] = []
+    for place, joint in enumerate(limb.chain):
+        chain.append(joint)
+        chain += [c.record for c in chosen if (c.limb, c.place) == (limb.name, place)]
+    return replace(limb, chain=tuple(chain))
