@@ -230,6 +230,23 @@ def test_three_targets_of_which_one_moved_do_not_show_which():
     assert finding.data["suspects"] == ("N2", "N3")
 
 
+def test_a_wrong_stated_place_and_interchanged_names_are_found():
+    data, _ = measure(4)
+    assert report_base_targets(data) == ()
+    (rows,) = data.base_observations
+    wrong = np.array(PLACES)
+    wrong[1, 0] += 2e-4
+    interchanged = PLACES[[1, 0, 2]]
+    for places in (wrong, interchanged):
+        kind = replace(make_base_kind(), places=places)
+        changed = replace(data, base_observations=(replace(rows.take([0]), kind=kind),))
+        (finding,) = report_base_targets(changed)
+        assert finding.code == "residuals.base-targets-moved"
+        assert finding.data["is_stated"]
+    right = [report_base_targets(measure(number)[0]) for number in range(10)]
+    assert sum(map(len, right)) == 0
+
+
 def test_rows_of_the_base_stay_when_poses_are_taken_held_out_weighted_or_excluded():
     data, _ = measure(2)
     fitted, held_out = data.split(hold_out=0.3, seed=1)

@@ -7,9 +7,9 @@ measurement. That of the first one is 0. If the frame keeps its place in a sessi
 much the whitened sum of squares grows with this condition is a chi-square of six degrees of freedom
 for each further measurement.
 
-Whether the targets kept their distances is what remains if each measurement of any session may move
-freely; each is first brought to the others by its best rigid motion, which may be large. No robot,
-no pose and no stated place of a target enters. The noise is the stated one.
+Whether the targets kept their distances, and have those of their stated places, is what remains if
+each measurement of any session may move freely; each is first brought to the others by its best
+rigid motion, which may be large. No robot and no pose enters. The noise is the stated one.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ LEVEL = 0.01
 
 TINY = 1e-99
 """Probabilities below this are not written."""
+
+EXACT = 1e-9
+"""Standard deviation of stated places [m]: none, beside that of any instrument."""
 
 RANK = 1e-9
 """Singular values of whitened rows with scaled columns, relative to the largest, that are zero."""
@@ -77,6 +80,7 @@ class ShapeTest:
     frame : in which they were measured. targets : on the base.
     suspects : targets without each of which the noise explains the others. With three targets there
         is often more than one.
+    is_stated : whether their places are stated, and compared, too.
     chi_square, degrees : of what no motion of frames explains.
     p_value : probability of a larger chi-square if no target moved.
     """
@@ -84,6 +88,7 @@ class ShapeTest:
     frame: str
     targets: tuple[str, ...]
     suspects: tuple[str, ...]
+    is_stated: bool
     chi_square: float
     degrees: int
     p_value: float
@@ -124,6 +129,7 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
             "residuals.base-targets-moved",
             targets=shape.targets,
             suspects=shape.suspects,
+            is_stated=shape.is_stated,
             chi_square=shape.chi_square,
             degrees=shape.degrees,
         )
@@ -204,9 +210,11 @@ def estimate_frame_drifts(data: Measurements) -> tuple[FrameDrift, ...]:
 
 
 def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
-    """Return the tests of all targets on the base that were measured together at least twice."""
+    """Return the tests of all targets on the base that were measured together at least twice, or
+    once if their places are stated and known.
+    """
     tests = []
-    for repeats in _list_repeats(data):
+    for repeats in _list_repeats(data, with_places=True):
         kind, aligned = repeats.kind, _align_each(repeats)
         rows, values, _ = _build_rows(aligned)
         is_seen = np.asarray(np.isfinite(repeats.points).all(axis=2))
@@ -219,12 +227,20 @@ def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
             if degrees > left > 0 and compute_chi_square_tail(left, cost) > LEVEL:
                 suspects.append(name)
         tail = float(compute_chi_square_tail(degrees, full))
-        tests.append(ShapeTest(kind.frame, kind.targets, tuple(suspects), full, degrees, tail))
+        names = (kind.frame, kind.targets, tuple(suspects))
+        tests.append(ShapeTest(*names, _states_places(kind), full, degrees, tail))
     return tuple(tests)
 
 
-def _list_repeats(data: Measurements) -> Iterator[_Repeats]:
-    """Give the measurements of the same targets in frames of one name, in their order."""
+def _states_places(kind: Position) -> bool:
+    """Return whether the places of targets are known."""
+    return "targets" not in kind.unknown
+
+
+def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[_Repeats]:
+    """Give the measurements of the same targets in frames of one name, in their order; before them,
+    if asked for, their stated places as an exact measurement without a session.
+    """
     groups: dict[tuple[str, tuple[str, ...]], list[Observations]] = {}
     for rows in data.base_observations:
         if isinstance(rows.kind, Position):
@@ -236,10 +252,14 @@ def _list_repeats(data: Measurements) -> Iterator[_Repeats]:
         pairs = list(zip(alike, order, strict=True))
         measured = np.concatenate([rows.measured[i] for rows, i in pairs])
         points = measured.reshape(len(measured), -1, 3)
+        whitener = np.concatenate([rows.whitener[i] for rows, i in pairs])
+        session = np.concatenate([rows.session[i] for rows, i in pairs])
+        if with_places and _states_places(kind) and kind.places is not None:
+            points = np.concatenate([kind.places[None], points])
+            whitener = np.concatenate([np.eye(kind.places.size)[None] / EXACT, whitener])
+            session = np.concatenate([[""], session])
         used = [i for i, each in enumerate(points) if _spans_plane(each)]
         if len(used) > 1:
-            whitener = np.concatenate([rows.whitener[i] for rows, i in pairs])
-            session = np.concatenate([rows.session[i] for rows, i in pairs])
             yield _Repeats(kind, points[used], whitener[used], session[used].tolist())
 
 
