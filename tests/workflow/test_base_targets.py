@@ -321,6 +321,27 @@ def test_any_kind_of_points_may_be_on_the_base():
 
 
 @pytest.mark.slow
+def test_a_validation_in_a_new_session_uses_its_targets_on_the_base():
+    fit = lc.identify(ROBOT, measure(5)[0])
+    other, _ = measure(5, 100.0 * DRIFT, poses=resolve_poses(ROBOT, 10, 8))
+    (of_poses,), (on_base,) = other.observations, other.base_observations
+    names = {"am": "tuesday", "pm": "wednesday"}
+    renamed = (
+        replace(rows, session=np.array([names[name] for name in rows.session.tolist()]))
+        for rows in (of_poses, on_base)
+    )
+    moving, base = renamed
+    data = replace(other, observations=(moving,), base_observations=(base,))
+    validation = lc.validate(fit, data)
+    assert validation.after.statistics("position").rms < 3.0 * SIGMA
+    measured = np.array(base.measured)
+    measured[1, 3] += 1e-3
+    wrong = replace(data, base_observations=(replace(base, measured=measured),))
+    codes = [finding.code for finding in lc.validate(fit, wrong).findings]
+    assert "residuals.base-targets-moved" in codes
+
+
+@pytest.mark.slow
 def test_a_plan_counts_targets_on_the_base():
     def plan(with_base):
         sensors = [lc.Sensor(lc.Position(unknown=("frame",)), lc.Gaussian(np.full(3, SIGMA)))]

@@ -45,6 +45,7 @@ from loopcal.diagnose import (
     compare_predictions,
     compute_noise_floor,
     compute_row_errors,
+    report_base_targets,
 )
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.fit_input import check_argument
@@ -315,6 +316,7 @@ def validate(
             *check_limits(result.after, compared.rows, limits, result.units),
             *report_conformity(conformity, limits, result.after, result.units),
             *report_blunders(blunders, result, rest),
+            *report_base_targets(data),
             *report_moved_setup(robot, compared, kept),
             *report_left_out(data, compared),
             *report_few_rows(result.after),

@@ -16,9 +16,13 @@ from loopcal.measure import Measurements, check_instruments
 from loopcal.units import Dimension
 from loopcal.workflow.data_split import DataSplit
 from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
+from loopcal.workflow.verdict import BASE_MOVED
 
 NO_GAIN = "model.no-expected-gain"
 """Finding that a calibration is not expected to improve on the tolerances."""
+
+ON_BASE = (*BASE_MOVED, "data.base-session-unused")
+"""Findings on targets on the base."""
 
 UNUSUAL_NOISE = 10.0
 """Factor on sigma from which an estimated noise is no property of an instrument."""
@@ -65,16 +69,17 @@ def report_validation(errors: Validation | None, is_held_out: bool) -> list[Find
         return [report_finding("workflow.no-held-out-poses"), *unreachable]
     if errors is None:
         return []
+    own = [f for f in errors.findings if f.code not in ON_BASE]  # reported once for all rows
     checked = errors.without_blunders or errors  # a wrong measurement says nothing of the geometry
     if checked.judged < FEW_ROWS:
         few = report_finding("workflow.few-held-out-poses", count=checked.judged, needed=FEW_ROWS)
-        return [*errors.findings, few]
+        return [*own, few]
     if checked.values_left < FEW_ROWS:
         values, setup = checked.kinds[-1].count, checked.setup_count
         held_out_setup = report_finding("workflow.held-out-setup", values=values, setup=setup)
-        return [*errors.findings, held_out_setup]
+        return [*own, held_out_setup]
     return [
-        *errors.findings,
+        *own,
         *(
             report_finding("gates.errors-grew", quantity=quantity, times=1.0 / change.times)
             for quantity, change in checked.changes().items()
