@@ -41,7 +41,8 @@ class SlotMap:
 
     Attributes
     ----------
-    matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and outputs.
+    matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and of its
+        outputs, which differ.
     nominal : (p,). n_displacements : length of e.
     terms : (a, k) nominal transmission terms. frequency : (a,) of their harmonics.
     """
@@ -63,9 +64,7 @@ class SlotMap:
         for (shared, inputs, outputs), nominal in zip(
             self.shared, self._shared_nominal, strict=True
         ):
-            change = shared.value(values[:, inputs]) - nominal
-            for place, column in zip(outputs, change.T, strict=True):
-                slots[:, place] += column
+            slots[:, outputs] += shared.value(values[:, inputs]) - nominal
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
         return e, self.terms + tau.reshape(-1, *self.terms.shape)
 
@@ -115,9 +114,8 @@ class SlotMap:
         J = np.repeat(self.matrix[None], len(values), axis=0)
         for shared, inputs, outputs in self.shared:
             slopes = shared.jacobian(values[:, inputs])
-            for o, place in enumerate(outputs):
-                for i, column in enumerate(inputs):
-                    J[:, place, column] += slopes[:, o, i]
+            for i, column in enumerate(inputs):
+                J[:, outputs, column] += slopes[:, :, i]
         return J
 
 
