@@ -84,8 +84,10 @@ class Model(Protocol):
         """Return which steps (a,) are the last: they are taken without being evaluated."""
         ...
 
-    def finish(self, point: Any, step: Any) -> Any:
-        """Return the points after a negligible step, their cost and model unchanged."""
+    def finish(self, point: Any, step: Any, trials: IntArray) -> Any:
+        """Return all points, those of some trials (a,) after their negligible steps (a,), with
+        their cost and model unchanged.
+        """
         ...
 
     def evaluate(self, point: Any, step: Any, trials: IntArray) -> Any:
@@ -164,8 +166,7 @@ class _Run:
             self.chains.is_ahead[active[last]] = False
             self.status[active[last]] = DescentStatus.CONVERGED
             self.taken[active[last]] += 1
-            finished = self.model.finish(current.take(last), step.take(last))
-            self.point = self.point.put(active[last], finished)
+            self.point = self.model.finish(self.point, step.take(last), active[last])
             active = active[going]
             if active.size:
                 current, step = current.take(going), step.take(going)

@@ -101,9 +101,9 @@ class _Descent:
         del point
         return np.zeros(len(step.x), dtype=bool)
 
-    def finish(self, point: _Point, step: _Step) -> _Point:
+    def finish(self, point: _Point, step: _Step, trials: IntArray) -> _Point:
         """Return the points as they are."""
-        del step
+        del step, trials
         return point
 
     def evaluate(self, point: _Point, step: _Step, trials: IntArray) -> _Point:

@@ -350,9 +350,11 @@ class _FilteredDescent:
         remaining = change * ratio / np.maximum(1.0 - ratio, 1.0 - CONTRACTION)
         return is_last | ((ratio <= CONTRACTION) & (remaining <= self.sufficient))
 
-    def finish(self, point: _Point, step: FilteredStep) -> _Point:
-        """Return the points after their full step, the rest unchanged."""
-        return replace(point, z=step.target)
+    def finish(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Point:
+        """Return the points, some after their full step, without copies of the linear model."""
+        z = point.z.copy()
+        z[trials] = step.target
+        return replace(point, z=z)
 
     def evaluate(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Candidate:
         """Linearize at the deviations of the steps."""

@@ -169,14 +169,14 @@ class _MeasuredPoses:
         del point
         return step.is_full & step.is_closed & (step.length < NEGLIGIBLE_STEP * self.robot.size)
 
-    def finish(self, point: _Point, step: _FullStep) -> _Point:
-        """Return the poses after their step."""
-        return replace(point, T=geometry.apply_twist(step.T, step.twist), state=step.state)
+    def finish(self, point: _Point, step: _FullStep, trials: IntArray) -> _Point:
+        """Return the poses, some after their step."""
+        return point.put(trials, self.evaluate(point.take(trials), step, trials))
 
     def evaluate(self, point: _Point, step: _FullStep, trials: IntArray) -> _Point:
         """Return the poses after their step."""
         del trials
-        return self.finish(point, step)
+        return replace(point, T=geometry.apply_twist(step.T, step.twist), state=step.state)
 
     def judge(
         self, point: _Point, step: _FullStep, candidate: _Point
