@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from loopcal.mechanism.batch_kinematics import inverse_trials as inverse_trials
     from loopcal.mechanism.batch_kinematics import step_towards_closure as step_towards_closure
     from loopcal.mechanism.compilation import build as build
+    from loopcal.mechanism.driven_joints import DrivenJoints as DrivenJoints
+    from loopcal.mechanism.driven_joints import drive_joints as drive_joints
     from loopcal.mechanism.families import FAMILIES as FAMILIES
     from loopcal.mechanism.families.joint_release import (
         propose_added_joints as propose_added_joints,
@@ -144,6 +146,7 @@ else:
                 inverse_trials
             """,
             "loopcal.mechanism.compilation": "build",
+            "loopcal.mechanism.driven_joints": "DrivenJoints drive_joints",
             "loopcal.mechanism.families": "FAMILIES",
             "loopcal.mechanism.families.joint_release": "propose_added_joints",
             "loopcal.mechanism.families.records": """

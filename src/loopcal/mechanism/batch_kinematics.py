@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import Program, State
+from loopcal.mechanism.driven_joints import DrivenJoints, drive_joints
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import (
     compare_coordinates,
@@ -62,6 +63,7 @@ def forward_trials(
     start: State | None = None,
     follow: bool = True,
     goal: State | None = None,
+    driven: DrivenJoints | None = None,
 ) -> State:
     """Solve forward kinematics for readings q (t | 1, n, a) and values (t | 1, p).
 
@@ -70,19 +72,19 @@ def forward_trials(
     fail are marked, see `Status`. Redundant readings contradict each other by their errors; a row
     that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
     these rows are marked at once, in a fraction of the time. With a `goal` (t, n), a row that comes
-    close to it ends there as `engine.NEAR_GOAL`.
+    close to it ends there as `engine.NEAR_GOAL`. `driven` is that of `drive_joints`, where it is
+    known.
     """
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
     if robot.stages:
         return solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
-    e, tau = robot.slots(values)
-    with np.errstate(invalid="ignore"):
-        # an infinite reading turns into NaN, and the engine marks its row
-        if robot.has_open_sums:
+    if robot.has_open_sums:
+        e, tau = robot.slots(values)
+        with np.errstate(invalid="ignore"):  # as in drive_joints
             sums = evaluate_sums(q, tau, robot.slots.frequency)
-            return close_at_joints(robot, e, sums, start, follow, weights=select_weights(tau))
-        joints = joints_from_readings(q, tau, robot.slots.frequency)
+        return close_at_joints(robot, e, sums, start, follow, weights=select_weights(tau))
+    e, tau, joints = driven or drive_joints(robot, values, q)
     state = close_at_joints(robot, e, joints, start, follow, goal)
     return _mark_out_of_reach(robot, state, q, tau) if len(find_triangles(tau)) else state
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
+from loopcal.mechanism.driven_joints import DrivenJoints, drive_joints
 from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.open_closure import differentiate_open, fold_open_poses
@@ -101,14 +102,15 @@ def fold_pose_rows(
     columns: ParameterUnits,
     observed: Sequence[engine.TwistRows],
     factor: FloatArray,
+    driven: DrivenJoints | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Fold rows of observed poses into factors (t, p + 1, p + 1), without writing derivatives.
 
     They are [G D | r] with D of `differentiate_pose`; see `engine.fold_poses`, also for the second
-    result (t, n). For robots without stages whose readings determine the joints.
+    result (t, n). For robots without stages whose readings determine the joints. `driven` is that
+    of `drive_joints`, where it is known.
     """
-    e, tau = robot.slots(values)
-    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    e, tau, joints = driven or drive_joints(robot, values, q)
     inputs = columns.linearize(values, tau, q)
     fold_poses = fold_open_poses if robot.program.may_stay_open else engine.fold_poses
     return fold_poses(factor, robot.program, e, joints, state, inputs, observed)

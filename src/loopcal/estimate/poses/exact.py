@@ -30,7 +30,7 @@ from loopcal.estimate.poses.linearization import (
     locate_poses,
 )
 from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_states
-from loopcal.mechanism import Status, fold_pose_rows, forward_trials
+from loopcal.mechanism import Status, drive_joints, fold_pose_rows, forward_trials
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
@@ -173,14 +173,15 @@ class ExactPoses:
     ) -> PoseSolution:
         """Solve the poses of the only block at deviations z (a | 1, p), and linearize them."""
         first = start.take(np.arange(len(z))) if len(z) < len(start) else start
-        begin, follow, block = first.states, not first.is_near, self.blocks[0]
+        begin, follow, block, driven = first.states, not first.is_near, self.blocks[0], None
         if derivatives:
             poses, state = self._linearize(block, z, trials, begin, follow)
         else:
             values, q = self.free.values(z), block.readings
-            state = forward_trials(self.free.robot, values, q, begin, follow)
+            driven = drive_joints(self.free.robot, values, q)
+            state = forward_trials(self.free.robot, values, q, begin, follow, driven=driven)
             poses = locate_poses(self.free, q, state, self.names)
-        return PoseSolution(None, poses, PoseStates(state, np.zeros(0)))
+        return PoseSolution(None, poses, PoseStates(state, np.zeros(0)), driven=driven)
 
     def fold_rows(
         self, factor: FloatArray, solution: PoseSolution, z: FloatArray, trials: IntArray
@@ -197,7 +198,7 @@ class ExactPoses:
             observed = [list_twist_rows(r, poses, trials) for r in block.rows if len(r.poses)]
             values = self.free.values(z[: len(state.T)])  # one trial may stand for all
             parts = values, block.readings, state, self.free.columns, observed, factor
-            factor, is_finite = fold_pose_rows(robot, *parts)
+            factor, is_finite = fold_pose_rows(robot, *parts, solution.driven)
             is_lost |= np.any(~(poses.is_reached & is_finite) & block.is_needed, axis=1)
         return factor, is_lost
 

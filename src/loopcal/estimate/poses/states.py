@@ -9,6 +9,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.poses.linearization import LinearizedPoses
+from loopcal.mechanism import DrivenJoints
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.value_classes import dataclass
@@ -81,12 +82,14 @@ class PoseSolution:
     states : (a, n) for the next start; None where they are too many to be kept, and are solved
         again block by block.
     estimates : of uncertain poses; None where readings are exact.
+    driven : joints of the only block; None where the next step has no use for them.
     """
 
     nuisance: FloatArray | None
     linearized: LinearizedPoses | None = None
     states: PoseStates | None = None
     estimates: PoseEstimates | None = None
+    driven: DrivenJoints | None = None
 
     @property
     def has_derivatives(self) -> bool:
