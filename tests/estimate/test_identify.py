@@ -147,7 +147,7 @@ def test_block_size_of_poses_changes_rounding_only(data, fit, monkeypatch, kept)
 def test_poses_of_several_blocks_begin_where_the_last_step_ended(data, fit, monkeypatch):
     begins = []
 
-    def solve(robot, values, q, start=None, follow=True):
+    def solve(robot, values, q, start, follow):
         begins.append((start.T, follow))
         return forward_trials(robot, values, q, start, follow)
 
