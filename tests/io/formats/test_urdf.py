@@ -193,7 +193,7 @@ def test_invalid_urdf_is_refused_in_one_sentence(tmp_path, text, sentence) -> No
             ":1: .* names the frame 'a' twice",
         ),
         ("closed_loop: [[a, arm]]\ntype: ['6d']\nname_mot: []\n", "no motor is named"),
-        ("closed_loop: 1\n", "write 'closed_loop:' as a list of pairs"),
+        ("closed_loop: 1\n", ":1: 'closed_loop' is '1', but must be a list"),
         ("closed_loop: []\ntype: []\nname_mot: [z]\n", ":3: the motor 'z' is not a movable joint"),
     ],
 )

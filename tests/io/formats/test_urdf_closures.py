@@ -239,6 +239,14 @@ REFUSED = {
         FIVE_BAR.replace('"tip_frame" type="fixed"', '"tip_frame" type="revolute"'),
         "no moving body carries a frame, .* one of rod1 and rod2",
     ),
+    "loop closed twice": (
+        FIVE_BAR.replace(PIN, PIN + PIN.replace('"pin"', '"again"')),
+        ":16: closure 'again' joins the same points of 'rod1' and 'rod2' as 'pin'",
+    ),
+    "joint type": (
+        FIVE_BAR.replace('type="continuous"', 'type="floating"'),
+        ":9: joint 'elbow2' is of type 'floating'; allowed: revolute, continuous",
+    ),
     "branch": (
         FIVE_BAR.replace(MOTORS, BRACE + MOTORS),
         "joints mot2, elbow2 and brace meet in 'arm2', so a limb branches from a limb",
@@ -269,6 +277,18 @@ CLOSURES = {
     "same frame": (
         "closed_loop: [[tip, tip]]\ntype: [6d]\n",
         ":1: closure 1 names the frame 'tip' twice",
+    ),
+    "closed twice": (
+        "closed_loop: [[elbow1, elbow2], [elbow2, elbow1]]\ntype: [3d, 3d]\nname_mot: [mot1]\n",
+        ":1: closure 'elbow2_ball' joins the same points of 'rod2' and 'rod1' as 'elbow1_ball'",
+    ),
+    "three frames": (
+        "closed_loop:\n- [rod1, rod2]\n- [rod1, rod2, tip]\ntype: [3d, 3d]\n",
+        ":3: closure 2 is .* but must be the names of two frames",
+    ),
+    "number of types": (
+        "closed_loop: [[rod1, rod2]]\ntype: []\n",
+        ":2: 'closed_loop' has 1 pairs, but 'type' has 0 entries",
     ),
     "motor twice": ("name_mot: [mot1, mot1]\n", ":1: motor 'mot1' is named twice"),
     "fixed motor": (

@@ -47,6 +47,9 @@ OVERRIDES = ("SPHERICAL", "FIXED", *(f"UJOINT_{a}{b}" for a, b in permutations("
 
 WELD, BALL = "6d", "3d"
 
+BALL_NAME = "_ball"
+"""Ending of the name of a ball joint at the origin of a movable joint, which has its own name."""
+
 
 @dataclass(frozen=True)
 class Closures:
@@ -150,10 +153,7 @@ def _read_closures(path: Path, urdf: Urdf) -> Closures:
     file = read_yaml(path, WHAT)
     refuse_unknown_keys(file, tuple(file.content), KEYS)
     pairs, kinds, motors, names, types = (file.content.get(key, []) for key in KEYS)
-    lists = all(isinstance(value, list) for value in (pairs, kinds, motors))
-    if not lists or len(kinds) != len(pairs) or not all(_is_pair_of_names(p) for p in pairs):
-        sentence = "write 'closed_loop:' as a list of pairs, 'type:' with one entry for each, and"
-        raise file.error(f"{sentence} 'name_mot:' as a list")
+    _check_lists(file, pairs, kinds, motors)
     for i, kind in enumerate(kinds):
         if str(kind).lower() not in (WELD, BALL):
             sentence = f"closure {pairs[i][0]!r} is of type {quote(str(kind))}; allowed: 6d (the"
@@ -165,6 +165,20 @@ def _read_closures(path: Path, urdf: Urdf) -> Closures:
         tuple(str(name) for name in motors),
         _read_overrides(file, names, types, urdf),
     )
+
+
+def _check_lists(file: YamlFile, pairs: Any, kinds: Any, motors: Any) -> None:
+    """Refuse closures, types and motors that are no lists, or do not belong together."""
+    for key, value in zip(KEYS, (pairs, kinds, motors), strict=False):
+        if not isinstance(value, list):
+            raise file.error(f"{key!r} is {quote(str(value))}, but must be a list", (key,))
+    for i, pair in enumerate(pairs):
+        if not isinstance(pair, list) or [type(name) for name in pair] != [str, str]:
+            sentence = f"closure {i + 1} is {quote(str(pair))}, but must be the names of two frames"
+            raise file.error(f"{sentence}: [A, B]", ("closed_loop", i))
+    if len(kinds) != len(pairs):
+        sentence = f"'closed_loop' has {len(pairs)} pairs, but 'type' has {len(kinds)} entries"
+        raise file.error(f"{sentence}; write 6d or 3d for each pair", ("type",))
 
 
 def _read_overrides(file: YamlFile, names: Any, types: Any, urdf: Urdf) -> dict[str, str]:
@@ -185,10 +199,6 @@ def _read_overrides(file: YamlFile, names: Any, types: Any, urdf: Urdf) -> dict[
             raise file.error(f"joint {name!r} is replaced twice; remove one", ("joint_name", i))
         overrides[name] = kind.upper()
     return overrides
-
-
-def _is_pair_of_names(value: Any) -> bool:
-    return isinstance(value, list) and [type(name) for name in value] == [str, str]
 
 
 def _check_motors(urdf: Urdf, closures: Closures, motors: Sequence[str]) -> None:
@@ -247,7 +257,7 @@ def _build_closure(
     (a, T_a, near), (b, T_b, far) = ends
     if kind == WELD:
         return Weld(pair[0], a, b, T_a, T_b)
-    name = f"{pair[0]}_ball" if pair[0] in urdf.joints else pair[0]
+    name = pair[0] + BALL_NAME if pair[0] in urdf.joints else pair[0]
     return GraphJoint(name, "S", a, b, T_a, T_b, np.array([0.0, 0.0, 1.0]), near, far)
 
 
@@ -325,9 +335,11 @@ def _locate_error(error: MechanismError, urdf: Urdf, closures: Closures) -> File
     """Return an error of the mechanism at the line of the closure that it names."""
     finding = error.finding
     name = "" if finding is None else finding.data.get("closure", "")
-    for i, pair in enumerate(closures.pairs):
-        if name in pair and closures.file is not None:
-            return closures.file.error(finding, ("closed_loop", i))
+    frame = name.removesuffix(BALL_NAME)
+    places = [i for i, pair in enumerate(closures.pairs) if frame == pair[0]]
+    places = places or [i for i, pair in enumerate(closures.pairs) if frame in pair]
+    if places and closures.file is not None:
+        return closures.file.error(finding, ("closed_loop", places[-1]))
     lines = {constraint.name: constraint.line for constraint in urdf.constraints}
     line = lines.get(name) or (urdf.joints[name].line if name in urdf.joints else None)
     return FileError(error.args[0], urdf.path, line)

@@ -83,18 +83,35 @@ def assemble_graph(base: str, joints: Sequence[GraphJoint], motors: tuple[str, .
 
     Raises
     ------
-    MechanismError : a joint joins a body to itself, or a loop has driven joints only.
+    MechanismError : a joint joins a body to itself, two join the same points of two bodies, or a
+        loop has driven joints only.
     """
     for joint in joints:
         if joint.body_a == joint.body_b:
             raise MechanismError(
                 report_finding("files.closure-within-body", closure=joint.name, body=joint.body_a)
             )
+    _refuse_repeated(joints)
     tree, closing = _span_tree(base, _merge_pins(base, list(joints), motors), motors)
     lost = next((joint.name for joint in closing if joint.name in motors), None)
     if lost is not None:
         raise MechanismError(report_finding("files.motors-in-loop", motor=lost))
     return JointGraph(base, tree, closing, motors)
+
+
+def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
+    """Refuse two rotary or ball joints of the same points of two bodies; raises MechanismError."""
+    turning = [joint for joint in joints if joint.kind != "P"]
+    for i, joint in enumerate(turning):
+        for other in turning[:i]:
+            if {joint.body_a, joint.body_b} != {other.body_a, other.body_b}:
+                continue
+            same = other.orient(joint.body_a)
+            gaps = (joint.T_a[:3, 3] - same.T_a[:3, 3], joint.T_b[:3, 3] - same.T_b[:3, 3])
+            if np.abs(gaps).max() < COAXIAL:
+                names = {"closure": joint.name, "other": other.name}
+                bodies = {"body_a": joint.body_a, "body_b": joint.body_b}
+                raise MechanismError(report_finding("files.closure-repeated", **names, **bodies))
 
 
 def _merge_pins(
