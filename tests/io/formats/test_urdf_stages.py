@@ -5,13 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from loopcal.errors import LoopcalError
+from loopcal.estimate import identify
 from loopcal.io.formats import urdf
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
 from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.mechanism.platform_coordinates import read_coordinates
 from tests.io.formats.urdf_chains import (
+    make_digger,
     make_head_with_wrist,
     make_leg,
     make_lever_arm,
@@ -24,11 +29,13 @@ MACHINES = {
     "leg": make_leg,
     "head": make_head_with_wrist,
     "arm": make_lever_arm,
+    "digger": make_digger,
     "tilted table": make_tilted_table,
 }
 STAGES = {
     "leg": (("yaw", "roll", "pitch", "shin", "platform"), ("shin", "platform")),
     "head": (("column", "head", "w1", "w2"), ("head",)),
+    "digger": (("slew", "boom", "stick", "platform"), ("boom", "stick", "platform")),
     "arm": (("slew", "forearm", "roll", "bend", "flange"), ("forearm",)),
 }
 
@@ -60,8 +67,10 @@ def draw_readings(robot: Mechanism, count: int) -> np.ndarray:
     return home + np.random.default_rng(2).uniform(-0.05, 0.05, (count, home.shape[1]))
 
 
-@pytest.mark.parametrize("seed", [None, 3])
-@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize(
+    ("machine", "seed"),
+    [("leg", None), ("leg", 3), ("head", 3), ("arm", None), ("digger", 3), ("tilted table", 3)],
+)
 def test_chains_agree_with_the_solver(tmp_path, machine, seed) -> None:
     """So does the corrected file, after every parameter has been changed."""
     path = write(tmp_path, MACHINES[machine](), seed)
@@ -148,3 +157,35 @@ def test_link_at_which_a_limb_branches_is_named_with_the_right_platform(tmp_path
         read(path, "rod_in")
     with pytest.raises(LoopcalError, match="choose the platform platform instead of 'rod_in'"):
         read(path, "rod_in")
+    # a bucket linkage, whose cylinder pushes the rocker
+    path = write(tmp_path, make_digger(has_rocker=True))
+    with pytest.raises(LoopcalError, match=r"urdf:\d+: joints .* meet in 'rocker', so a limb bran"):
+        read(path)
+
+
+def test_wrist_that_is_drawn_in_a_singular_pose_has_another_home(tmp_path) -> None:
+    path = write(tmp_path, make_lever_arm(bend=0.0))
+    robot = read(path)[1]
+    q = draw_readings(robot, 2)
+    found = forward(robot, q).T
+    np.testing.assert_allclose(found, solve(path, robot, q), rtol=0, atol=AGREES)
+    np.testing.assert_allclose(inverse(robot, found).q, q, rtol=0, atol=AGREES)
+
+
+@pytest.mark.parametrize("machine", ["leg", "arm"])
+def test_chains_are_calibrated(tmp_path, machine) -> None:
+    robot = read(write(tmp_path, MACHINES[machine]()))[1]
+    rng = np.random.default_rng(5)
+    true = robot.with_values(robot.values + 1e-3 * rng.uniform(-1, 1, len(robot.values)))
+    home = inverse(robot, robot.home[None]).q
+    q = home + rng.uniform(-0.2, 0.2, (60, len(robot.actuators)))
+    measured, held_out = q[:40], q[40:]
+    instrument = Instrument((Sensor(Pose(), Gaussian(np.array([1e-5] * 3 + [5e-5] * 3))),))
+    poses = read_coordinates(forward(robot, measured).T, robot.controlled)
+    fit = identify(robot, simulate(true, poses, instrument, 4))
+    low, high = chi2.ppf([0.005, 0.995], fit.residual_test.dof)
+    assert low < fit.chi_square < high
+    expected = forward(true, held_out).T
+    assert np.abs(forward(robot, held_out).T - expected).max() > 1e-3  # [m, 1]: before
+    # [m, 1] ten times the noise of positions, twice that of angles
+    np.testing.assert_allclose(forward(fit.robot, held_out).T, expected, rtol=0, atol=1e-4)

@@ -85,12 +85,14 @@ def make_head_with_wrist() -> list[MachineJoint]:
     ]
 
 
-def make_lever_arm() -> list[MachineJoint]:
+def make_lever_arm(bend: float = 0.6) -> list[MachineJoint]:
     """Return a robot arm whose forearm a lever and a rod move, between a slew and a wrist.
 
     The axis of the slew leans, so that no axis of the column's frame is in the plane of the loop.
+    `bend` is the angle of the wrist, which is singular at zero.
     """
     slew = make_pose(Rotation.from_euler("xy", [0.3, 0.2]).as_matrix(), [0.0, 0.0, 0.2])
+    tilted = Rotation.from_euler("y", np.pi / 2 + bend).as_matrix()
     elbow, rear = np.array([0.1, 0, 1.2]), np.array([-0.1, 0, 1.15])
     lever = np.array([-0.15, 0, 0.45])
     return [
@@ -102,7 +104,7 @@ def make_lever_arm() -> list[MachineJoint]:
         MachineJoint("rear", "R", "tie", "forearm", about("y", rear)),
         MachineJoint("roll", "R", "forearm", "hand1", about("x", [0.3, 0, 1.25]), True),
         MachineJoint("bend", "R", "hand1", "hand2", about("y", [0.7, 0, 1.25]), True),
-        MachineJoint("flange", "R", "hand2", PLATFORM, about("x", [0.8, 0, 1.2]), True),
+        MachineJoint("flange", "R", "hand2", PLATFORM, make_pose(tilted, [0.8, 0, 1.25]), True),
     ]
 
 
@@ -119,3 +121,37 @@ def make_tilted_table() -> list[MachineJoint]:
             T = tilt @ make_pose(np.eye(3), place)
             joints.append(MachineJoint(f"{name}{k}", "R", bodies[i], bodies[i + 1], T, i == 0))
     return joints
+
+
+def make_digger(has_rocker: bool = False) -> list[MachineJoint]:
+    """Return an excavator: a slew, and cylinders that move boom, stick and bucket.
+
+    With a rocker, the cylinder of the bucket pushes a rocker that a link joins to the bucket.
+    """
+    slew = MachineJoint("slew", "R", BASE, "house", about("z", [0, 0, 1]), True)
+    boom = _make_cylinder("boom", "house", "boom", [0.2, 0, 1.5], [0.6, 0, 1.2], [2.0, 0, 2.6])
+    stick = _make_cylinder("stick", "boom", "stick", [4.0, 0, 3.5], [2.6, 0, 3.6], [3.8, 0, 4.0])
+    if not has_rocker:
+        last = _make_cylinder("dig", "stick", PLATFORM, [5.0, 0, 1.8], [4.4, 0, 3.4], [5.2, 0, 2.2])
+        return [slew, *boom, *stick, *last]
+    push = _make_cylinder("dig", "stick", "rocker", [4.9, 0, 2.2], [4.4, 0, 3.4], [5.2, 0, 2.5])
+    return [
+        *(slew, *boom, *stick, *push),
+        MachineJoint("link_top", "R", "rocker", "link", about("y", [5.25, 0, 2.45])),
+        MachineJoint("link_end", "R", "link", PLATFORM, about("y", [5.4, 0, 2.0])),
+        MachineJoint("bucket", "R", "stick", PLATFORM, about("y", [5.0, 0, 1.8])),
+    ]
+
+
+def _make_cylinder(
+    name: str, a: str, b: str, pin: ArrayLike, foot: ArrayLike, head: ArrayLike
+) -> list[MachineJoint]:
+    """Return a pin between two bodies, and a cylinder that turns it."""
+    along = np.subtract(head, foot)
+    slide = Rotation.align_vectors([along, [0, 1, 0]], [[0, 0, 1], [0, 1, 0]])[0].as_matrix()
+    return [
+        MachineJoint(f"{name}_pin", "R", a, b, about("y", pin)),
+        MachineJoint(f"{name}_foot", "R", a, f"{name}_barrel", about("y", foot)),
+        MachineJoint(name, "P", f"{name}_barrel", f"{name}_rod", make_pose(slide, head), True),
+        MachineJoint(f"{name}_head", "R", f"{name}_rod", b, about("y", head)),
+    ]

@@ -109,9 +109,14 @@ def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
             same = other.orient(joint.body_a)
             gaps = (joint.T_a[:3, 3] - same.T_a[:3, 3], joint.T_b[:3, 3] - same.T_b[:3, 3])
             if np.abs(gaps).max() < COAXIAL:
-                names = {"closure": joint.name, "other": other.name}
-                bodies = {"body_a": joint.body_a, "body_b": joint.body_b}
-                raise MechanismError(report_finding("files.closure-repeated", **names, **bodies))
+                finding = report_finding(
+                    "files.closure-repeated",
+                    closure=joint.name,
+                    other=other.name,
+                    body_a=joint.body_a,
+                    body_b=joint.body_b,
+                )
+                raise MechanismError(finding)
 
 
 def _merge_pins(

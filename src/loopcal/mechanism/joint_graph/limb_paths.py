@@ -18,7 +18,7 @@ from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.mechanism.joint_graph.home_pose import Freedoms, find_freedoms, list_nearby
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
+from loopcal.value_classes import dataclass, replace
 
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
@@ -77,7 +77,26 @@ def place_limbs(
     used |= {joint.origin_b for limb in limbs for joint in limb}
     replaced = tuple(joint.name for joint in graph.joints if joint.name not in used)
     motions = find_freedoms(graph, home, platform)
+    limbs = _keep_shifts_in_plane(graph, home, limbs, freedoms)
     return LimbPaths(graph, home, platform, limbs, freedoms, motions, replaced)
+
+
+def _keep_shifts_in_plane(
+    graph: JointGraph, home: FloatArray, limbs: tuple[Path, ...], freedoms: tuple[str, ...]
+) -> tuple[Path, ...]:
+    """Return limbs without the shifts normal to their plane, which no equation of it contains."""
+    normals = [AXES[i + 3] for i in range(3) if AXES[i] in freedoms]
+    if len(normals) != 1 or normals[0] in freedoms:
+        return limbs
+    normal = np.eye(3)[AXES[3:].index(normals[0])]
+    placement = graph.place(home[None])
+
+    def keep(joint: GraphJoint) -> GraphJoint:
+        R = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0, :3, :3]
+        across = [a for a in joint.shifts if abs(normal @ R[:, "xyz".index(a)]) < 1 - MOTION]
+        return replace(joint, shifts="".join(across))
+
+    return tuple(tuple(map(keep, limb)) for limb in limbs)
 
 
 def is_translating(block: Block, home: FloatArray) -> bool:
