@@ -11,6 +11,7 @@ from loopcal.apply import validate
 from loopcal.diagnose import compute_noise_floor, compute_row_errors, find_moved_setups
 from loopcal.errors import DataError
 from loopcal.estimate import identify
+from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import (
     KINDS,
@@ -20,9 +21,11 @@ from loopcal.measure import (
     Pose,
     Position,
     Sensor,
+    sample_truth,
     simulate,
 )
 from loopcal.measure.kinds.error_groups import list_error_groups
+from loopcal.mechanism import sample_workspace
 from tests import zoo
 from tests.estimate.problems import (
     UM,
@@ -127,6 +130,36 @@ def test_commanded_errors_of_a_hexapod_equal_predicted_errors(validation):
     np.testing.assert_allclose(
         validation.commanded_before.position, validation.before.position, rtol=1e-12
     )
+
+
+TWO_JOINTS = """format: 1
+family: stages
+name: arm
+units: {length: mm, angle: deg}
+controlled: [x, y]
+stages:
+  - name: shoulder
+    joint: {kind: R, start: 20, errors: [offset]}
+  - name: elbow
+    mount: {x: 300}
+    joint: {kind: R, start: 60, tip: [250, 0, 0], errors: [x, offset]}
+tolerances: {lengths: {sd: 0.5}, angles: {sd: 0.1}}
+workspace: {x: [150, 350], y: [200, 400]}
+"""
+
+
+def test_positions_that_are_commanded_can_be_corrected_whatever_the_platform_turns(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(TWO_JOINTS)
+    robot = load_robot(path)
+    truth = robot.with_values(sample_truth(robot, 1, 3)[0])
+    noise = Gaussian(np.full(3, 1e-6))
+    poses = sample_workspace(robot, 12, seed=1).coordinates
+    data = simulate(truth, poses, Instrument((Sensor(Position(), noise),)), 2)
+    perfect = validate(truth, data)
+    assert perfect.before.statistics("position").rms > 0.2 * MM
+    # [m] the size of the arm is 0.5 m; orientation and position were traded off here
+    assert perfect.not_compensable.position.max() < 1e-9
 
 
 def test_errors_without_an_actuator_are_not_compensable():

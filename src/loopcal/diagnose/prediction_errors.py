@@ -26,7 +26,7 @@ from loopcal.measure import (
     list_sensed_joints,
     select_joint_values,
 )
-from loopcal.mechanism import Mechanism, Solution, inverse, make_solution
+from loopcal.mechanism import Mechanism, Solution, inverse, make_solution, read_coordinates
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -191,7 +191,8 @@ def compare_predictions(
         for robot, setup in ((before, setup_before), (after, setup_after))
     )
     predictable = first.is_determined & last.is_determined
-    commanded = inverse(after, first.solution.T)
+    # a controller states coordinates; of a whole pose, `inverse` would return the nearest one
+    commanded = inverse(after, read_coordinates(first.solution.T, after.controlled))
     reached = first.solution.converged & last.solution.converged & commanded.converged
     usable = reached & predictable
     if not usable.any():
