@@ -225,15 +225,26 @@ def _translate(
 ) -> tuple[tuple[str, str], Location]:
     """Return the first complaint of pydantic (by line) in our own words, and its location.
 
-    Where pydantic names branches of a union, the deepest complaint is the relevant one.
+    Where pydantic names branches of a union, the deepest complaint is the relevant one; a constant
+    that another branch has comes last.
     """
     complaints = error.errors(include_url=False, include_context=True)
     places = [_resolve(c["loc"], content) for c in complaints]
     if any(len(path) < len(c["loc"]) - 1 for (path, _), c in zip(places, complaints, strict=True)):
-        chosen = max(range(len(places)), key=lambda i: len(places[i][0]))
+        chosen = max(
+            range(len(places)),
+            key=lambda i: (len(places[i][0]), complaints[i]["type"] != "literal_error"),
+        )
     else:
         chosen = min(range(len(places)), key=lambda i: file.line((*location, *places[i][0])))
     complaint, (path, node) = complaints[chosen], places[chosen]
+    if complaint["type"] == "literal_error":  # every branch names its own constants
+        expected = {
+            c["ctx"]["expected"]: None
+            for c, place in zip(complaints, places, strict=True)
+            if c["type"] == "literal_error" and place[0] == path
+        }
+        complaint = {**complaint, "ctx": {"expected": ", ".join(expected)}}
     parent = complaint["loc"][:-1]
     missing = [c["loc"][-1] for c in complaints if c["loc"] and c["loc"][:-1] == parent]
     needed = max((step + 1 for step in missing if isinstance(step, int)), default=0)
@@ -265,7 +276,7 @@ NUMBERS: Mapping[str, str] = {
 SHAPES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("tuple_type", "list_type"), ("a list", "write it as [.., ..]")),
     **dict.fromkeys(
-        ("dataclass_type", "dict_type", "dataclass_exact_type"),
+        ("dataclass_type", "dict_type", "mapping_type", "dataclass_exact_type"),
         ("a mapping", "write 'key: value' lines"),
     ),
     "string_type": ("text", "put it in quotes"),
