@@ -23,7 +23,7 @@ SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, s
         (SECOND, "q2: {reads: length, sum: [m, k]}",
          "'actuators.q2.sum' is a list of 2, but a mapping is needed", 9),
         (SECOND, "q2: {reads: lenght, sum: {m: 1, k: 2}}",
-         "'lenght' .did you mean 'length'.; allowed: 'length', 'angle'", 9),
+         "'lenght' .did you mean 'length'..; allowed: 'length', 'angle'", 9),
         (SECOND, "q2: {reads: length}", "'q2' drives no joint and states no `sum:`", 9),
         ("[weight.n]", "[weight.k]", "no term 'weight.k'", 8),
         ("[weight.n]", "[wait.n]", "no term 'wait.n'", None),

@@ -30,7 +30,8 @@ def test_picture_of_every_shipped_robot_has_units_on_its_axes(name):
         assert "[mm]" in axes.get_xlabel()
         assert "[mm]" in axes.get_ylabel()
     assert robot.name in figure.get_suptitle()
-    assert f"{len(robot.assembly.limbs)} limbs" in figure.get_suptitle()
+    count = len(robot.assembly.limbs)
+    assert f" {count} {'limb' if count == 1 else 'limbs'}, " in figure.get_suptitle()
     assert {text.get_text() for text in above.texts} == {limb.name for limb in robot.assembly.limbs}
 
 
