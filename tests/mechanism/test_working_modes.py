@@ -37,7 +37,8 @@ from loopcal.mechanism.batch_kinematics import (
     forward_trials,
     inverse_trials,
 )
-from loopcal.mechanism.solution_modes import SAME_POSE, judge_modes
+from loopcal.mechanism.kinematics import make_solution
+from loopcal.mechanism.solution_modes import SAME_POSE, has_bends, judge_modes
 from loopcal.mechanism.states import select_poses
 from tests.zoo import load_cached_robot
 
@@ -109,6 +110,12 @@ def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
         gap = measure_gap(robot, back, closed.T[0])
         has_sign = clear_sign(robot, closed).closure_sign == clear_sign(robot, home).closure_sign
         expected = has_sign[0] & (gap <= SAME_POSE)
+        if has_bends(robot):  # an arm that was stretched on the way is bent to the other side
+            q = compute_readings(robot, values, closed)[0]
+            at_home = forward(robot, start_readings(robot))
+            expected &= measure_mobility_sign(
+                robot, make_solution(robot, closed, q)
+            ) == measure_mobility_sign(robot, at_home)
         for begin in (home, robot.home_state):  # a start of one pose allows proofs
             judged, is_other = judge_modes(robot, closed, begin)
             assert is_other[~expected].all()
@@ -203,6 +210,25 @@ def test_two_turns_of_the_cranks_reach_what_the_first_solution_does_not() -> Non
     result = inverse(robot, targets)
     assert not (result.status == Status.OTHER_MODE).any()
     assert result.converged.sum() > 10
+
+
+def test_arms_of_a_five_bar_stay_bent_as_at_home() -> None:
+    # Closed form: the tip of an arm of 200 mm, and on which side of the arm the rod lies.
+    robot = load_cached_robot("five-bar")
+    motors = np.array([[-0.075, 0.0], [0.075, 0.0]])
+
+    def find_sides(solution: Solution) -> Array:
+        arm = 0.2 * np.stack([np.cos(solution.q), np.sin(solution.q)], axis=-1)
+        rod = solution.T[:, None, :2, 3] - motors - arm
+        return np.sign(arm[..., 0] * rod[..., 1] - arm[..., 1] * rod[..., 0])
+
+    # Each of the first two was CONVERGED with one arm bent to the other side.
+    targets = np.array([[0.28494558, 0.15969963], [-0.29664238, 0.1867183]])
+    result = inverse(robot, np.concatenate([targets, draw_targets(robot, 6.0, 200)]))
+    assert result.converged[:2].all()
+    assert result.converged.sum() > 50
+    home = find_sides(forward(robot, start_readings(robot)))
+    assert (find_sides(result)[result.converged] == home).all()
 
 
 @pytest.mark.parametrize("name", ["five-bar", "3-rrr", "linear-delta"])

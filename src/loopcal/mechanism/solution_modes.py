@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
@@ -108,6 +109,24 @@ def has_one_solution(robot: Mechanism) -> bool:
     return all(g.ending == "distance" and g.actuator[-1, 0] >= 0 for g in robot.program.groups)
 
 
+def has_bends(robot: Mechanism) -> bool:
+    """Return whether limbs that are closed one by one at a pose may have several readings there."""
+    if robot.stages or robot.is_serial or needs_readings(robot.program):
+        return False
+    return determine_platform(robot) and not has_one_solution(robot)
+
+
+def compute_bend(robot: Mechanism, state: State) -> NDArray[np.int8]:
+    """Return the sign (n,) of the determinant of the limbs at their platform, every joint free.
+
+    It changes where a limb is stretched or folded: there its readings have two solutions that
+    coincide, and the machine passes from one working mode to another.
+    """
+    e, _ = robot.slots(robot.values[None])
+    limbs, joints = robot.program.with_fixed_platform, driven_values(robot.program, state)
+    return engine.solve(limbs, e, joints, state, free=True, max_iterations=0).closure_sign[0]
+
+
 def reach_coordinates(
     robot: Mechanism, target: FloatArray, start: State | None = None
 ) -> tuple[State, BoolArray | None]:
@@ -160,6 +179,8 @@ def judge_modes(
             sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
         state = replace(state, closure_sign=sign[None])
     is_other = closed & (sign != begin.closure_sign[0])
+    if has_bends(robot):
+        is_other |= closed & (compute_bend(robot, state) != compute_bend(robot, begin))
     rows = np.flatnonzero(closed & ~is_other & ~is_sure)
     if not len(rows):
         return state, is_other
