@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 import loopcal as lc
-from loopcal.diagnose import estimate_frame_drifts, report_base_targets
+from loopcal.diagnose import estimate_frame_drifts, interpret_fit, report_base_targets
 from loopcal.diagnose.frame_drift import compare_shapes
 from loopcal.errors import DataError
 from loopcal.estimate import MAP, FitOptions
+from loopcal.findings import Finding
 from loopcal.measure import sample_truth
 from loopcal.mechanism import forward, resolve_poses
 from loopcal.workflow import Verdict
@@ -303,6 +304,26 @@ def test_two_targets_leave_one_rotation_of_the_base_open():
     # of the six motions of the base, a point leaves three, two points one, three points none;
     # the six of the platform stay open, since its targets are unknown
     assert open_base == [12, 9, 7, 6]
+
+
+def test_the_rotation_that_two_targets_leave_open_is_named_by_its_axis():
+    hexapod = lc.load_robot("hexapod-octahedral")
+    places = np.array([[0.1, 0, 0], [-0.05, 0.09, 0.02], [-0.05, -0.09, 0.0]])
+    platform = lc.Position(targets=("A", "B", "C"), places=places, unknown=("frame",))
+    base = lc.Position(targets=NAMES[:2], places=PLACES[:2], unknown=("frame",), of="base")
+    sensors = (
+        lc.Sensor(platform, lc.Gaussian(np.full(9, SIGMA))),
+        lc.Sensor(base, lc.Gaussian(np.full(6, SIGMA))),
+    )
+    data = lc.simulate(hexapod, resolve_poses(hexapod, 15, 1), lc.Instrument(sensors), 1)
+    (combination,) = interpret_fit(lc.identify(hexapod, data)).unidentifiable
+    motion = combination.meaning
+    assert isinstance(motion, Finding)
+    axis = np.array([float(x) for x in motion.data["axis"].strip("()").split(",")])
+    line = (PLACES[1] - PLACES[0]) / np.linalg.norm(PLACES[1] - PLACES[0])
+    assert (motion.data["frame"], motion.data["motion"]) == ("base", "rotation")
+    # three digits are printed
+    assert abs(axis @ line) == pytest.approx(1.0, abs=5e-3)
 
 
 def test_any_kind_of_points_may_be_on_the_base():

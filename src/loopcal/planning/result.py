@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.measure import Instrument
+from loopcal.measure import Instrument, Kind
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.planning.options import PlanOptions
 from loopcal.planning.path import locate_home
@@ -200,7 +200,7 @@ class Plan(TableResult):
             counted=name_groups(self.poses.groups.shape[1]),
             fitted=self.n_groups,
             held_out=groups - self.n_groups,
-            kinds=tuple(sensor.kind.name for sensor in self.instrument.sensors),
+            kinds=tuple(_name_kind(sensor.kind) for sensor in self.instrument.sensors),
         )
 
     def _report_path(self) -> Finding:
@@ -283,3 +283,8 @@ def list_stops(plan: Plan) -> tuple[Stop, ...]:
         held_out = bool(poses.held_out[i])
         stops.append(Stop(label, False, held_out, poses.coordinates[i], poses.readings[i]))
     return tuple(stops)
+
+
+def _name_kind(kind: Kind) -> str:
+    """Return the name of a kind, with the base if its targets are there."""
+    return f"{kind.name} of targets on the base" if kind.is_of_base else kind.name
