@@ -92,6 +92,28 @@ workspace: {x: [-80, 80]}
 """A planar four-bar linkage described in space, with four R joints."""
 
 
+THREE_RRR = """format: 1
+family: limbs
+name: three-rrr
+source: ours
+units: {length: mm, angle: deg}
+controlled: [x, y, yaw]
+limbs:
+  - name: arm
+    ending: rigid
+    chain:
+      - {joint: R, name: motor, at: [300, 0, 0], axis: z, actuated: q, start: 130}
+      - {joint: R, name: elbow, at: [150, 0, 0], axis: z, start: 97}
+      - {joint: R, name: wrist, at: [170, 0, 0], axis: z, start: -29}
+    attach: [60, 0, 0]
+    copies: {count: 3}
+    errors:
+      - {of: elbow, shift: [x, z], tolerance: {sd: 0.1}}
+      - {of: wrist, tilt: [rx], tolerance: {sd: 0.02}}
+workspace: {x: [-50, 50], y: [-50, 50], yaw: [-10, 10]}
+"""
+"""A planar machine described in space, with three equal limbs."""
+
 RAILS = """format: 1
 family: limbs
 name: rails
@@ -175,3 +197,24 @@ def solve_exechon(robot: Mechanism, values: Array, q: Array, start: Array) -> Ar
     T[:3, :3] = Rotation.from_rotvec(found.x[:3]).as_matrix() @ start[:3, :3]
     T[:3, 3] = found.x[3:6]
     return T
+
+
+def put_on_wrist(text: str) -> str:
+    """Return the text of a chain: the machine of a text as its first stage, and a wrist."""
+    kept = [line for line in text.splitlines()[5:] if not line.startswith("workspace")]
+    head = "\n".join(f"    {line}" for line in kept)
+    return f"""format: 1
+family: stages
+name: chain
+source: ours
+units: {{length: mm, angle: deg}}
+controlled: [z, phi, theta, psi]
+stages:
+  - name: head
+    family: limbs
+{head}
+  - name: wrist
+    joint: {{kind: R, stroke: [-170, 170], start: 10, errors: [x, offset]}}
+tolerances: {{lengths: {{sd: 0.1}}, angles: {{sd: 0.02}}}}
+workspace: {{z: [950, 1100], phi: [-180, 180], theta: [1, 10], psi: [-90, 90]}}
+"""

@@ -17,6 +17,8 @@ from loopcal.mechanism import (
     Mechanism,
     Status,
     build,
+    compare_coordinates,
+    differentiate_passive_joints,
     differentiate_pose,
     forward,
     forward_trials,
@@ -34,8 +36,10 @@ from tests.over_constrained import (
     EXECHON,
     FOUR_BAR,
     RAILS,
+    THREE_RRR,
     close_by_least_squares,
     load_text,
+    put_on_wrist,
     solve_exechon,
 )
 from tests.zoo import move_base, place
@@ -198,6 +202,35 @@ def test_derivatives_of_open_loops_agree_with_differences(text: str, tmp_path: P
         assert_allclose(D.readings[..., i], differ(0 * values[0], unit), atol=2e-7)
 
 
+@BOTH
+def test_derivatives_of_passive_joints_of_open_loops_agree_with_differences(
+    text: str, tmp_path: Path
+) -> None:
+    robot = load_text(tmp_path, close_by_least_squares(text))
+    values, q = draw(robot, 2)
+    state = forward_trials(robot, values, q)
+    D = differentiate_passive_joints(robot, values, q, state)
+    h = 1e-5
+
+    def read(shift_values: np.ndarray, shift_q: np.ndarray) -> np.ndarray:
+        moved = forward_trials(robot, values + shift_values, q + shift_q, state)
+        joints = {
+            f"{robot.assembly.limbs[i].name}.{joint.name}": own[:, :, k, j]
+            for group, own in zip(robot.program.groups, moved.joints, strict=True)
+            for k, i in enumerate(group.limbs)
+            for j, joint in enumerate(robot.assembly.limbs[i].joints)
+        }
+        return np.stack([joints[name] for name in D.names], axis=-1)
+
+    for i, unit in enumerate(h * np.eye(values.shape[1])):
+        differences = (read(unit, 0 * q[0, 0]) - read(-unit, 0 * q[0, 0])) / (2 * h)
+        # [rad/m, 1] a step of 1e-5 has an error of about 1e-10 times the third derivative
+        assert_allclose(D.parameters[..., i], differences, atol=2e-7)
+    for i, unit in enumerate(h * np.eye(q.shape[2])):
+        differences = (read(0 * values[0], unit) - read(0 * values[0], -unit)) / (2 * h)
+        assert_allclose(D.readings[..., i], differences, atol=2e-7)
+
+
 def test_least_squares_closure_without_repeated_equations_changes_nothing(tmp_path: Path) -> None:
     text = FOUR_BAR.replace("controlled:", "freedoms: [ry, x, z]\ncontrolled:")
     plain = load_text(tmp_path, text)
@@ -264,3 +297,35 @@ def test_a_machine_that_is_not_over_constrained_has_no_proposal(tmp_path: Path) 
     planar = FOUR_BAR.replace("controlled:", "freedoms: [ry, x, z]\ncontrolled:")
     assert propose_added_joints(load_text(tmp_path, planar)) is None
     assert propose_added_joints(load_text(tmp_path, close_by_least_squares(EXECHON))) is None
+
+
+def test_a_joint_of_a_limb_with_copies_is_freed_in_each_copy(tmp_path: Path) -> None:
+    robot = load_text(tmp_path, THREE_RRR)
+    data = get_data(robot)
+    assert (data["count"], data["freedoms"]) == (6, ("rz", "x", "y"))
+    assert [entry["limb"] for entry in data["repeated"]] == ["arm2", "arm3"]
+    finding = propose_added_joints(robot)
+    assert finding is not None
+    for chosen in finding.data["proposals"]:
+        assert len(chosen) == 2  # in each of three limbs
+        written = THREE_RRR
+        for added in reversed(chosen):
+            written = insert_line(written, added)
+        assert load_text(tmp_path, written).findings == ()
+
+
+def test_stage_of_a_chain_names_its_parameters_and_closes_by_least_squares(tmp_path: Path) -> None:
+    alone = find_breaking_parameters(load_text(tmp_path, EXECHON))
+    chain = load_text(tmp_path, put_on_wrist(EXECHON))
+    assert find_breaking_parameters(chain) == tuple(f"head.{name}" for name in alone)
+    with pytest.raises(MechanismError):
+        sample_truth(chain, 1, 0)
+    robot = load_text(tmp_path, put_on_wrist(close_by_least_squares(EXECHON)))
+    true = robot.with_values(sample_truth(robot, 1, 5)[0])
+    asked = np.array([[1.0, 0.3, 0.08, -0.4], [1.05, -2.0, 0.1, 0.9]])
+    solution = inverse(true, asked)
+    assert solution.converged.all()
+    again = forward(true, solution.q)
+    assert again.converged.all()
+    error = compare_coordinates(again.T, asked, robot.controlled, robot.size)[0]
+    assert_allclose(error, 0, atol=1e-10)  # [m]

@@ -118,13 +118,31 @@ def differentiate_open(
     program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
 ) -> tuple[FloatArray, FloatArray]:
     """Differentiate the platform of a least-squares closure; see `loopcal.engine.differentiate`."""
+    by_input, freedoms = differentiate_unknowns(program, e, q, state, inputs), program.freedoms
+    p, m = inputs.pattern.parameters, len(freedoms)
+    out = np.zeros((*state.T.shape[:2], 6, by_input.shape[-1]))
+    out[:, :, list(freedoms)] = by_input[:, :, :m]
+    return out[..., :p], out[..., p:]
+
+
+def differentiate_unknowns(
+    program: Program, e: FloatArray, q: FloatArray, state: State, inputs: ParameterMap
+) -> FloatArray:
+    """Differentiate the unknowns of a least-squares closure by p parameters and a readings.
+
+    Arguments are those of `loopcal.engine.differentiate`.
+
+    Returns
+    -------
+    (t, n, u, p + a), the freedoms of the platform, then the joints of `list_unknown_joints`.
+    """
     t, n = state.T.shape[:2]
-    p, a = inputs.pattern.parameters, program.n_joints
-    out = np.zeros((t * n, 6, p + a))
     joints = [
         np.broadcast_to(g.insert_driven(own, q), (t, n, *own.shape[2:]))
         for g, own in zip(program.groups, state.joints, strict=True)
     ]
+    count = len(program.freedoms) + len(list_unknown_joints(program))
+    out = np.zeros((t * n, count, inputs.pattern.parameters + program.n_joints))
     for first in range(0, t * n, CHUNK):
         trial, pose = np.divmod(np.arange(first, min(first + CHUNK, t * n)), n)
         rows = _Rows(
@@ -135,8 +153,18 @@ def differentiate_open(
         )
         with np.errstate(all="ignore"):
             moved = _differentiate_rows(program, rows, _map_inputs(program, inputs, trial, pose))
-        out[first : first + len(trial), list(program.freedoms)] = moved
-    return out[..., :p].reshape(t, n, 6, p), out[..., p:].reshape(t, n, 6, a)
+        out[first : first + len(trial)] = moved
+    return out.reshape(t, n, *out.shape[1:])
+
+
+def list_unknown_joints(program: Program) -> list[tuple[int, int]]:
+    """Return limb and number of each joint that closure determines, group by group."""
+    return [
+        (limb, joint)
+        for group in program.groups
+        for limb in group.limbs
+        for joint in group.unknown_joints(False)
+    ]
 
 
 def fold_open_poses(
@@ -222,7 +250,7 @@ def _map_inputs(
 
 
 def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> FloatArray:
-    """Return the platform's freedoms by parameters and readings (N, m, p + a)."""
+    """Return the unknowns by parameters and readings (N, u, p + a)."""
     m, N, width = len(program.freedoms), len(rows.T), inputs.joints.shape[2]
     unknown = [g.unknown_joints(False) for g in program.groups]
     total = m + sum(len(g.limbs) * len(u) for g, u in zip(program.groups, unknown, strict=True))
@@ -249,7 +277,7 @@ def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> Flo
             J.append(place(*(a[:, k, chosen] for a in (block.A, block.E, block.Q)))[..., :total])
             dr.append(place(*(a[:, k, chosen] for a in exact)))
             bent[:, columns] += place(*(a[:, k] for a in bends[number]))
-    return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), bent)[:, :m]
+    return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), bent)
 
 
 def _correct_slopes(

@@ -21,7 +21,12 @@ from loopcal.engine import State
 from loopcal.mechanism.driven_joints import DrivenJoints, drive_joints
 from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.open_closure import differentiate_open, fold_open_poses
+from loopcal.mechanism.open_closure import (
+    differentiate_open,
+    differentiate_unknowns,
+    fold_open_poses,
+    list_unknown_joints,
+)
 from loopcal.mechanism.parameter_units import ParameterUnits
 from loopcal.mechanism.stages.chain_kinematics import (
     differentiate_end,
@@ -168,8 +173,31 @@ def differentiate_passive_joints(
         for place, column, by_values in limbs.turned_joints(names):
             parameters[rows][:, :, place] = by_values
             readings[rows][:, :, place, column] = limbs.joints_by_reading[:, :, column]
+    if robot.program.may_stay_open and summed is None:
+        places, exact = _differentiate_open_joints(robot, values, q, state, names)
+        parameters[:, :, places], readings[:, :, places] = np.split(
+            exact, [len(robot.parameters)], axis=-1
+        )
     parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, parameters, readings)
+
+
+def _differentiate_open_joints(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, names: Sequence[str]
+) -> tuple[list[int], FloatArray]:
+    """Return the places in `names` of joints whose loops may stay open, and their derivatives by
+    parameters and readings (t, n, j, p + a).
+    """
+    program, limbs = robot.program, robot.assembly.limbs
+    e, tau = robot.slots(values)
+    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    inputs = robot.all_parameters.linearize(values, tau, q)
+    exact = differentiate_unknowns(program, e, joints, state, inputs)
+    places = [
+        names.index(f"{limbs[i].name}.{limbs[i].joints[j].name}")
+        for i, j in list_unknown_joints(program)
+    ]
+    return places, exact[:, :, len(program.freedoms) :]
 
 
 def differentiate_sensed_values(
