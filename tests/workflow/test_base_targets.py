@@ -15,6 +15,7 @@ from scipy.stats import chi2, kstest
 
 import loopcal as lc
 from loopcal.diagnose import estimate_frame_drifts, interpret_fit, report_base_targets
+from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
 from loopcal.diagnose.frame_drift import compare_shapes
 from loopcal.errors import DataError
 from loopcal.estimate import MAP, FitOptions
@@ -270,6 +271,12 @@ def test_rows_of_the_base_are_no_errors_of_poses():
     assert report.examination.outliers.blocks == 15
     # the residuals of the fit name them by their body
     assert set(report.identification.residuals[-1].poses) == {"base"}
+
+
+def test_repeated_targets_on_the_base_are_no_repeated_poses():
+    data, _ = measure(2)
+    lack = check_lack_of_fit(lc.identify(ROBOT, data), data)
+    assert [finding.code for finding in lack.findings] == ["residuals.no-repeats"]
 
 
 def test_uncertain_readings_and_targets_on_the_base_are_fitted_together():

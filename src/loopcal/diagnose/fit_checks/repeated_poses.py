@@ -126,7 +126,11 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
 
 
 def _group_repeats(rows: ObservationRows, member: IntArray) -> IntArray:
-    """Return the group (r,) of rows of one kind that repeat each other."""
+    """Return the group (r,) of rows of one kind that repeat each other; rows of targets on the base
+    repeat no pose.
+    """
+    if rows.kind.is_of_base:
+        return np.arange(len(rows.poses))
     same = np.column_stack([member[rows.poses_by_link], rows.nuisance])
     return np.asarray(np.unique(same, axis=0, return_inverse=True)[1].ravel())
 
