@@ -10,8 +10,18 @@ from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
+from loopcal.estimate import LeastSquares, identify_trials
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, select_joint_values, simulate
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    Pose,
+    Sensor,
+    sample_truth,
+    select_joint_values,
+    simulate,
+    simulate_trials,
+)
 from loopcal.mechanism import (
     Mechanism,
     Status,
@@ -247,6 +257,23 @@ def test_the_complete_error_model_has_the_offsets_of_the_sums(tmp_path: Path) ->
     robot = load_text(tmp_path, text)
     offsets = [name for name in robot.parameters.names if name.endswith(".offset")]
     assert offsets == ["q1.offset", "q2.offset", "q3.offset"]
+
+
+@pytest.mark.parametrize("name", ["core-xy", "pulley-3"])
+def test_weights_of_simulated_machines_are_as_accurate_as_stated(name: str) -> None:
+    robot = load_cached_robot(name)
+    noise = Gaussian(np.repeat([5e-5, 1e-5], 3))  # [rad, m]
+    instrument = Instrument((Sensor(Pose("rotation-vector"), noise),))
+    poses, truth = sample_workspace(robot, 40, seed=1).coordinates, sample_truth(robot, 200, 2)
+    trials = simulate_trials(robot, truth, poses, instrument, 3)
+    fits = identify_trials(robot, trials, LeastSquares())
+    assert fits.converged.all()
+    is_weight = np.array([".weight." in p for p in robot.parameters.names])
+    error = ((fits.values - truth) / fits.standard_deviations())[:, is_weight]
+    before = (robot.values - truth)[:, is_weight] / 1e-3  # in tolerances
+    assert np.abs(fits.values - truth)[:, is_weight].max() < 0.3e-3 * np.abs(before).max()
+    # squares of 200 draws have the mean 1 +- sqrt(2 / 200), 2.6 times that
+    np.testing.assert_allclose((error**2).mean(axis=0), 1.0, rtol=0, atol=2.6 * np.sqrt(2 / 200))
 
 
 def test_uncertain_readings_of_sums_are_estimated(tmp_path: Path) -> None:
