@@ -141,6 +141,23 @@ class Program:
         return replace(self, freedoms=())
 
     @cached_property
+    def idle_groups(self) -> tuple[int, ...]:
+        """Groups of limbs without a drive that constrain nothing: their joints follow the platform.
+
+        Each has as many unknown joints as equations, such as a limb that only carries sensors.
+        """
+        return tuple(
+            i
+            for i, g in enumerate(self.groups)
+            if g.actuator.max() < 0 and len(g.rows) == len(g.unknown_joints(free=False))
+        )
+
+    @cached_property
+    def idle_limbs(self) -> Program:
+        """The limbs of the idle groups alone, with a platform that stays where the start has it."""
+        return replace(self, groups=tuple(self.groups[i] for i in self.idle_groups), freedoms=())
+
+    @cached_property
     def is_square(self) -> bool:
         """Whether closure with locked actuators has as many equations as the platform freedoms."""
         return self.count_equations(free=False) == len(self.freedoms)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -128,9 +129,17 @@ def solve(
     goal : solutions (t, n); a row ends as NEAR_GOAL as soon as its next step leads close to its
         goal, to which further steps would converge. Its coordinates are those before that step.
 
-    Rows that fail are marked in `status`; nothing is raised.
+    Rows that fail are marked in `status`; nothing is raised. The closure sign is that of the limbs
+    that constrain the platform: a limb whose joints only follow it may pass its own singularities.
     """
-    return get_current_engine().solve(program, e, q, start, task, free, max_iterations, goal)
+    current = get_current_engine()
+    state = current.solve(program, e, q, start, task, free, max_iterations, goal)
+    if not program.idle_groups:
+        return state
+    joints = tuple(state.joints[i] for i in program.idle_groups)
+    own = replace(state, joints=joints)
+    sign = current.solve(program.idle_limbs, e, q, own, None, True, 0, None).closure_sign
+    return replace(state, closure_sign=state.closure_sign * sign)
 
 
 def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArray[np.int8]:

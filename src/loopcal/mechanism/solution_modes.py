@@ -139,6 +139,7 @@ def reach_coordinates(
     """
     values, target = robot.values[None], target[None]
     is_plain = not (robot.stages or robot.is_serial or needs_readings(robot.program))
+    is_plain &= not robot.program.idle_groups
     if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
         return close_at_coordinates(robot, values, target, start), None
     e, _ = robot.slots(values)
