@@ -2,6 +2,7 @@
 """simulate, calibrate, validate, identifiability and check on shipped robots."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots
 from loopcal.io.runs.run_folder import load_run
 from loopcal.mechanism import forward
 
@@ -257,6 +258,20 @@ def test_simulate_writes_the_drawn_errors_as_a_robot_file(run) -> None:
     drawn = load_robot("drawn.yaml")
     assert 1e-6 < np.std(drawn.values - drawn.parameters.nominal) < 1e-4  # [m], tolerance 0.029 mm
     assert run("calibrate hexapod-42 drawn.csv -o run")[0] == 0
+
+
+def test_simulate_notes_that_a_robot_without_tolerances_has_no_errors_to_draw(
+    run, tmp_path
+) -> None:
+    text = find_robot_file("five-bar").read_text()
+    bare = re.sub(r", (tolerance|angle): \{sd: 0.1\}", "", text)
+    (tmp_path / "bare.yaml").write_text(bare)
+    words = "simulate {} --kind position --draw 5 --draw-errors --truth {}-true.yaml -o {}.csv"
+    code, _, err = run(words.format("bare.yaml", "bare", "bare"))
+    assert (code, "no free parameter of five-bar has a tolerance" in err) == (0, True)
+    true = load_robot("bare-true.yaml")
+    np.testing.assert_array_equal(true.values, true.parameters.nominal)
+    assert run(words.format("five-bar", "full", "full"))[2] == ""
 
 
 def test_simulate_keeps_the_names_of_poses(run, tmp_path) -> None:

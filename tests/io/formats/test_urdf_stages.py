@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """URDF whose loops follow one another is read as a chain of stages, in agreement with a solver."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,21 @@ def test_stages_have_the_names_of_joints_and_links(tmp_path, machine) -> None:
     (finding,) = [f for f in imported.findings if f.code == "files.urdf-stages"]
     assert (finding.data["stages"], finding.data["closed"]) == STAGES[machine]
     assert tuple(stage.name for stage in robot.stages) == STAGES[machine][0]
+
+
+def test_stages_have_names_of_their_own_without_points(tmp_path) -> None:
+    """The link that carries the wrist has the name of a joint, and the slew one with a point."""
+    path = write(tmp_path, make_lever_arm())
+    for file in (path, path.with_suffix(".yaml")):
+        text = re.sub(r"\bforearm\b", "roll", file.read_text())
+        file.write_text(re.sub(r"\bslew\b", "arm.slew:1", text))
+    robot = read(path)[1]
+    names = ("arm_slew_1", "roll", "roll_2", "bend", "flange")
+    assert tuple(stage.name for stage in robot.stages) == names
+    assert robot.actuators[0].name == "arm.slew:1"
+    changed = robot.with_values(robot.values + 1e-4)
+    exported = urdf.write(ExportSource(changed), path)
+    assert "files.not-expressed" not in {finding.code for finding in exported.findings}
 
 
 def test_joint_without_motor_outside_of_loops_is_refused(tmp_path) -> None:

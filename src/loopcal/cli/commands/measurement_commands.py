@@ -275,6 +275,7 @@ def simulate(
       loopcal simulate hexapod-42 --sigma-position 0.6um --distribution uniform -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """  # noqa: D301
+    from loopcal.findings import report_finding
     from loopcal.io import load_robot, save_measurements, save_robot
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.robot.robot_file import find_robot_file
@@ -301,6 +302,9 @@ def simulate(
         save_measurements(result.data, output, result.truth, remark)
         if truth is not None:
             save_robot(result.truth, truth)
+    if draw_errors and not any(p.free and p.tolerance for p in machine.parameters.entries):
+        finding = report_finding("data.no-errors-drawn", robot=machine.name)
+        terminal.print_note(str(finding))
     counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
     if as_json:
         terminal.print_json({"output": output, "truth": truth, **counts, "skipped": result.skipped})

@@ -96,7 +96,7 @@ def list_stage_names(mechanism: UrdfMechanism, paths: StagePaths) -> tuple[str, 
         is_serial = isinstance(stage, SerialStage)
         stated = stage.joint.name if is_serial else choose_link(mechanism, stage.platform)
         plain = stated.replace(".", "_").replace(":", "_")
-        tries = (f"{plain}{suffix}" for suffix in ("", "_loop", *map(str, range(2, 1000))))
+        tries = (f"{plain}{suffix}" for suffix in ("", *(f"_{i}" for i in range(2, 1000))))
         names.append(next(name for name in tries if name not in (BASE, *names)))
     return tuple(names)
 
