@@ -157,6 +157,14 @@ def test_lengths_that_no_angle_reaches_are_unreachable() -> None:
 # --- derivatives
 
 
+def test_a_length_of_the_wrong_sign_is_unreachable() -> None:
+    robot = load_cached_robot("solar-tracker")
+    solution = forward(robot, [[0.8, 1.5], [-0.8, 1.5]])
+    # the second was CONVERGED at the pose of the first, because only its square was used
+    assert solution.status.tolist() == [Status.CONVERGED, Status.UNREACHABLE]
+    assert solution.residual[1] > 0.8  # [m] at least the length itself is missing
+
+
 def test_derivatives_of_the_angle_agree_with_differences_and_jax() -> None:
     terms = np.array([0.6, -0.4, 0.1, 2.3, 0.35, -0.2, 0.05, -0.08])
     constants = np.array([1.0, 1.0])

@@ -36,12 +36,13 @@ MOVABLE = 8
 def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
     """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10).
 
-    It is NaN where no angle reaches the length.
+    It is NaN where no angle reaches the length, which a negative one never does.
     """
     level, reach, gamma = _describe(triangle)
     side, middle = triangle[..., 8], triangle[..., 9]
     with np.errstate(invalid="ignore"):
-        opening = np.arccos((level - length * length) / reach)
+        square = np.where(length < 0.0, np.nan, length * length)
+        opening = np.arccos((level - square) / reach)
     return middle + geometry.wrap_angle(gamma + side * opening - middle)
 
 
