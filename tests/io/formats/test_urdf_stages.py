@@ -93,6 +93,21 @@ def test_chains_agree_with_the_solver(tmp_path, machine, seed) -> None:
     assert np.abs(moved - found.T).max() > 1e-4  # [m, 1]: the changes matter
 
 
+def test_shifts_at_constraints_in_a_limb_with_the_name_of_its_motor_agree(tmp_path) -> None:
+    text, closures = write_machine(make_leg(), 0, has_constraints=True)
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    path.with_suffix(".yaml").write_text(closures)
+    robot = read(path)[1]
+    values = [1e-3 if "top_in_child" in name else 0.0 for name in robot.parameters.names]
+    assert sum(values) == pytest.approx(3e-3)
+    changed, q = robot.with_values(robot.values + values), draw_readings(robot, 1)
+    corrected = tmp_path / "corrected.urdf"
+    corrected.write_text(urdf.write(ExportSource(changed), path).text)
+    moved = forward(changed, q).T
+    np.testing.assert_allclose(moved, solve(corrected, robot, q), rtol=0, atol=AGREES)
+
+
 @pytest.mark.parametrize("machine", STAGES)
 def test_stages_have_the_names_of_joints_and_links(tmp_path, machine) -> None:
     imported, robot = read(write(tmp_path, MACHINES[machine]()))

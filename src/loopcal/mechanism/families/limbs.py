@@ -372,7 +372,8 @@ def _map_entry(
     """Yield the maps of one entry, for every copy that it means."""
     name, (axis, coefficient) = named.name, find_engine_axis(named.name, entry)
     check_units(named, entry, drives.get(entry.limb))
-    if entry.limb in drives:
+    # a limb and a drive may have one name; only a limb has links with axes
+    if entry.limb in drives and axis not in AXES:
         yield LinearMap(name, Address(entry.limb, entry.element, axis), coefficient)
         return
     copies = [member for group in members.values() for member in group]
