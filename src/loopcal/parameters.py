@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from loopcal.errors import MechanismError
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated, Any
 
 from loopcal.errors import UnitError, suggest_names
-from loopcal.value_classes import dataclass
 
 
 class Dimension(Enum):

@@ -44,5 +44,4 @@ def test_engine_imports_numpy_only(root: Path):
         "functools",
         "typing",
         "loopcal.typing",
-        "loopcal.value_classes",  # `dataclass` of the standard library, faster to import
     }

@@ -14,6 +14,7 @@ is known, and that of Student's t for the effective degrees of freedom where it 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -35,7 +36,6 @@ from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
 from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 COMPONENT_LEVEL = 0.954499736103642
 """Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,

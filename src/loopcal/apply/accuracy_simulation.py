@@ -10,6 +10,8 @@ docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -26,7 +28,6 @@ from loopcal.measure import Instrument, Trials, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, Status, forward, forward_trials, inverse
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 BATCH = 250
 """Trials that are identified at once; progress is reported between them."""

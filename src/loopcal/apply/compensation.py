@@ -10,6 +10,7 @@ part remains, and the result states it for each target. See docs/theory/accuracy
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal, get_args
 
@@ -37,7 +38,6 @@ from loopcal.mechanism import (
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 Mode = Literal["readings", "commands"]
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -38,7 +39,6 @@ from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
-from loopcal.value_classes import dataclass
 
 LEVEL = 0.95
 """Probability that conformity and nonconformity need: the default of ISO 14253-1:2017."""

@@ -16,6 +16,7 @@ order; only the setup comes first. A source never has a negative part.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,6 @@ from loopcal.measure import Measurements, Observations
 from loopcal.numerics.back_substitution import substitute_backward
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 INSTRUMENT, READINGS, SETUP = "instrument", "readings", "setup"
 EARLIER, REPEATABILITY = "earlier calibration", "repeatability"

@@ -11,6 +11,7 @@ weights changed, not from the part of the source. See docs/theory/uncertainty.md
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -43,7 +44,6 @@ from loopcal.mechanism import Solution, sample_workspace
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

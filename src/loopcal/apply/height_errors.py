@@ -15,6 +15,7 @@ setup parameters that fit it best at the fitted rows.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,6 @@ from loopcal.mechanism.assembly import AXES
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, Unit
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

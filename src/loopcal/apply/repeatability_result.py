@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from loopcal.findings import Finding
@@ -11,7 +12,6 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,6 +17,7 @@ contains no error of the setup, and before and after differ by the geometry only
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +58,6 @@ from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
 from loopcal.presentation import TableResult, draw
 from loopcal.units import Unit
-from loopcal.value_classes import dataclass, field, replace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from loopcal.measure.array_checks import check_number
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.units import Unit
-from loopcal.value_classes import dataclass
 
 FEW_ROWS = 5
 """Number of rows below which an error cannot be judged.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,6 @@ from loopcal.estimate.result import Identification
 from loopcal.mechanism import forward, resolve_poses
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

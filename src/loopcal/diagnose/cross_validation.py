@@ -12,6 +12,7 @@ exactly for a linear problem.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import decompose
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 NOTHING_LEFT = 1e-12
 """Determinant of 1 - leverage of a block below which the other blocks do not determine its rows."""

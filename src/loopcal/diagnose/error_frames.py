@@ -20,6 +20,7 @@ Derivation: docs/theory/gauge.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -41,7 +42,6 @@ from loopcal.mechanism import (
     forward_trials,
 )
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 Over = Literal["measured", "home", "predicted"]
 FITTED, BASE, RELATIVE = "fitted", "base", "relative"

@@ -15,7 +15,7 @@ rigid motion, which may be large. No robot and no pose enters. The noise is the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,6 @@ from loopcal.measure import Measurements, Observations, Position
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import find_unit
-from loopcal.value_classes import dataclass
 
 LEVEL = 0.01
 """Probability of reporting anything although no frame and no target moved, of each of both tests.

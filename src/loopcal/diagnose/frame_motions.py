@@ -10,6 +10,7 @@ where its frames are placed. See docs/theory/gauge.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,7 +33,6 @@ from loopcal.mechanism import (
 )
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 PROBES = 24
 """Poses at which motions are compared: 144 equations for the 12 numbers of two frames and the

@@ -6,6 +6,7 @@ Singular values are those of whitened rows in units of tolerance.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -38,7 +39,6 @@ from loopcal.numerics.decomposition import (
 from loopcal.presentation import TableResult, draw
 from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
@@ -31,7 +32,6 @@ from loopcal.numerics.decomposition import are_nonzero
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 OFFSETS = re.compile(r"(^|\.)(offset|stop|zero|home)$|^q\d+$")
 """Names of parameters that shift an actuator reading."""

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 SCALING = "rows divided by sigma, columns multiplied by tolerance"
 """Units of the singular values; every index depends on them."""

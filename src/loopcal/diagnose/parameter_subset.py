@@ -11,6 +11,8 @@ docs/theory/observability.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.diagnose.identifiable_parameters import Identifiability
@@ -22,7 +24,6 @@ from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import LinearMap, Mechanism
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 SETTABLE, NONZERO = 0.1, 0.3
 """Weights of parameters that a controller can set (those of a transmission), and of dimensions that

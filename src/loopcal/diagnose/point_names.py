@@ -11,13 +11,13 @@ two poses, so the nominal robot suffices.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.measure import Position
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 FAR = 8.0
 """Distance from its prediction, in medians, above which a point is not where its name says."""

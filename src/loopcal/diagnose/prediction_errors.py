@@ -11,6 +11,7 @@ pose, so they are rows themselves: true minus recorded readings at the pose that
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from loopcal.mechanism import Mechanism, Solution, inverse, make_solution, read_
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

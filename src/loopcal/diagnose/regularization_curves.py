@@ -14,6 +14,7 @@ Stone, Classification and Regression Trees (1984).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -31,7 +32,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import FloatArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,6 +23,7 @@ section 4.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,6 @@ from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 MOST_COMPONENTS = 3
 """Components of the largest error."""

@@ -9,6 +9,7 @@ stays open. A combination is determined when no direction of that null space has
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,7 +41,6 @@ from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 POSES = 24
 """Number of poses of a further measurement."""

@@ -15,6 +15,7 @@ No tolerance of parameters and no rank tolerance enters. See docs/theory/gauge.m
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 NEIGHBORS = (0.1, 10.0)
 """Multiples of the accuracy for which the number of combinations is stated, too."""

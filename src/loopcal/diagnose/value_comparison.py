@@ -21,6 +21,7 @@ No matrix is inverted. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +41,6 @@ from loopcal.numerics.decomposition import NULL_COMPONENT
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 TINY = 1e-99
 """Probability below which a sentence states no number."""

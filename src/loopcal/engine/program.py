@@ -12,13 +12,13 @@ together. The rod of a `distance` ending counts as joint J, whose value is added
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 PITCH, LENGTH = 6, 7
 """Values of `Slot.axis` beside the axes 0..5 of a twist."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -33,7 +33,6 @@ from loopcal.engine.program import (
 from loopcal.errors import MissingPackageError
 from loopcal.findings import report_finding
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 VARIABLE, GROUP = "LOOPCAL_ENGINE", "loopcal.engines"
 """The environment variable that names an engine, and the entry points that provide engines."""

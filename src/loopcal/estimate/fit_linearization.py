@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
@@ -17,7 +19,6 @@ from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ of the result. Where no tolerance is stated, a default one scales the parameter.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +19,6 @@ from loopcal.mechanism import Mechanism, ParameterUnits, refuse_free_breaking_pa
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 DEFAULT_TOLERANCE = 1e-3
 """Tolerance where none is stated: this share of the robot's size for lengths, this many radians for

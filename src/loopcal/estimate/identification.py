@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.errors import EstimationError
@@ -71,7 +73,6 @@ from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 
 def identify(

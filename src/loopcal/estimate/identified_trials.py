@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +15,6 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +30,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.column_elimination import eliminate_from_factor
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

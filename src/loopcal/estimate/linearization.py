@@ -9,6 +9,7 @@ their results do not depend on it beyond rounding, as long as it is near.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from loopcal.estimate.nuisance.elimination import EliminatedNuisance
 from loopcal.estimate.poses.states import PoseEstimates, PoseStates
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

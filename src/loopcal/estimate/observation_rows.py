@@ -9,6 +9,7 @@ larger than it must be.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,7 +19,6 @@ from loopcal.measure import Kind, Measurements
 from loopcal.measure.kinds.rows import MeasuredColumns
 from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, field, replace
 
 BLOCK = 2048
 """Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few

@@ -9,6 +9,8 @@ coordinates of the poses as further columns.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.linearization import Linearization
@@ -17,7 +19,6 @@ from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.linearization import linearize_rows
 from loopcal.estimate.problem import Problem
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -20,7 +21,6 @@ from loopcal.measure import NuisanceParameters
 from loopcal.measure.array_checks import check_number, check_type
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field
 
 Noise = Literal["given", "estimated"]
 """Whether the stated sigmas are true, or true up to one common factor."""

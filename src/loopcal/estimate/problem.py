@@ -17,6 +17,7 @@ docs/theory/uncertain-readings.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -46,7 +47,6 @@ from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Problem:
     trials: IntArray
     nuisance: NuisanceElimination | None
     data: Callable[[int], Measurements]
-    control: Halving = Halving()
+    control: Halving = Halving()  # noqa: RUF009
     sigma: FloatArray | None = None
     member: IntArray | None = None
     coordinates: PoseCoordinates | None = None

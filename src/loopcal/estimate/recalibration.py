@@ -14,6 +14,7 @@ of that noise. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,7 +35,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_averaged_tail
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 MOST_TRIED = 60
 """Number of parameters up to which each is tried alone as the explanation of a change."""

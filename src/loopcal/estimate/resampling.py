@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from loopcal.estimate.result import Identification
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 LEAST_DEGREES = 0.5
 """Degrees of freedom below which residuals show no noise."""

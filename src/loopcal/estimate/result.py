@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -25,7 +26,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.presentation import FitFigures, TableResult
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 LAST_DIGITS = 3
 """Digits of the values at which an iteration ended that did not converge."""

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 from loopcal.presentation import HtmlResult
-from loopcal.value_classes import dataclass
 
 
 class Severity(StrEnum):

@@ -7,6 +7,7 @@ a rotation error about the axes of the frame, so E is the identity there.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -15,7 +16,6 @@ from loopcal.errors import DataError
 from loopcal.geometry import euler_angles, rotations
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 Conversion = Callable[[FloatArray], FloatArray]
 

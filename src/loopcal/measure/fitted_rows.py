@@ -10,6 +10,7 @@ noise, see `loopcal.measure.row_agreement`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.row_agreement import ComparedRows, find_agreeing
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 PREFIX = "fitted"
 """First word of the names of the stored arrays."""

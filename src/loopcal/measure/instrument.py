@@ -2,6 +2,7 @@
 """An instrument: the kinds it measures, each with its frame and its noise, and random streams."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
 import numpy as np
@@ -16,7 +17,6 @@ from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
-from loopcal.value_classes import dataclass, field, replace
 
 # --- noise
 

@@ -2,6 +2,7 @@
 """Measurements: the actuator readings at n poses, and the observations made at them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -18,7 +19,6 @@ from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_si
 from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, field, replace
 
 SAME_READING = 1e-9
 """Readings [m] or [rad] that differ by less belong to repeats of one pose."""

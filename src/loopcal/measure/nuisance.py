@@ -7,6 +7,7 @@ Kinds that use the same name share the parameter.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Self
 
@@ -20,7 +21,6 @@ from loopcal.measure.observations import Observations
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 """Observations: measured rows of one kind, with their poses and covariances."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -16,7 +17,6 @@ from loopcal.measure.traceability import InstrumentRecord
 from loopcal.measure.whitening import compute_whitener
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
-from loopcal.value_classes import dataclass, field, replace
 
 TextArray = NDArray[np.str_]
 """Names of sessions or groups."""

@@ -8,6 +8,7 @@ the true machine turns readings into true poses. The instrument measures these p
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -30,7 +31,6 @@ from loopcal.measure.readings import (
 )
 from loopcal.mechanism import Mechanism, Status, forward, refuse_drawn_errors
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
 

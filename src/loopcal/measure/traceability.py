@@ -8,13 +8,12 @@ instrument that was used after its due date is a finding (ISO/IEC 17025:2017, se
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import date
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.measure.observations import Observations

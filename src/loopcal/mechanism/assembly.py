@@ -7,6 +7,7 @@ Every family expands into an `Assembly`; `loopcal.mechanism.build` compiles it f
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -16,7 +17,6 @@ from loopcal.errors import MechanismError
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")
 """Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""

@@ -7,6 +7,7 @@ docs/theory/kinematics.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +30,6 @@ from loopcal.mechanism.states import Status, is_closed, select_poses
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SI_SYMBOLS
-from loopcal.value_classes import dataclass, replace
 
 COMPROMISE = 1e-9
 """Residual [m] of a converged row above which its redundant readings contradict each other."""

@@ -9,6 +9,7 @@ joint values in place of readings. Derivation: docs/theory/engine.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.mechanism.model import Columns, LimbMap, Mechanism
 from loopcal.mechanism.states import driven_values, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 BLOCK_ROWS = 1024
 """Rows linearized together."""

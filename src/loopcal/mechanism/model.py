@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,6 @@ from loopcal.parameters import ParameterTable
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit, find_unit
-from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -19,6 +19,7 @@ docs/theory/over-constraint.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from loopcal.mechanism.assembly import ENDINGS
 from loopcal.mechanism.limb_frames import follow_limb
 from loopcal.mechanism.states import make_start
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 CHUNK = 512
 """Rows differentiated together."""

@@ -11,6 +11,7 @@ and no reading can close them again. Derivation: docs/theory/over-constraint.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_row
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 RANK = 1e-9
 """Relative size below which a singular value of the closure equations counts as zero.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,6 @@ from loopcal.mechanism.transmission import (
     term_derivatives,
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.mechanism.model import SlotMap

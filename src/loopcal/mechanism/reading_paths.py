@@ -7,7 +7,7 @@ in equal steps. Source: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from loopcal.mechanism.states import Status, driven_values, replace_rows, select
 from loopcal.mechanism.summed_drives import solve_open_sums
 from loopcal.mechanism.sums import apply_weights
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 PATH_STEPS = (8, 64)
 """Steps of the path from the start's readings, tried in turn where the direct solution fails."""

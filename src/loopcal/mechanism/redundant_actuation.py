@@ -10,6 +10,8 @@ docs/theory/uncertain-readings.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal import engine
@@ -19,7 +21,6 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ Failed rows have NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,7 +44,6 @@ from loopcal.mechanism.summed_drives import (
 )
 from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.engine import State
@@ -11,7 +13,6 @@ from loopcal.mechanism.states import compute_limb_frames, driven_values
 from loopcal.mechanism.transmission import ALL_TERMS, TERMS
 from loopcal.mechanism.triangle import turn_head
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

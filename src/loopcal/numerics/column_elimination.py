@@ -12,12 +12,13 @@ its rows are kept. All functions work on any leading axes. See docs/theory/ident
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE
 from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 SMALLEST_ROW = 1e-14
 """Rows that the projection leaves shorter than this share of the largest are rounding."""

@@ -11,6 +11,7 @@ See docs/theory/estimation.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -18,7 +19,6 @@ import numpy as np
 
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest count as zero.

@@ -20,12 +20,12 @@ rows belongs to a node of this tree. See docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 
 from loopcal.typing import BoolArray, IntArray
-from loopcal.value_classes import dataclass
 
 SCOPES = ("machine", "session", "group", "pose")
 """Scopes of unknowns, from the outermost to the innermost."""

@@ -17,6 +17,7 @@ stated share of their norm (the relative offset of Bates and Watts, Technometric
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol, Self
 
@@ -25,7 +26,6 @@ import numpy as np
 from loopcal.numerics.damping import PATIENCE, Damping, FixedFactors, Progress
 from loopcal.numerics.full_steps import FullSteps
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 ROUNDING = 1e-12
 """Relative change of a sum of squares that is rounding and says nothing about a step."""

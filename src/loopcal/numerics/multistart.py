@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from loopcal.numerics.damping import FixedFactors
 from loopcal.numerics.gauss_newton import DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 STEPS = 60
 """Steps of damped Gauss-Newton [1]; starts in the right basin need fewer than ten."""

@@ -12,6 +12,7 @@ over a whole cluster. See docs/theory/identification.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -23,7 +24,6 @@ from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination_tree import EliminationTree, Structure
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 SHORTEST_DIRECTION = 0.5
 """Unobservable directions have at least length one when they are carried inwards. Shorter ones are

@@ -16,11 +16,11 @@ run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, suggest_names
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.papers.reproduction import Reproduction

@@ -6,6 +6,7 @@ replace that of the paper.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from loopcal.io.core.text_file import read_text, write_text
 from loopcal.papers import Paper
 from loopcal.studies import Study, load_study
 from loopcal.studies.files.template import quote_robot, write_study_text
-from loopcal.value_classes import dataclass
 
 FILE = "study.yaml"
 """Name of the study file in the folder of a paper with one robot."""

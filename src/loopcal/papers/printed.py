@@ -8,6 +8,7 @@ So printed numbers are read as text ("0.0352" has the unit 1e-4, "-9E-05" the un
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 Cell = str | float | int | bool | None
 ROUNDING = 1e-9

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from loopcal.papers.printed import Comparison, Table
-from loopcal.value_classes import dataclass, field
 
 OWN_CHECK = "our own check, not a statement of the paper"
 """Place of a claim that the paper does not make."""

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from string import Formatter
@@ -34,7 +35,6 @@ from loopcal.findings.wording import fill_template
 from loopcal.papers.printed import Cell, Comparison, Printed, Table
 from loopcal.papers.reproduction import OWN_CHECK, Figure, Series, Verdict
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 RELATIONS: Mapping[str, Callable[[Any, Any], Any]] = {
     "<": operator.lt, "<=": operator.le, "==": operator.eq, "!=": operator.ne, ">=": operator.ge,

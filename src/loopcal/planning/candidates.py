@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,7 +38,6 @@ from loopcal.planning.constraints import (
 from loopcal.planning.path import check_paths, interpolate_path, locate_home, measure_distance
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass
 
 HALVINGS = 12
 """Bisections of the line to the middle: the boundary is located to 1/4096 of it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,6 @@ from loopcal.mechanism import (
 )
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 ROUNDING = 1e-12
 """Share of a bound by which it may be exceeded: the rounding of its own number."""

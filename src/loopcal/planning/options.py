@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,6 @@ from loopcal.errors import DataError
 from loopcal.measure import Measurements
 from loopcal.planning.constraints import Constraints
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field
 
 Target = Literal["pose", "position", "orientation"]
 """Error that a plan makes small; that of a pose counts rotations times the robot's size."""

@@ -15,6 +15,8 @@ plan. Where no straight path is allowed between two poses, the path goes via hom
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal import geometry
@@ -22,7 +24,6 @@ from loopcal.mechanism import POSITION, TILT, Mechanism, inverse, read_coordinat
 from loopcal.planning.constraints import ConstraintCheck, ConstraintChecker, Violation
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 STEPS = 40
 """Steps in which a path as long as the robot's size, or one radian, is checked."""

@@ -21,6 +21,7 @@ docs/theory/constraint.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -41,7 +42,6 @@ from loopcal.mechanism import (
 from loopcal.numerics.column_elimination import eliminate_columns
 from loopcal.planning.constraints import ConstraintChecker
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 AXIS = 3
 """Column of the axis in a design."""

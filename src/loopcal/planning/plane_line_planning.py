@@ -9,6 +9,7 @@ and docs/theory/planning.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +34,6 @@ from loopcal.planning.plane_line_sensors import make_plane_line_instrument
 from loopcal.planning.result import PlannedPoses
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, field
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

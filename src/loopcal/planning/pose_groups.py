@@ -17,6 +17,7 @@ candidate pairs. Derivations: docs/theory/identification.md, docs/theory/plannin
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 
@@ -45,7 +46,6 @@ from loopcal.planning.redundant_rows import (
     observe_groups,
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 BLOCK = 256
 """Groups whose rows are computed at once."""

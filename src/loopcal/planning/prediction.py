@@ -10,6 +10,8 @@ docs/theory/gauge.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.apply.accuracy import transport
@@ -32,7 +34,6 @@ from loopcal.mechanism import Mechanism, Solution
 from loopcal.planning.options import Target
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 FRAMES = (FITTED, BASE, RELATIVE)
 """Frames in which a plan can state errors."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -45,7 +46,6 @@ from loopcal.planning.pose_groups import (
 )
 from loopcal.planning.prediction import ExpectedErrors, Prediction, linearize_prediction
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 PREDICTED = 200
 """Poses of the workspace whose errors are predicted."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.planning.problem import name_groups
 from loopcal.planning.sample_size import ErrorCurve
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,6 +8,7 @@ make many pairs, and a bound on pairs is none on poses.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from loopcal.planning.options import N_POSES, Target
 from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors
 from loopcal.planning.problem import PlanningProblem, name_groups
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 SIZES = 6
 """Numbers of poses on a curve."""

@@ -8,10 +8,10 @@ import html
 import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from loopcal.plain_text import escape
-from loopcal.value_classes import dataclass
 
 GAP = 2
 """Blanks between two columns of text."""

@@ -15,6 +15,7 @@ See docs/theory/resampling.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -35,7 +36,6 @@ from loopcal.sampling.block_scatter import BlockScatter, describe_scatter
 from loopcal.sampling.blocks import choose_blocks
 from loopcal.sampling.intervals import Intervals, compare_ends, half_widths, report_intervals
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 Scheme = Literal["wild", "pairs", "normal"]
 """How resamples are drawn."""

@@ -14,6 +14,7 @@ docs/theory/resampling.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.observed_columns import ObservedColumns, list_observed_columns
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,8 @@ one of chance.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.diagnose.fit_checks.cluster_covariance import FEWEST_DEGREES, compute_robust_spread
@@ -19,7 +21,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.sampling.intervals import NAMED, OFF
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 FALSE_ALARMS = 0.01
 """Probability that any parameter is reported where errors are independent and as stated."""

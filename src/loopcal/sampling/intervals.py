@@ -14,6 +14,7 @@ weights v_i, and the linear density f there.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.presentation import TableResult
 from loopcal.sampling.weighted_sample import weighted_quantiles
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 OFF = 0.10
 """Difference of an end of an interval, in linear half-widths, above which it is reported."""

@@ -18,6 +18,7 @@ See docs/theory/resampling.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Literal, get_args
 
@@ -35,7 +36,6 @@ from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.presentation import TableResult
 from loopcal.sampling.intervals import half_widths
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 Rule = Literal["maximum", "sidak", "bonferroni", "scheffe"]
 """How simultaneous intervals are made."""

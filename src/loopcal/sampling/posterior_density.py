@@ -18,6 +18,8 @@ fit best at z and x. See docs/theory/resampling.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.fit_linearization import FitLinearization
@@ -26,7 +28,6 @@ from loopcal.estimate.resampling import repeat_trial, resample_rows
 from loopcal.estimate.result import Identification
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ See docs/theory/resampling.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,6 @@ from loopcal.sampling.intervals import OFF, Intervals, compare_ends, half_widths
 from loopcal.sampling.posterior_density import PosteriorDensity, describe_density
 from loopcal.sampling.weighted_sample import effective_size, fit_tail_shape, normalize_weights
 from loopcal.typing import FloatArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 BATCH = 250
 """Draws that are evaluated at once; progress is reported between them."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 
 from loopcal.findings import Finding, report_finding
@@ -19,7 +20,6 @@ from loopcal.studies.specification.cells import Cell
 from loopcal.studies.specification.keys import compute_key, describe_block
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 MOST_NAMED = 5
 """Blocks that were given up and are named in a finding."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from loopcal.studies.simulation.published_fits import refuse_per_leg
 from loopcal.studies.simulation.replay import replay_trial
 from loopcal.studies.specification.levels import FACTORS
 from loopcal.typing import Progress, report_no_progress
-from loopcal.value_classes import dataclass
 from loopcal.workflow import CalibrationOptions, CalibrationReport, calibrate
 
 ROBOT, TRUTH, DATA = "robot.yaml", "truth.yaml", "measurements.csv"

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
 from loopcal.studies.simulation.poses import CellPoses
 from loopcal.studies.simulation.tasks import BlockTask, PosesTask, make_block_task, make_poses_task
-from loopcal.value_classes import dataclass
 
 KEPT_POSES = 256
 """Poses that are kept, because later cells have the same ones, such as those of other methods."""

@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from loopcal.report.text_page import Block
 from loopcal.studies.results.summary_view import explain_failures
@@ -17,7 +18,6 @@ from loopcal.studies.specification.cells import Cell, list_factors
 from loopcal.studies.specification.keys import compute_key, describe_block
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 MOST_BLOCKS = 4
 """Cells of which a block is computed at most; further cells are estimated from them."""

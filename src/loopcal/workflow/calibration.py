@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
@@ -29,7 +30,6 @@ from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
-from loopcal.value_classes import dataclass, replace
 from loopcal.workflow.calibration_findings import (
     check_split_instruments,
     report_conventions,

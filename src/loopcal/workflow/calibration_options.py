@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from loopcal.apply.validation_findings import check_limit
 from loopcal.argument_types import check_seed
@@ -15,7 +16,6 @@ from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_number, check_type
 from loopcal.mechanism import Mechanism
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True)

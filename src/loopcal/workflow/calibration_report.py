@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,6 @@ from loopcal.measure import InstrumentRecord, Measurements, list_instruments
 from loopcal.mechanism import Mechanism
 from loopcal.presentation import TableResult
 from loopcal.serialization import to_json
-from loopcal.value_classes import dataclass
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
 from loopcal.workflow.recommendation import recommend_values

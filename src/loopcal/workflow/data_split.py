@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements
-from loopcal.value_classes import dataclass
 
 UNKNOWN = np.array(np.inf)
 """Sigma of readings that may be missing."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -23,7 +24,6 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.serialization import json_fields
-from loopcal.value_classes import dataclass
 from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 
 FEW = 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +16,6 @@ from loopcal.measure.kinds.points.target_kind import TargetKind
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass, replace
 
 FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
 """A frame that may be unknown -> the names that kinds have for it."""

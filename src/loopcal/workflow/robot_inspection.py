@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism, evaluate_limits, inverse, propose_added_joints
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ROUNDING = 1e-9
 """How far home may exceed a limit by rounding [m or rad]."""

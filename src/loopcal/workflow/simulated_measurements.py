@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +22,6 @@ from loopcal.measure import (
 )
 from loopcal.mechanism import Mechanism, forward, inverse, resolve_poses
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from loopcal.apply.run_comparison.comparability import check_runs, list_free, refuse_incomparable
@@ -14,7 +15,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.presentation import TableResult, draw
 from loopcal.units import UNITS, Unit, find_unit
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

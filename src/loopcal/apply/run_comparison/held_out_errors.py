@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from loopcal.apply.run_comparison.stored_run import StoredRun, list_data_digests
 from loopcal.apply.validation import validate
 from loopcal.findings import Finding
 from loopcal.measure import Measurements
-from loopcal.value_classes import dataclass
 
 QUANTITIES = ("position", "orientation", "length")
 """Quantities whose errors are compared."""

@@ -8,6 +8,7 @@ differences are stated, but not tested.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +25,6 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 CHANGE_LEVEL = 0.05
 """Probability that any of the compared machines is declared changed although none is."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,6 @@ from loopcal.cli.options.shared_options import (
 )
 from loopcal.errors import DataError
 from loopcal.units import Dimension, list_symbols
-from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding

@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,6 @@ from loopcal.cli import terminal
 from loopcal.cli.options.shared_options import Count, add_options, flag_option, refuse_given
 from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from loopcal.cli.time_limit import TimeLimitError, format_duration
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.studies.driver import RunReport, Share

@@ -15,6 +15,7 @@ are refused only where one of them fits far better: see docs/theory/convention-c
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,6 @@ from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, fix_breaking_parameters, forward
 from loopcal.presentation import HtmlResult
-from loopcal.value_classes import dataclass, replace
 
 IMPLAUSIBLE = 10.0
 """Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated

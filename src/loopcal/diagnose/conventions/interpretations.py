@@ -9,12 +9,12 @@ evaluation judges all interpretations. `value_interpretations` lists those of me
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from loopcal.diagnose.conventions.changes import Change
 from loopcal.findings import Finding, report_finding
 from loopcal.measure.measurements import Measurements
-from loopcal.value_classes import dataclass, replace
 
 Slip = tuple[str, dict[str, Any], Change]
 """Kind of a slip, what is read differently, and how."""

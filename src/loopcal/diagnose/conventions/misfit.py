@@ -9,6 +9,7 @@ its own excluded rows. All functions are pure; see docs/theory/convention-check.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -29,7 +30,6 @@ from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import Mechanism, find_directly_reachable, forward, forward_trials
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 FEWEST = 3
 """Smallest number of equations beyond those of unknown frames that gives a misfit."""

@@ -5,6 +5,7 @@ beyond them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,6 @@ from loopcal.diagnose.conventions.misfit import Comparison, compute_misfit
 from loopcal.estimate.linearization import Linearization
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 REFINEMENT = Halving(steps=3, attempts=1)
 """Gauss-Newton steps by which the stated convention and the best other one are compared finally; a

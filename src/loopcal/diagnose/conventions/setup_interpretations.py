@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.measure import Kind, Measurements
-from loopcal.value_classes import dataclass, replace
 
 DECLARED = ("frame", "targets", "tool", "anchor")
 """Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets are

@@ -15,13 +15,13 @@ turn), any of them may have been moved.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from loopcal.diagnose.conventions.misfit import Comparison, compare_with_robot, exclude_far_rows
 from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
-from loopcal.value_classes import dataclass, replace
 
 MOST_SINGLE = 12
 """Number of stated parameters up to which each is estimated alone, to find the wrong one."""

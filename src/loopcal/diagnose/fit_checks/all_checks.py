@@ -5,6 +5,8 @@ expected gain.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.diagnose.fit_checks.cluster_covariance import ClusterCheck, check_clusters
 from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_correlated_groups
@@ -19,7 +21,6 @@ from loopcal.findings import Finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.presentation import HtmlResult
 from loopcal.typing import Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ the level of the search. Where none fits, the finding says which were tried.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
 from typing import Any
 
@@ -21,7 +22,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Kind, Measurements, Observations
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field, replace
 
 MOST_PERMUTED = 4
 """Targets of which all orders are tried; of more only exchanges of two."""

@@ -17,6 +17,7 @@ the stated covariance with which C_robust is compared. See docs/theory/uncertain
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +40,6 @@ from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.tree_elimination import fold_at
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 LIMIT = 1.5
 """Ratio of standard uncertainties above which the stated ones are too small."""

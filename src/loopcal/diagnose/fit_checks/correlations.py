@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.value_classes import dataclass
 
 STRONG = 0.9
 """Correlation above which the error of one parameter is mostly that of another (81 % of its

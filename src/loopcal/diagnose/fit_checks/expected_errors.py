@@ -10,6 +10,7 @@ tolerances, the error after calibration is no smaller, and another instrument is
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 GAIN = 1.1
 """Factor by which an expected error must become smaller to count as an improvement."""

@@ -18,6 +18,7 @@ that exceeds 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,7 +36,6 @@ from loopcal.numerics.back_substitution import substitute_transposed
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 LEVEL = 1e-3
 """Probability of naming any block where none is wrong. It is small, because a named block changes

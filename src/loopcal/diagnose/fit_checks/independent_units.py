@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.measure import Measurements
 from loopcal.numerics.elimination_tree import find_connected_groups
 from loopcal.typing import IntArray
-from loopcal.value_classes import dataclass
 
 FEWEST_CLUSTERS = 5
 """Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom

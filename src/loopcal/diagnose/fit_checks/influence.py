@@ -16,6 +16,7 @@ The leverage is the trace of w G. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 TESTABLE = 1e-6
 """Remaining part 1 - w g of a direction below which only this block determines it, so that its

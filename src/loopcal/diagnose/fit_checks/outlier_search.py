@@ -10,6 +10,7 @@ as well: with j excluded instead of i, i must still be a suspect.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -27,7 +28,6 @@ from loopcal.numerics.chi_square import (
 )
 from loopcal.numerics.multiple_tests import compute_single_level
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 MOST_ROUNDS = 20
 """Largest number of searches with other suspects."""

@@ -18,6 +18,7 @@ geometry so far that right poses seem wrong. Blocks are then compared at a robus
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -44,7 +45,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 MOST_ROBUST = 20_000
 """Blocks that a robust fit is made from: it is where the others are compared, not a result."""

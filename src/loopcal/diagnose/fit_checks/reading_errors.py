@@ -9,6 +9,8 @@ g(estimated).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.fit_input import exclude_poses
@@ -17,7 +19,6 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism, transmit_readings
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

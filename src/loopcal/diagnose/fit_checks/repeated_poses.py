@@ -13,6 +13,7 @@ Regression Analysis.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import IntArray
-from loopcal.value_classes import dataclass
 
 UNMEASURED = 1e-12
 """Singular values of the whiteners of repeats below this share of the largest belong to components

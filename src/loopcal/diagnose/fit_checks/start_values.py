@@ -16,6 +16,7 @@ against the optimum before they are used.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -28,7 +29,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_chi_square_tail
-from loopcal.value_classes import dataclass, replace
 
 NO_GAIN = 1e-3
 """Share of the start's cost below which a gain is rounding: the last digits of a file."""

@@ -10,13 +10,13 @@ distinguished from the best one, and are stated as well.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from loopcal.diagnose.machine_changes.parameter_changes import ParameterChanges
 from loopcal.numerics.chi_square import compute_chi_square_quantile
-from loopcal.value_classes import dataclass
 
 DISTINGUISHED = 0.05
 """Probability of distinguishing the true cause from a better one by chance."""

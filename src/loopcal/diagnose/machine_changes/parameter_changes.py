@@ -16,6 +16,7 @@ covariance of u.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,6 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.numerics.chi_square import compute_averaged_tail, compute_f_tail
 from loopcal.numerics.decomposition import NULL_COMPONENT, are_nonzero
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 PARALLEL = 1e-2
 """Sine of the angle up to which null directions of two linearizations are the same direction."""

@@ -10,6 +10,8 @@ larger. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.diagnose.error_frames import FITTED
@@ -39,7 +41,6 @@ from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Solution
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS
-from loopcal.value_classes import dataclass, replace
 
 NOTICEABLE = 1.05
 """Factor of the uncertainty of the measured poses from which a correlation that no test shows is

@@ -18,13 +18,13 @@ Maximum likelihood approaches to variance component estimation, JASA 72 (1977).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.diagnose.residuals.residual_rows import ResidualRows
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)
 """Correlations of neighbors between which the average is taken."""

@@ -18,6 +18,7 @@ Poses that are outliers are left out: one gross error is no heavy tail.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,7 +30,6 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 LEVEL = 0.01
 """Probability that normal noise is reported; below `SIGNIFICANCE` it is a warning."""

@@ -16,6 +16,7 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,7 +44,6 @@ from loopcal.numerics.variance_component import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 FEWEST_POSES = 5
 """Different poses below which nothing can be said of how errors vary with the pose."""

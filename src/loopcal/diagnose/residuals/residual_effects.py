@@ -9,6 +9,7 @@ of one function and component are one column; its size is the range of the effec
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
 """What residuals may depend on."""

@@ -17,6 +17,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,7 +28,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_f_tail
 from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 LEVEL = 0.05
 """Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the

@@ -11,6 +11,7 @@ residuals themselves are correlated even where the errors are not.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements, Observations
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 EXPLAINED = 1e-6
 """Share of its length below which a column counts as explained by other columns."""

@@ -9,6 +9,7 @@ N). Formulas: docs/theory/engine.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from loopcal.engine.numpy_engine.householder import SMALLEST, triangularize
 from loopcal.engine.program import LENGTH, PITCH, Block, ClosureBlocks, Group, Program, Slot, State
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 def linearize(

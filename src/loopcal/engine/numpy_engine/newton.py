@@ -9,6 +9,7 @@ is. Derivation: docs/theory/engine.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
 
@@ -35,7 +36,6 @@ from loopcal.engine.program import (
     Task,
 )
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 CHUNK = 2048
 """Rows solved together: few enough for the cache, many enough that Python's share is small."""

@@ -9,6 +9,7 @@ compared although tolerances pull both estimates to nominal. Null directions hav
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from loopcal.estimate.inference.residual_test import ResidualTest
 from loopcal.estimate.inference.shown_noise import find_shown_noise
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ROWS, DEVIATIONS, NOISE = "information_rows", "information_deviations", "information_noise"
 """Names of the stored arrays."""

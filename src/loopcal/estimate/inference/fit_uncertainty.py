@@ -10,6 +10,7 @@ known only together with the machine; then neither is certain, but their combina
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from loopcal.estimate.inference.posterior import Posterior, posterior_from_array
 from loopcal.estimate.result import Identification
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 UNKNOWN = 1e6
 """Standard deviation in `unit` that stands for a direction of which nothing is known."""

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field
 
 PREFIX = "frames_"
 """Beginning of the names of the arrays of a run folder."""

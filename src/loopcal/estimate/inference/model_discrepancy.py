@@ -10,13 +10,13 @@ parameters follow the errors, the poses err less than by either of them.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.estimate.poses.smooth_errors import PREFIX, SmoothErrors
 from loopcal.findings.wording import round_to_digits
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 DISCREPANCY = "residuals.model-discrepancy"
 """Source of the part of the covariance that the discrepancy causes, and code of its finding."""

@@ -8,6 +8,7 @@ robot's file.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, field
 
 NEGLIGIBLE = 1e-6
 """Part of a combination, in tolerances and relative to its largest, that is rounding and left out.

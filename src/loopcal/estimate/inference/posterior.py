@@ -9,6 +9,7 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +47,6 @@ from loopcal.measure import FittedRows, fitted_rows_from_arrays
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 STORED = {"unit": "unit", "directions": "directions", "variance": "variance", "seen": "determined"}
 """Arrays of a run folder (after `PREFIX`), and the attributes that they hold."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 PARALLEL = 1e-2
 """Sine of the angle up to which null directions of two estimates are the same direction."""

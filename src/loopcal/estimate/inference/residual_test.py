@@ -17,6 +17,7 @@ docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from loopcal.findings import Finding, Severity, report_finding
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 FEWEST_DEGREES = 5
 """Degrees of freedom below which an estimated noise is too uncertain to weigh data against

@@ -8,12 +8,12 @@ false-alarm rate must not depend on a wrong sigma needs the noise that the resid
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, ResidualTest
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.value_classes import dataclass
 
 NAME = "posterior_shown_noise"
 """Name of the stored array."""

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,7 +42,6 @@ from loopcal.estimate.methods.tolerance_components import (
 )
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 PRIOR_ODDS: Mapping[Kind, float] = {"shift": 1.0, "group": 1.0 / 3.0, "single": 1.0 / 3.0}
 """Odds of each kind of component against none, before the data: parts of one batch and common zeros

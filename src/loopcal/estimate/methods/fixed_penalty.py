@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, Ridge
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ that exp(-L/2) is its distribution afterwards. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -22,7 +23,6 @@ from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 LARGEST_FACTOR = 1e6
 """Factor on tolerances up to which the most probable one is searched."""

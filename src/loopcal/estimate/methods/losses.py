@@ -10,6 +10,7 @@ usual constants give 95 % efficiency for a single normal residual.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +19,6 @@ from loopcal.argument_types import check_fields
 from loopcal.errors import EstimationError
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 LARGEST = 8.0
 """Largest constant [standard deviations]; the probability of more is below double precision."""

@@ -20,6 +20,7 @@ docs/theory/estimation.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -35,7 +36,6 @@ from loopcal.estimate.methods.tolerance_components import (
 )
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, field, replace
 
 Rule = Callable[[Decomposition], FloatArray | IntArray]
 """Choose one number per trial, (t,), from a decomposition; see

@@ -20,6 +20,7 @@ for the noise. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -32,7 +33,6 @@ from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass
 
 LEVEL = 0.01
 """Probability that any of the tests rejects tolerances that are right."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 FIXED = "fixed"
 """Rule of a parameter that was given."""

@@ -15,12 +15,12 @@ Technometrics 21 (1979).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 PER_DECADE = 16
 """Grid points per factor of ten; around their minimum the criteria are flat over much more."""

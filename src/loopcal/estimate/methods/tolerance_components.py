@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import string
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -22,7 +23,6 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.inflated_tolerances import By
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 Kind = Literal["shift", "group", "single"]
 

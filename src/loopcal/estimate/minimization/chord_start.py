@@ -13,6 +13,8 @@ Problems", 2004, chapter 2.1, simplified Newton iteration.) See docs/theory/iden
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.estimate.linearization import Start
@@ -24,7 +26,6 @@ from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.triangular_systems import solve_regular
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 ACCEPTED_STEP = 1e-3
 """A trial that began with a chord has converged where all further steps together would change the

@@ -11,6 +11,7 @@ makes no progress. See docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Protocol, Self
 
@@ -28,7 +29,6 @@ from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus, minimize
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 ACCEPTED_SHARE = 1e-4
 """Share of the predicted decrease that a step must bring."""

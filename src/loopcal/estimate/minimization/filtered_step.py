@@ -9,12 +9,13 @@ new decomposition.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

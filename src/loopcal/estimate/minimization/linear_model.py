@@ -11,6 +11,7 @@ Both lead to the same estimate. See docs/theory/identification.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -25,7 +26,6 @@ from loopcal.numerics.decomposition import Decomposition, empty_factor
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.numerics.triangular_systems import solve_regular
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ component.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from loopcal.estimate.problem import Problem
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 ROUNDS = 50
 """Reweightings, at most."""

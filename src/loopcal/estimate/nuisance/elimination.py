@@ -12,6 +12,7 @@ nuisance parameter is one more row. See docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,6 @@ from loopcal.numerics.tree_elimination import NodeFactors, TreeElimination, elim
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 
 class NodeMembers(NamedTuple):

@@ -10,6 +10,7 @@ too: a frame is then known only together with the machine.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from loopcal.parameters import Parameter, ParameterTable
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass, replace
 
 SMALLEST_EFFECT = 1e-7
 """Share of all that the machine does to a nuisance parameter below which a direction does not move

@@ -11,6 +11,7 @@ stacked and eliminated together.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from loopcal.estimate.poses.linearization import KindRows
 from loopcal.findings import report_finding
 from loopcal.numerics.elimination_tree import EliminationTree, find_connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 LARGEST = 2000
 """Coordinates of one component, at most: its rows are one dense matrix."""

@@ -12,6 +12,7 @@ docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)
 """Control of the iteration to consistent poses: until residuals are rounding, or out of reach."""

@@ -9,6 +9,7 @@ the stroke or on another branch than home's, so that nobody takes it for a measu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from loopcal.measure import Measurements, find_outside_strokes
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 SAME_READING = 1e-6
 """Difference of readings, as a share of the robot's size or in radians, up to which they are the

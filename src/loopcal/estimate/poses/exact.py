@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +37,6 @@ from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 KEPT_POSES = 2**17
 """Poses whose states are kept between linearizations where they form several blocks: 33 MB of a

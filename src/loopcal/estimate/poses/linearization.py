@@ -15,6 +15,7 @@ poses. This module is the only place where poses and rows are linearized.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,6 @@ from loopcal.mechanism import (
 )
 from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, field, replace
 
 
 @dataclass(frozen=True, eq=False)

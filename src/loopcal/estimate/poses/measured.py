@@ -10,6 +10,7 @@ docs/theory/uncertain-readings.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,7 +28,6 @@ from loopcal.numerics.decomposition import are_nonzero
 from loopcal.numerics.gauss_newton import DescentStatus, minimize
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 STEPS = 30
 """Gauss-Newton steps, at most. A position takes one, an orientation four."""

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism, forward
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 MOST = 0.5
 """Share of open poses above which a geometry is not one to begin with."""

@@ -9,6 +9,8 @@ docs/theory/uncertain-readings.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
@@ -17,7 +19,6 @@ from loopcal.measure import Measurements, NuisanceParameters, fill_in_reading_si
 from loopcal.mechanism import Mechanism, Solution, forward, make_solution
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 SAME_RATIO = 1e-9
 """Relative difference of sigma ratios below which a pose's readings are weighted as the robot

@@ -18,12 +18,12 @@ Gaussian Processes for Machine Learning, 2006, sections 2.2 and 8.1.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, fields, replace
 
 PREFIX = "discrepancy_"
 """Beginning of the names of the arrays of a run folder."""

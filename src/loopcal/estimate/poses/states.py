@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from loopcal.estimate.poses.linearization import LinearizedPoses
 from loopcal.mechanism import DrivenJoints
 from loopcal.numerics.trial_batch import TrialBatch, map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

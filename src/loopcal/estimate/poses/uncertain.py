@@ -14,6 +14,7 @@ coordinate: its row is not a heavy one, it does not exist. See docs/theory/uncer
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -36,7 +37,6 @@ from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.tree_elimination import NodeFactors, eliminate_tree
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False)

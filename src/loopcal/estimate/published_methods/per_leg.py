@@ -10,6 +10,7 @@ simulation of the calibration algorithm for a 6-DOF parallel mechanism", section
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism, Solution, differentiate_pose, forward
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 SHARED = 1e-9
 """Share of a column of G, relative to its largest entry, that counts as no effect on a leg."""

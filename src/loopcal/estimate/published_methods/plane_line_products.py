@@ -21,6 +21,7 @@ directions. Derivation, and why this equals surfaces as unknowns: docs/theory/co
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -41,7 +42,6 @@ from loopcal.mechanism import (
     inverse_trials,
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 Weights = Literal["printed", "distance", "single", "full"]
 """Rows as printed; divided by |d_1|, a distance from the plane; divided by their own sd; with their

@@ -13,6 +13,7 @@ truncated SVD", Advances in Mechanical Engineering 2016, doi:10.1177/16878140166
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +26,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 MM = 1e-3
 

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from loopcal.findings.finding import Severity
 from loopcal.findings.wording import Quantity, depends_on_data, fill_template, list_fields
-from loopcal.value_classes import dataclass, field
 
 FILES: Mapping[str, tuple[str, ...]] = {
     "workflow": ("gates", "workflow"),

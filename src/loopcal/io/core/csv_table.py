@@ -14,6 +14,7 @@ import csv
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,6 @@ from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 from loopcal.units import LARGEST, Dimension, find_unit
-from loopcal.value_classes import dataclass
 
 WHAT = "measurement file"
 CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/exports.md)"

@@ -8,12 +8,11 @@ import inspect
 import re
 import types
 from collections.abc import Mapping
-from dataclasses import MISSING
+from dataclasses import MISSING, dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from loopcal.io.core.records import get_field_types
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 SECTION = re.compile(r"^(Attributes|Examples|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
 SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)

@@ -9,6 +9,7 @@ is taken for what it limits.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
@@ -20,7 +21,6 @@ from loopcal.mechanism.assembly import (
     MOST_LIMBS,
     MOST_PARAMETERS,
 )
-from loopcal.value_classes import dataclass
 
 MEGABYTE = 10**6
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,6 @@ from loopcal.io.core.outputs import FILES, replace_folder, resolve_folder
 from loopcal.io.core.read_back import require_same
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
-from loopcal.value_classes import dataclass
 
 _BLANK = "0" * 64
 """Stands for the document's own digest where this is computed."""

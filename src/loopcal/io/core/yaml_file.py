@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from loopcal.io.core.names import find_fault_below
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.plain_text import escape, quote
 from loopcal.units import Dimension, parse_quantity
-from loopcal.value_classes import dataclass, replace
 
 Location = tuple[str | int, ...]
 

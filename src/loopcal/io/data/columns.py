@@ -12,6 +12,7 @@ import re
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,6 @@ from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
-from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +35,6 @@ from loopcal.io.data.shared_error_settings import read_shared_errors
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import EXAMPLES, SMALLEST_SD
-from loopcal.value_classes import dataclass, field, replace
 
 if TYPE_CHECKING:
     from loopcal.measure import InstrumentRecord, Kind, Observations

@@ -14,6 +14,7 @@ otherwise it is refused.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SMALLEST_SD, find_sd_fault
-from loopcal.value_classes import dataclass
 
 READING_NOISE = "reading_noise"
 RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12

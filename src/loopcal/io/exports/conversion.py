@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
@@ -43,7 +44,6 @@ from loopcal.io.exports.export_lines import (
 from loopcal.io.exports.patterns import Pattern, PatternClock
 from loopcal.io.exports.profile import ColumnSource, Place, Profile, strip_target
 from loopcal.plain_text import quote
-from loopcal.value_classes import dataclass
 
 Row = dict[str, str]
 """Column -> cell."""

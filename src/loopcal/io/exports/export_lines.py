@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
@@ -20,7 +21,6 @@ from loopcal.io.core.text_file import read_bytes
 from loopcal.io.exports.patterns import PatternClock
 from loopcal.io.exports.profile import Profile, normalize_name
 from loopcal.plain_text import quote
-from loopcal.value_classes import dataclass
 
 
 class Misfit(Exception):  # noqa: N818

@@ -16,6 +16,7 @@ from __future__ import annotations
 import codecs
 import unicodedata
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,7 +25,6 @@ from loopcal.io.core.yaml_file import YamlFile
 from loopcal.io.data.columns import MEASURED
 from loopcal.io.exports.patterns import Pattern, compile_pattern
 from loopcal.units import find_unit, parse_quantity
-from loopcal.value_classes import dataclass, field
 
 if TYPE_CHECKING:
     from loopcal.measure import Column, Kind

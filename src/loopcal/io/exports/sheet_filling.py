@@ -10,6 +10,7 @@ is written, the points are to be examined: `loopcal.diagnose.examine_points`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,6 @@ from loopcal.measure import Measurements, Observations
 from loopcal.measure.kinds.points.target_kind import name_point
 from loopcal.mechanism import Mechanism
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass, replace
 
 Row = dict[str, str]
 """Column -> cell."""

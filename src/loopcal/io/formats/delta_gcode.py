@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
@@ -40,7 +41,6 @@ from loopcal.io.formats.program_format import (
     ImportOptions,
 )
 from loopcal.io.formats.value_file import Name, format_number, is_same, shorten_numbers
-from loopcal.value_classes import dataclass
 
 ECHO = re.compile(r"\s*echo:", re.IGNORECASE)
 MARLIN_COMMANDS, REPRAP_COMMANDS = ("M851",), ("M307", "M584")

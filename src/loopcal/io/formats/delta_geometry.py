@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.io.formats.program_format import ExportSource, ImportOptions, format_head, get_record
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.value_classes import dataclass
 
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
 """Angles of the towers in firmware, before any correction [deg]."""

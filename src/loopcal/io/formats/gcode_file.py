@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -20,7 +21,6 @@ from loopcal.errors import FileError
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.value_file import Name, Value, ValueFile
 from loopcal.plain_text import quote
-from loopcal.value_classes import dataclass
 
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
 FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +31,6 @@ from loopcal.io.runs.plan_folder import SHEET, VIA
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass
 
 WORDS = {"x": "X", "y": "Y", "z": "Z", "roll": "A", "pitch": "B", "yaw": "C"}
 """Controlled coordinate -> word of RS-274."""

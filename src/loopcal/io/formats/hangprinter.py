@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,6 @@ from loopcal.io.core.json_text import read_json
 from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
-from loopcal.value_classes import dataclass, field, replace
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,7 +41,6 @@ from loopcal.io.formats.program_format import (
     ImportOptions,
 )
 from loopcal.io.formats.value_file import DECIMALS, Name, Value, ValueFile, shorten_numbers
-from loopcal.value_classes import dataclass, replace
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements

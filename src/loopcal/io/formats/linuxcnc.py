@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,6 @@ from loopcal.io.formats.value_file import DECIMALS, Name, Value, ValueFile
 from loopcal.mechanism.families.gough import Gough
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass
 
 COMPONENT = "genhexkins"
 SETP = re.compile(rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(\s*=\s*|\s+)([^\s#]+)")

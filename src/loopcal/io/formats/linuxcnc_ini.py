@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import DataError
@@ -27,7 +28,6 @@ from loopcal.io.formats.program_format import Exported, ExportSource, Format, ge
 from loopcal.io.formats.value_file import DECIMALS, Name, Value, ValueFile
 from loopcal.mechanism.families.gough import Gough
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass
 
 STRUTS = 6
 OFFSET = "HOME_OFFSET"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,6 @@ from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.mechanism import Mechanism
 from loopcal.plain_text import quote
 from loopcal.units import LARGEST
-from loopcal.value_classes import dataclass, field
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements

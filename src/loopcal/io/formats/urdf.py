@@ -11,6 +11,7 @@ the text stays as it is.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,6 @@ from loopcal.mechanism.joint_graph import (
     list_possible_platforms,
 )
 from loopcal.typing import FloatArray
-from loopcal.value_classes import replace
 
 LARGE = 30.0
 """Largest distance of two joints of a link that is plausible [m]; URDF has no other unit."""

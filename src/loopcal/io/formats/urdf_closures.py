@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal
@@ -37,7 +38,6 @@ from loopcal.mechanism.joint_graph import (
 )
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field, replace
 
 WHAT = "file of loop closures"
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")

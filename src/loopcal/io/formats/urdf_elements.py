@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field  # noqa: TID251 some can be changed
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np

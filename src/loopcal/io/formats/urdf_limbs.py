@@ -10,6 +10,7 @@ place; behind the last joint it is a shift of the attachment to the platform.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from loopcal import geometry
 from loopcal.io.core.yaml_text import quote_scalar
 from loopcal.mechanism.joint_graph import GraphJoint, LimbPaths, get_value, measure_rotation
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ZERO = 1e-15
 """Numbers below this are rounding and written as 0 [m, rad]."""

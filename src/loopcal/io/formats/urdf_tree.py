@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,6 @@ from loopcal.io.formats.urdf_elements import (
     build_joint,
 )
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field, replace
 
 WHAT = "URDF file"
 OTHER_LOOPS = ("loop_joint", "loop")

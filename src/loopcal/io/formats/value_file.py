@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
@@ -24,7 +25,6 @@ from loopcal.io.formats.program_format import (
     parse_number,
     report_changes,
 )
-from loopcal.value_classes import dataclass
 
 DECIMALS = 6
 """Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometer."""

@@ -14,6 +14,7 @@ A loaded robot keeps the text of its file, so that writing it back changes only 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,6 @@ from loopcal.mechanism import (
 from loopcal.mechanism.families.summed_records import SumError
 from loopcal.mechanism.stages.joined_assembly import StageError
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Literal
 
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
-from loopcal.value_classes import dataclass
 
 WHAT = "certificate file"
 

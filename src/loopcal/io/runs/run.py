@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,6 @@ from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.runs.run_verdict import find_run_failure
 from loopcal.mechanism import Mechanism
 from loopcal.presentation import HtmlResult
-from loopcal.value_classes import dataclass, field
 
 if TYPE_CHECKING:
     from loopcal.estimate import Posterior

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ import numpy as np
 from loopcal.io.core.text_file import sha256
 from loopcal.io.runs.arrays_file import read_arrays
 from loopcal.io.runs.run_result import report_damage
-from loopcal.value_classes import dataclass
 
 Test = Callable[[np.ndarray], Any]
 

@@ -12,6 +12,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -25,7 +26,6 @@ from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import YamlFile
 from loopcal.mechanism import Mechanism
 from loopcal.units import UNITS
-from loopcal.value_classes import dataclass, field
 
 RESULT = "result.json"
 FORMAT = 2

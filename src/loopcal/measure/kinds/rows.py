@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,6 @@ import numpy as np
 from loopcal.numerics.rounding import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 InvalidRows = tuple[tuple[int, str], ...]
 """Index of each invalid row, and the end of a sentence that says why."""

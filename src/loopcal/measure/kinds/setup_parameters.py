@@ -11,6 +11,7 @@ exactly 180 degrees.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from loopcal.geometry.rotations import stack_blocks
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 ROTATION_AXES, POSITION_AXES, DIRECTION_AXES = ("rx", "ry", "rz"), ("x", "y", "z"), ("u", "v")
 

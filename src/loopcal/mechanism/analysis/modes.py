@@ -10,6 +10,7 @@ mode was reached. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +34,6 @@ from loopcal.mechanism.transmission import evaluate_sums, joints_from_readings, 
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 BATCH = 2048
 """Starts solved together."""

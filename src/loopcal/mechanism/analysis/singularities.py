@@ -14,6 +14,7 @@ independently. Derivation: docs/theory/kinematics.md.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,6 @@ from loopcal.mechanism.transmission import select_weights
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 NEAR_SHARE = 0.1
 """Share of the median margin below which a pose is close to a singularity (rule of thumb)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +20,6 @@ from loopcal.mechanism.states import compute_limb_frames
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 MIN_DRAWS = 2000
 """Positions drawn before a workspace is refused."""

@@ -14,6 +14,7 @@ Derivation: docs/theory/parameters.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from loopcal.mechanism.assembly import AXES, Address, LinearMap, SharedMap
 from loopcal.mechanism.families.limb_placement import PlacedLimb, map_displacement
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 KEPT_AXES: Mapping[str, tuple[str, ...]] = {"R": ("rx", "ry", "x", "y"), "P": ("rx", "ry")}
 """Displacements of a link that its joint does not repeat."""

@@ -9,6 +9,7 @@ Derivation: docs/theory/hexapod.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 from loopcal.errors import MechanismError
@@ -34,7 +35,6 @@ from loopcal.mechanism.families.records import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True)

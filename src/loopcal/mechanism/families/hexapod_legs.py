@@ -14,6 +14,8 @@ docs/theory/hexapod.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal import geometry
@@ -31,7 +33,6 @@ from loopcal.mechanism.families.limb_placement import (
 from loopcal.mechanism.families.records import values_per_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Length, Ratio
-from loopcal.value_classes import dataclass
 
 Direction = tuple[Ratio, Ratio, Ratio]
 

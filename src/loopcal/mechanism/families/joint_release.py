@@ -12,6 +12,7 @@ errors of all parameters. Derivation: docs/theory/over-constraint.md.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,7 +40,6 @@ from loopcal.mechanism.over_constraint import (
 from loopcal.mechanism.states import Status, compute_limb_frames, driven_values
 from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 INDEPENDENT = 1e-6
 """Smallest singular value of the works, relative to the largest, of independent joints."""

@@ -8,6 +8,7 @@ stand for gain and curve. Formulas: docs/theory/parameters.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,7 +40,6 @@ from loopcal.mechanism.families.triangle_records import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import ARTICLES, Dimension
-from loopcal.value_classes import dataclass, field
 
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)

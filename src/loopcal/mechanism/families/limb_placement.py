@@ -10,6 +10,7 @@ alone. Derivation: docs/theory/parameters.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, Cone, Joint, Limb, LinearMap, Link
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 EX, EY, EZ = np.eye(3)
 

@@ -12,6 +12,7 @@ the unit of a number from its annotation.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -28,7 +29,6 @@ from loopcal.mechanism.families.records import (
 from loopcal.mechanism.families.triangle_records import TriangleDrive
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
-from loopcal.value_classes import dataclass, field
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[Ratio, Ratio, Ratio]
 Place = Point | PoseRecord

@@ -9,6 +9,7 @@ repeats. How to write such a file: docs/robots.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,7 +79,6 @@ from loopcal.mechanism.families.summed_records import check_sums, has_sums, list
 from loopcal.mechanism.families.triangle_records import TriangleDrive, complete_triangle
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True)

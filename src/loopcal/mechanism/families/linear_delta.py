@@ -10,6 +10,7 @@ point at distance arm_k from all three. Radius and angles are shared parameters
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -29,7 +30,6 @@ from loopcal.mechanism.families.records import (
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True)

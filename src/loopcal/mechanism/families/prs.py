@@ -11,6 +11,8 @@ revolute joint on it. Derivation: docs/theory/tripods.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal import geometry
@@ -38,7 +40,6 @@ from loopcal.mechanism.families.limb_placement import (
 from loopcal.mechanism.families.records import AngleTolerance, LengthTolerance, standard_deviation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

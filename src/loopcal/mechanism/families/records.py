@@ -9,6 +9,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 import numpy as np
@@ -20,7 +21,6 @@ from loopcal.mechanism.families.error_models import ErrorModel
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
-from loopcal.value_classes import dataclass, field, fields, replace
 
 Point = tuple[Length, Length, Length]
 

@@ -17,6 +17,7 @@ Derivation: docs/theory/tripods.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -47,7 +48,6 @@ from loopcal.mechanism.families.prs import (
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
-from loopcal.value_classes import dataclass, field
 
 POST_ANGLES = (
     ("thOx", "pivot", "rx"),

@@ -8,6 +8,7 @@ How to write such a file: docs/robots.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -52,7 +53,6 @@ from loopcal.mechanism.families.records import (
 from loopcal.mechanism.families.triangle_records import NamedTriangleDrive
 from loopcal.mechanism.stages.joined_assembly import StageError, check_stage_names, join_stages
 from loopcal.units import Angle, Dimension, Length, Ratio
-from loopcal.value_classes import dataclass, field, replace
 
 JointError = Literal[Freedom, "offset", "gain"]
 LIMB, LINK = "serial", "joint"

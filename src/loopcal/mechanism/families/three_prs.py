@@ -11,6 +11,7 @@ rotate an axis about itself. Derivation: docs/theory/tripods.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -27,7 +28,6 @@ from loopcal.mechanism.families.prs import (
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True)

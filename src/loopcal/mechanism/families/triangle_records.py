@@ -8,6 +8,7 @@ are those of the joint's errors. Formulas: `loopcal.mechanism.triangle`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -25,7 +26,6 @@ from loopcal.mechanism.families.records import (
 from loopcal.mechanism.triangle import TRIANGLE_TERMS, compute_range, find_side
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
-from loopcal.value_classes import dataclass, field, replace
 
 ON_AXIS = 1e-9
 """Distance of an anchor from the axis, as a share of the larger one, that is no lever."""

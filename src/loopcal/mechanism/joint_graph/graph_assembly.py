@@ -10,6 +10,7 @@ fewest equations, whose values nobody needs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from loopcal.findings import report_finding
 from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 COAXIAL = 1e-9
 """Difference of two frames or axes that count as the same [m, 1]."""

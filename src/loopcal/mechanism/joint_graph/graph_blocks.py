@@ -10,10 +10,10 @@ loop with the joints of the tree around it; loops with a common joint are in one
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

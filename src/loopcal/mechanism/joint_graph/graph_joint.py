@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal import geometry
@@ -12,7 +14,6 @@ from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.mechanism.joint_graph.loop_closure import CLOSURE_RANK_TOLERANCE, JointGraph, Placement
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 STARTS, SPREAD = 24, 0.6
 """Tries to close the loops, and range of their first joint values [rad, sizes]."""

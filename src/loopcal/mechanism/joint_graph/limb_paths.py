@@ -9,6 +9,7 @@ the same, and one path for each motor is left.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.mechanism.joint_graph.home_pose import Freedoms, find_freedoms, list_nearby
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""

@@ -11,6 +11,7 @@ those of the two points and directions, which only the joints below each body mo
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal import geometry
 from loopcal.mechanism.joint_graph.graph_joint import GraphJoint
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 CLOSURE_RANK_TOLERANCE = 1e-8
 """Singular value of the scaled closures, relative to the largest, that counts as zero [1]."""

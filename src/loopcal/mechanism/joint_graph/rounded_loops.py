@@ -10,6 +10,8 @@ with fewer equations closes by its joints alone and stays as it is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal import geometry
@@ -17,7 +19,6 @@ from loopcal.mechanism.joint_graph.graph_joint import GraphJoint, turn_between
 from loopcal.mechanism.joint_graph.home_pose import approach_closure, list_nearby, measure_gap
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ is left out. A mechanism that is one block, or has no loops at all, is one stage
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,7 +42,6 @@ from loopcal.mechanism.joint_graph.limb_paths import (
 from loopcal.mechanism.joint_graph.loop_closure import JointGraph
 from loopcal.mechanism.joint_graph.rounded_loops import Repair, repair_rounded_loops
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 FIRM, FIRM_DRAWN = 0.5, 0.01
 """Share of the best firmness that a home pose must have, and the pose that was drawn [1]."""

@@ -14,6 +14,7 @@ straight path of poses from the start. Derivation: docs/theory/stages.md, docs/t
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -35,7 +36,6 @@ from loopcal.mechanism.states import Status, driven_values
 from loopcal.mechanism.transmission import joint_slopes, readings_from_joints
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 STEPS = 60
 """Newton steps of a row."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from loopcal import geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, State
 from loopcal.mechanism.model import Mechanism, Stage
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 SEVERITY = (CONVERGED, EXHAUSTED, STALLED, NOT_FINITE)
 """Statuses of stages, of which the last one in this order is that of the chain. Any other status,

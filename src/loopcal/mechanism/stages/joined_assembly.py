@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import (
@@ -18,7 +19,6 @@ from loopcal.mechanism.assembly import (
 )
 from loopcal.parameters import CommonError
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 
 class StageError(MechanismError):

@@ -6,6 +6,7 @@ the paper's experiment, fifty points spread over the workspace and then independ
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,7 +34,6 @@ from loopcal.studies.simulation.calibrated_cells import (
     set_size,
 )
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 BEFORE, LS, PRIOR = "before", "LS", "MAP"
 METHODS: Mapping[str, Method] = {LS: LeastSquares(), PRIOR: MAP()}

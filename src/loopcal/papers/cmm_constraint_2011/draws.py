@@ -7,6 +7,7 @@ A statement that holds in some draws only is labelled so.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from loopcal.papers.cmm_constraint_2011.calibrations import (
     LINES,
@@ -17,7 +18,6 @@ from loopcal.papers.cmm_constraint_2011.calibrations import (
 )
 from loopcal.papers.cmm_constraint_2011.layouts import compare_weights
 from loopcal.papers.cmm_constraint_2011.machines import Study, compute_spread
-from loopcal.value_classes import dataclass
 
 DRAWS = 5
 """Times that points, machines and noise are drawn."""

@@ -9,6 +9,8 @@ held.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate import identify
@@ -25,7 +27,6 @@ from loopcal.papers.cmm_constraint_2011.calibrations import LS, METHODS
 from loopcal.papers.cmm_constraint_2011.machines import Study, draw_true_machines
 from loopcal.planning.plane_line_sensors import make_plane_line_instrument
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ERRORS, NOISES = 1e-3, (1e-6, 1e-5)
 """Standard deviations [m] of parameters and of held coordinates."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from loopcal.papers.cmm_constraint_2011.machines import (
 )
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 SD, VARIANCE = "standard deviation", "variance"
 READINGS: Mapping[str, Callable[[float], float]] = {

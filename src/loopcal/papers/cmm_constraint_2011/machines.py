@@ -7,6 +7,7 @@ and 2 are not in our text.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,6 @@ from loopcal.planning.design import MovedDesign
 from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.planning.plane_line_planning import improve_groups
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ROBOT = "hexapod-nategh-agheli"
 GROUPS, POINTS = 10, 10

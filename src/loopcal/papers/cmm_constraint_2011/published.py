@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from math import hypot
 
 from loopcal.papers.printed import last_digit, read_content
-from loopcal.value_classes import dataclass
 
 MM = 1e-3
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from loopcal.papers.wording import Wording, read_wording
 from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 RANKS = ((1, 100), (2, 50), (5, 20), (10, 10), (20, 10), (30, 10))
 """Groups and points of each, drawn at random, whose rank is computed."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,7 +42,6 @@ from loopcal.studies.simulation.calibrated_cells import (
 )
 from loopcal.studies.specification.levels import PosesLevel
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 STATED = (1e-3, 1e-6)
 """Limits [mm, rad] of the stated noise. The paper gives none for angles: the same number in the

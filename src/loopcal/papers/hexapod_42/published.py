@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -12,7 +13,6 @@ import numpy as np
 from loopcal.mechanism import Mechanism
 from loopcal.papers.printed import Printed, read_content
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 MM = 1e-3
 LEGS = tuple(f"leg{i}" for i in range(1, 7))

@@ -20,6 +20,7 @@ Derivation: docs/theory/hexapod.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -31,7 +32,6 @@ from loopcal.measure import Measurements, Observations, Pose, make_random_stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.papers.hexapod_42.published import MM
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ORDER = "xyz"
 """R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made. Equation (2) differs, see

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,7 +37,6 @@ from loopcal.papers.printed import Cell, Comparison, Printed, Table
 from loopcal.papers.reproduction import Content, Figure, Series
 from loopcal.papers.wording import read_wording
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 ITERATIONS = 5
 """Shown in figure 4."""

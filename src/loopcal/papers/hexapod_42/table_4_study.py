@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -15,7 +16,6 @@ from loopcal.papers.hexapod_42.published import MM, Published
 from loopcal.papers.hexapod_42.steps import Study, compute_actual_poses, iterate, to_measurements
 from loopcal.papers.printed import Cell
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 GREEK = ("alpha", "beta", "gamma")
 LEVEL = 0.01

@@ -11,6 +11,7 @@ errors in position and angle.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,7 +33,6 @@ from loopcal.papers.tsvd_2016.machines import (
 from loopcal.papers.tsvd_2016.situations import LS, RANKED, RE, TSVD, find_bottom
 from loopcal.papers.tsvd_2016.steps import Iterations, iterate, linearize, list_scales
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
 CHOSEN = ", chosen"

@@ -8,6 +8,7 @@ theirs from the data; MAP is given the true spread of the errors as its toleranc
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from loopcal.papers.tsvd_2016.situations import (
     run_situation,
 )
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.value_classes import dataclass, replace
 
 BEFORE, TRUE = "before calibration", "true parameters known"
 RAW_LS, RAW_RE, RAW_TSVD = "raw LS", "raw RE at its best", "raw TSVD at its best"

@@ -8,6 +8,7 @@ torsion, as in the paper.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +37,6 @@ from loopcal.mechanism import (
 from loopcal.papers.tsvd_2016.published import MM, read_published
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 ROBOTS = {"RU-PUS-PRS": "ru-pus-prs", "3-PRS": "3-prs"}
 """Names in the paper, and of our robot files."""

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache, cached_property
 
 from loopcal.papers.printed import Printed, read_content
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 MM = 1e-3
 NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")

@@ -9,6 +9,7 @@ errors in position and angle at equal readings.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penaliz
 from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.papers.tsvd_2016.steps import iterate
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 LS, RANKED, RE, TSVD = "LS", "LS with rank detection", "RE", "TSVD"
 

@@ -19,6 +19,8 @@ TSVD.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.estimate.published_methods.raw_steps import (
@@ -33,7 +35,6 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

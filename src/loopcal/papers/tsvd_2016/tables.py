@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +26,6 @@ from loopcal.papers.tsvd_2016.situations import LS, RANKED, RE, TSVD
 from loopcal.papers.wording import read_wording
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 RIDGE_STEPS = (5, 10, 20, 50, 100)
 """Iterations of RE after which its curve over lambda is examined."""

@@ -11,6 +11,7 @@ docs/theory/planning.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,7 +37,6 @@ from loopcal.planning.design.exchange import (
 from loopcal.planning.design.relaxation import RelaxedDesign, relax_design
 from loopcal.planning.design.scoring import ScaledCandidates
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass
 
 PERTURBATIONS, LEAST_PERTURBATIONS = 1600, 20
 """Default number of perturbations: the first over the number of groups, at least the second."""

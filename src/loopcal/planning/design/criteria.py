@@ -11,13 +11,13 @@ Formulas: docs/theory/planning.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from loopcal.planning.design.design_space import divide_by_factor
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

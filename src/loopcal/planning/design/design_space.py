@@ -9,6 +9,8 @@ are removed once, by a stated tolerance, for all designs alike. See docs/theory/
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -17,7 +19,6 @@ from loopcal.findings import report_finding
 from loopcal.numerics.column_elimination import eliminate_from_triangle
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

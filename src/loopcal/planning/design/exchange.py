@@ -12,6 +12,7 @@ exchange only if the new score is larger. Sources and derivations: docs/theory/p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,7 +41,6 @@ from loopcal.planning.design.scoring import (
     score_swaps,
 )
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
-from loopcal.value_classes import dataclass, replace
 
 LinearizeGroups = Callable[[IntArray, FloatArray], FloatArray]
 """(b,) indices of groups, (b, c) coordinates -> rows (b, r, o + p), NaN where not allowed."""

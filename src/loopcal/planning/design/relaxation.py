@@ -24,13 +24,14 @@ Vandenberghe, Convex Optimization (2004), chapter 11. Derivations: docs/theory/p
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.planning.design.criteria import Criterion, compute_efficiency
 from loopcal.planning.design.design_space import ObservableSpace, PriorInformation, divide_by_factor
 from loopcal.planning.design.scoring import ScaledCandidates, Scoring, scale_candidates
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 ROUNDS = 40
 """Largest number of times that candidates enter the barrier problem."""

@@ -28,6 +28,8 @@ R is triangular with these first. Derivations: docs/theory/planning.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.errors import EstimationError
@@ -43,7 +45,6 @@ from loopcal.planning.design.design_space import (
     require_enough,
 )
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 SINGULAR = 1e-6
 """A design is singular where it determines a direction with less than this share of the mean

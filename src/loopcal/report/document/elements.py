@@ -6,10 +6,10 @@ A sentence is a `str`; a table is the one that the terminal shows, too.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 from loopcal.report.tables import Table
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ A report in memory and a run folder give the same record, so that both give the 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from loopcal.estimate.inference.posterior import posterior_from_arrays
 from loopcal.estimate.residuals import KindResiduals, residuals_from_arrays
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import restore_numbers
-from loopcal.value_classes import dataclass, field
 from loopcal.workflow import Verdict
 
 

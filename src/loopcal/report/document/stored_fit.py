@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from loopcal.measure.kinds.joints.actuator_readings import ActuatorReadings
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension, Unit
-from loopcal.value_classes import dataclass
 
 READING_PREFIX, TIME = "reading ", "time"
 """Start of the name of an actuator reading, and name of the time."""

@@ -9,6 +9,7 @@ from `loopcal.report.scene.robot_parts`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +29,6 @@ from loopcal.report.figures.style import (
 from loopcal.report.scene.robot_parts import Part, Role, is_planar, list_parts
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

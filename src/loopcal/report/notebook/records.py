@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import singledispatch
 from typing import Any
 
 import numpy as np
-
-from loopcal.value_classes import dataclass
 
 OTHER = "other"
 """Second dimension of a matrix over the rows of the main table, such as a covariance."""

@@ -7,6 +7,8 @@ cannot change one reading alone, so its axes are the coordinates in which it is 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.diagnose.error_frames import solve_home
@@ -22,7 +24,6 @@ from loopcal.mechanism import (
 )
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit
-from loopcal.value_classes import dataclass
 
 SAMPLES, SEED = 64, 0
 """Poses of the workspace, and the seed of their draw, from which ranges are taken."""

@@ -8,6 +8,7 @@ same parts, each in its own style.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,6 @@ import numpy as np
 from loopcal.engine import State
 from loopcal.mechanism import Mechanism, compute_limb_frames, locate_anchors
 from loopcal.typing import FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 AXIS, GUIDE = 0.06, 0.12
 """Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both

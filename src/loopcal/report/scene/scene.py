@@ -8,13 +8,13 @@ the 3-D view, for which `scene_data.py` writes it.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.apply import AccuracyMap
 from loopcal.mechanism import Mechanism, Solution, forward
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 LONGEST = 0.15
 """Length of the longest drawn error, as a share of the robot's size."""

@@ -6,13 +6,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any
 
 from loopcal.errors import StudyError
 from loopcal.findings import report_finding
 from loopcal.studies.execution.interface import Answer, R, T, TaskQueue, compute_timed
 from loopcal.studies.execution.optional_packages import import_optional
-from loopcal.value_classes import dataclass
 
 QUEUED = 2
 """Tasks in flight for each thread of the workers: one is computed, the next one waits there."""

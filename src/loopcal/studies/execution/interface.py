@@ -6,9 +6,8 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
-
-from loopcal.value_classes import dataclass
 
 MOST_LOSSES = 5
 """Workers that one task may stop. After that it is given up, because it stops any worker."""

@@ -13,7 +13,7 @@ import signal
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass  # noqa: TID251 some can be changed
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic
 
 from loopcal.errors import StudyError

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass
 
 from loopcal.studies.execution.interface import Answer, R, T, compute_timed
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

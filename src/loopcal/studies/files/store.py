@@ -16,6 +16,7 @@ import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,6 @@ from loopcal.findings import report_finding
 from loopcal.io.core.descriptors import lock, open_folder
 from loopcal.studies.files.file_systems import find_network_file_system
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 NAME = "study.sqlite"
 """File name of a store in the folder of its study."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +34,6 @@ from loopcal.studies.specification.levels import (
 )
 from loopcal.studies.specification.scores import check_question
 from loopcal.studies.specification.study import BLOCK, REPLICATES, Study
-from loopcal.value_classes import dataclass, field, replace
 
 T = TypeVar("T")
 

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import loopcal
@@ -32,7 +33,6 @@ from loopcal.studies.files.store import (
 from loopcal.studies.specification.changes import list_conflicts
 from loopcal.studies.specification.keys import NUMERICS
 from loopcal.studies.specification.study import Study
-from loopcal.value_classes import dataclass, replace
 
 STUDY_FILE = "study.yaml"
 """Name of the study file in the folder."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.report.figures.style import COLORS
@@ -13,7 +14,6 @@ from loopcal.studies.results.summary_view import UNITS
 from loopcal.studies.specification.cells import list_factors, list_varied_factors
 from loopcal.studies.specification.level_chains import LevelChain, list_chains
 from loopcal.studies.specification.study import Study
-from loopcal.value_classes import dataclass
 
 CHAIN = ""
 """Stands for a factor: the words in which levels along the axis differ, beside their number."""

@@ -13,6 +13,7 @@ therefore wrong in at most 5 % of studies. A trial that failed is a machine that
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -25,7 +26,6 @@ from loopcal.studies.specification.level_chains import LevelChain, list_chains
 from loopcal.studies.specification.levels import Question
 from loopcal.studies.specification.scores import check_question
 from loopcal.studies.specification.study import Study
-from loopcal.value_classes import dataclass
 
 Certainty = Literal["certain", "between", "none", "unknown"]
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.report.tables import Column, Table, word_column
@@ -11,7 +12,6 @@ from loopcal.report.text_page import Block
 from loopcal.studies.files.store import is_driven, read_store
 from loopcal.studies.files.study_folder import load_specification
 from loopcal.studies.specification.cells import list_factors, list_varied_factors
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,6 @@ from loopcal.studies.specification.cells import Cell, list_factors
 from loopcal.studies.specification.levels import Question
 from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

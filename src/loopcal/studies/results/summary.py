@@ -11,6 +11,7 @@ positive counts estimated from survey data", Survey Methodology 24 (1998) 193-20
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from loopcal.studies.specification.cells import Cell
 from loopcal.studies.specification.scores import ScoreColumn
 from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 LEVEL = 0.95
 """Of all intervals."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +30,6 @@ from loopcal.studies.results.summary_view import FRAMES, UNITS
 from loopcal.studies.specification.scores import BASE_COLUMNS, ScoreColumn, check_question
 from loopcal.studies.specification.study import Study
 from loopcal.units import Unit
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

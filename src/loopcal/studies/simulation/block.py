@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,6 @@ from loopcal.studies.simulation.preparation import PreparedCell, prepare_cell
 from loopcal.studies.specification.scores import list_columns
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 HELD_OUT = 4
 """Purpose of the random stream from which the errors of the readings of held-out poses come."""

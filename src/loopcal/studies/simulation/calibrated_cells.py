@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
@@ -15,7 +16,6 @@ from loopcal.studies.simulation.fits import DIVERGED
 from loopcal.studies.simulation.tasks import list_tasks
 from loopcal.studies.specification.study import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from loopcal.measure import (
@@ -18,7 +20,6 @@ from loopcal.mechanism import Mechanism, compute_readings
 from loopcal.studies.specification.levels import Backlash, EffectsLevel, ThermalGrowth
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, replace
 
 EFFECTS = 3
 """Purpose of the random stream of a trial from which the direction of drift and jump is drawn."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,7 +24,6 @@ from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.studies.simulation.preparation import PreparedCell
 from loopcal.studies.simulation.published_fits import PublishedFits, fit_published
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass, fields, replace
 from loopcal.workflow.calibration import calibrate
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.verdict import Verdict

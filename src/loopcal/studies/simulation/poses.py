@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from loopcal.studies.specification.levels import (
     Scores,
 )
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 TOLERANCES = ("tolerance_factor", "tolerances")
 """Settings of errors that change the tolerances, and with them planned poses."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -33,7 +34,6 @@ from loopcal.studies.specification.levels import (
     Scores,
 )
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, replace
 
 OF_BLOCK = ("block",)
 """Keys of the content of a task that differ between the blocks of a cell."""

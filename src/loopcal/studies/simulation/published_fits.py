@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
@@ -30,7 +32,6 @@ from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.studies.simulation.methods import make_method
 from loopcal.studies.specification.levels import MethodLevel
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.value_classes import dataclass
 
 MOST_LEG_STEPS = 100
 """Steps of a fit leg by leg at most, where epsilon ends them."""

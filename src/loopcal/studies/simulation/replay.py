@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 
 from loopcal.errors import DataError
 from loopcal.estimate import FitOptions
@@ -15,7 +16,6 @@ from loopcal.studies.simulation.preparation import prepare_cell
 from loopcal.studies.simulation.tasks import list_tasks
 from loopcal.studies.specification.levels import MethodLevel
 from loopcal.studies.specification.study import Study
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False)

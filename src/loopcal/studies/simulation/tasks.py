@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from loopcal.studies.simulation.block import compute_scores
@@ -12,7 +13,6 @@ from loopcal.studies.simulation.poses import CellPoses, compute_poses, describe_
 from loopcal.studies.specification.keys import compute_key, describe_block, format_json
 from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True)

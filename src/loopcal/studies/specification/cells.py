@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from loopcal.studies.specification.levels import FACTORS
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.studies.specification.study import Study

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 from loopcal.studies.specification.levels import FACTORS
 from loopcal.units import SI_SYMBOLS, Dimension
-from loopcal.value_classes import dataclass, fields
 
 if TYPE_CHECKING:
     from loopcal.studies.specification.study import Study

@@ -8,11 +8,11 @@ are in SI; the reader of study files converts them.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from loopcal.measure.instrument import Distribution
 from loopcal.units import Angle, Length
-from loopcal.value_classes import dataclass, field
 
 FACTORS: Mapping[str, str] = {
     "robots": "robot",

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.studies.specification.level_chains import list_chains
 from loopcal.studies.specification.levels import FACTORS, Question, Scores
 from loopcal.units import SI_SYMBOLS, Dimension, find_unit, parse_quantity
-from loopcal.value_classes import dataclass
 
 if TYPE_CHECKING:
     from loopcal.studies.specification.study import Study

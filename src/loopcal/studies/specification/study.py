@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from loopcal.presentation import HtmlResult
@@ -25,7 +26,6 @@ from loopcal.studies.specification.levels import (
     Scores,
 )
 from loopcal.studies.specification.scores import ScoreColumn, list_columns
-from loopcal.value_classes import dataclass, field
 
 BLOCK, REPLICATES = 50, 1000
 """Trials of a block, and of a cell, by default."""

@@ -3,6 +3,7 @@
 autocollimator.
 """
 
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -13,7 +14,6 @@ from loopcal.measure.kinds.directions.direction_kind import AxisKind
 from loopcal.measure.kinds.rows import Column, InvalidRows
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

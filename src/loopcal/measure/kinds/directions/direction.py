@@ -3,6 +3,7 @@
 probed face.
 """
 
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -14,7 +15,6 @@ from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, is_incom
 from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

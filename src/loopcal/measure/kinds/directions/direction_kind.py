@@ -5,6 +5,7 @@ the platform.
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
@@ -17,7 +18,6 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Evaluation
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

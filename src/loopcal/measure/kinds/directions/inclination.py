@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `inclination`: two tilts of the platform against gravity, by inclinometers on it."""
 
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -10,7 +11,6 @@ from loopcal.measure.kinds.directions.direction_kind import DirectionKind
 from loopcal.measure.kinds.rows import Column, InvalidRows, list_rows
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

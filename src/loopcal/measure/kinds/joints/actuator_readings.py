@@ -6,6 +6,7 @@ made from the robot. It is not in `KINDS`, because files state readings as colum
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -14,7 +15,6 @@ from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False)

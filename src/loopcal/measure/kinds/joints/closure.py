@@ -7,6 +7,7 @@ readings has; see docs/theory/uncertain-readings.md. A row of this kind has no c
 that its pose has no measured value on purpose, and which session and time its readings belong to.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

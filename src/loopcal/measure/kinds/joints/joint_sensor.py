@@ -8,6 +8,7 @@ value that the encoder showed.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -20,7 +21,6 @@ from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `bearing`: two angles of a point from a station, measured by a theodolite or a camera."""
 
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -14,7 +15,6 @@ from loopcal.measure.kinds.points.target_kind import Prediction, TargetKind
 from loopcal.measure.kinds.rows import Column
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

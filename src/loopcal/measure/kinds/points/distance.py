@@ -4,6 +4,7 @@ ball bar.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -17,7 +18,6 @@ from loopcal.measure.kinds.points.target_kind import LengthKind, Prediction
 from loopcal.measure.kinds.rows import Column
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

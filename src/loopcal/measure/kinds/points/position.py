@@ -3,6 +3,7 @@
 measures spheres.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -18,7 +19,6 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.points.target_kind import Prediction, TargetKind
 from loopcal.measure.kinds.rows import POSITION_COLUMNS, Column
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

@@ -3,6 +3,7 @@
 calipers on a printed part.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -11,7 +12,6 @@ from loopcal.measure.kinds.points.target_kind import LengthKind
 from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

@@ -3,6 +3,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -15,7 +16,6 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field, replace
 
 Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
 """The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in

@@ -5,6 +5,7 @@ Angles are those of the declared orientation; their differences are wrapped. Nea
 azimuth phi is not defined. There the x and y components of the unit normal replace theta and phi.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -21,7 +22,6 @@ from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, list_row
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 SMALL_TILT = 0.05
 """Measured tilt [rad] below which the normal replaces phi and theta; the noise of phi is twenty

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `pose`: position and full orientation of the tool in a frame."""
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -22,7 +23,6 @@ from loopcal.measure.kinds.rows import (
 )
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -2,6 +2,7 @@
 """Base of the kinds that measure the robot's tool in the frame of an instrument."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -14,7 +15,6 @@ from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
 from loopcal.typing import FloatArray
-from loopcal.value_classes import dataclass, field, replace
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

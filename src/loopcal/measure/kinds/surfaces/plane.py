@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `plane`: points of the platform on a plane, such as a probed bed or plate."""
 
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -13,7 +14,6 @@ from loopcal.measure.kinds.surfaces.surface_kind import SurfaceKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

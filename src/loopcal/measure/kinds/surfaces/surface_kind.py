@@ -7,6 +7,7 @@ correction for its ball and its deflection. Rows of one group share the paramete
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
@@ -18,7 +19,6 @@ from loopcal.measure.kinds.points.target_kind import TargetKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-from loopcal.value_classes import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
