@@ -24,10 +24,11 @@ from loopcal.mechanism.platform_coordinates import (
 from loopcal.mechanism.states import driven_values
 from loopcal.mechanism.summed_drives import differentiate_lengths
 from loopcal.mechanism.transmission import select_weights
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
 
 RANK = 1e-9
-"""Relative size below which a singular value at home counts as zero.
+"""Relative size below which a singular value of closure equations counts as zero.
 
 Real margins are above 1e-4, rounding is below 1e-13.
 """
@@ -58,7 +59,7 @@ def check_mobility(robot: Mechanism) -> None:
     names = [AXES[f] for f in program.freedoms]
     _, s, V = np.linalg.svd(A, full_matrices=True)
     m, a = len(names), program.n_joints
-    rank = _count_rank(s)
+    rank = count_rank(s)
     if rank < m:
         finding = report_finding(
             "mechanism.free-platform",
@@ -71,7 +72,7 @@ def check_mobility(robot: Mechanism) -> None:
         raise MechanismError(finding)
     _, both, W = np.linalg.svd(np.concatenate([A, Q], axis=1), full_matrices=True)
     # motions with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
-    independent = _count_rank(both)
+    independent = count_rank(both)
     motions = W[independent:, :m]
     movable = len(motions)
     if movable < min(a, m):
@@ -102,7 +103,7 @@ def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
     weights = select_weights(tau)
     assert weights is not None
     slope = differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
-    if _count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
+    if count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
         raise MechanismError(
             f"{robot.name}: the sums of its readings do not hold the platform at home, where it "
             "can move while all sums are constant; correct the weights of `sum:`, or state another "
@@ -117,7 +118,7 @@ def _check_controlled(robot: Mechanism, movable: int, D: FloatArray) -> None:
     """
     columns = _differentiate_controlled(robot, robot.home)
     s = np.linalg.svd(columns @ D, compute_uv=False)
-    if _count_rank(s) < movable:
+    if count_rank(s) < movable:
         raise MechanismError(_word_dependent(robot, movable))
 
 
@@ -132,7 +133,7 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     columns = _differentiate_controlled(robot, state.T[0, 0])
     scale = 1 / robot.twist_scale[list(program.freedoms)]
     s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
-    if _count_rank(s) < len(scale):
+    if count_rank(s) < len(scale):
         raise MechanismError(_word_dependent(robot, len(robot.controlled)))
 
 
@@ -206,16 +207,16 @@ def _find_dependent_columns(U: FloatArray) -> list[int]:
     while True:
         rest = [c for c in range(U.shape[1]) if c not in chosen]
         _, s, V = np.linalg.svd(U[:, rest])
-        if _count_rank(s) == len(rest):
+        if count_rank(s) == len(rest):
             return chosen
         part = np.abs(V[-1])
         # of equal components the first, whatever their rounding errors
         chosen.append(rest[int(np.argmax(part > (1 - 1e-6) * part.max()))])
 
 
-def _count_rank(s: NDArray[np.floating[Any]]) -> int:
-    """Return how many singular values are above RANK times the largest one."""
-    return int((s > RANK * s.max(initial=1e-300)).sum())
+def count_rank(s: NDArray[np.floating[Any]]) -> int:
+    """Return how many singular values of closure equations are above RANK times the largest."""
+    return int(are_nonzero(s, RANK).sum())
 
 
 def list_main_freedoms(names: Sequence[str], direction: FloatArray) -> list[str]:

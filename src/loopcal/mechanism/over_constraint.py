@@ -23,15 +23,11 @@ from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
 from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials
 from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.mobility import RANK, count_rank
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-RANK = 1e-9
-"""Relative size below which a singular value of the closure equations counts as zero.
-
-Real margins are above 1e-4, rounding is below 1e-13.
-"""
 SAME = 1e-6
 """Largest component, relative to the whole, by which a vector may differ from a named direction,
 or from the equations of other limbs, and still count as one of them.
@@ -86,7 +82,7 @@ class _Rows:
         own = np.isin(self.limb, limbs)
         both = np.concatenate([self.A, self.Q], axis=1)[own]
         left, s, _ = np.linalg.svd(both, full_matrices=True)
-        out = np.zeros((len(both) - int((s > RANK * s.max(initial=1e-300)).sum()), len(own)))
+        out = np.zeros((len(both) - count_rank(s), len(own)))
         out[:, own] = left[:, len(both) - len(out) :].T
         return out
 
@@ -94,7 +90,7 @@ class _Rows:
         """Return an orthonormal basis (r, m) of what a limb constrains with its drives free."""
         own = self.limb == limb
         left, s, _ = np.linalg.svd(self.Q[own], full_matrices=True)
-        undriven = left[:, int((s > RANK * s.max(initial=1e-300)).sum()) :]
+        undriven = left[:, count_rank(s) :]
         return _find_basis(undriven.T @ self.A[own])
 
 
@@ -246,7 +242,7 @@ def _find_sufficient_freedoms(
     used = np.zeros(len(freedoms), bool)
     for rows in _linearize(robot, find_nearby_states(robot)):
         _, s, W = np.linalg.svd(np.concatenate([rows.A, rows.Q], axis=1), full_matrices=True)
-        motions = W[int((s > RANK * s.max()).sum()) :, : len(freedoms)]
+        motions = W[count_rank(s) :, : len(freedoms)]
         largest = np.abs(motions).max(axis=0, initial=0.0)
         used |= largest > SAME * largest.max(initial=1e-300)
     names = tuple(AXES[f] for f, moves in zip(freedoms, used, strict=True) if moves)
@@ -284,8 +280,8 @@ def find_nearby_states(robot: Mechanism) -> State:
 
 def find_over_constraint(robot: Mechanism) -> Finding | None:
     """Return the finding of closure equations that repeat others, None where none does."""
-    codes = (f for f in robot.findings if f.code == "mechanism.repeated-equations")
-    return next(codes, None)
+    code = "mechanism.repeated-equations"
+    return next((finding for finding in robot.findings if finding.code == code), None)
 
 
 def is_over_constrained(robot: Mechanism) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from loopcal.numerics.decomposition import are_nonzero
 from loopcal.typing import FloatArray
 
 SINGULAR = 1e-9
@@ -41,4 +42,4 @@ def count_independent(weights: FloatArray) -> int:
     """Return how many rows of W (a, J) are independent."""
     scale = np.abs(weights).max(axis=1, initial=0.0, keepdims=True)
     s = np.linalg.svd(weights / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
-    return int((s > SINGULAR * s.max(initial=1e-300)).sum())
+    return int(are_nonzero(s, SINGULAR).sum())

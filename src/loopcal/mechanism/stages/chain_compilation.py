@@ -13,6 +13,7 @@ from loopcal.engine import Program
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
 from loopcal.mechanism.assembly import AXES, BASE, Assembly, AttachedStage
+from loopcal.mechanism.mobility import count_rank
 from loopcal.mechanism.model import Mechanism, SlotMap, Stage
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
 from loopcal.mechanism.stages.chain_kinematics import PoseDerivative, differentiate_end
@@ -27,8 +28,6 @@ from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension
 
-RANK = 1e-9
-"""Relative size below which a singular value at home counts as zero."""
 DEFAULT_SIZE = 1.0
 """Characteristic length [m] of a chain whose platforms all coincide."""
 
@@ -185,7 +184,7 @@ def _check_mobility(robot: Mechanism, home: ChainState, differentiate: PoseDeriv
     D = differentiate_end(robot, values, q, home, differentiate).readings[0, 0]
     turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
     scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
-    freedoms = _count_rank(scaled)
+    freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))
     c, a = len(robot.controlled), len(moving)
     if c != a:
         raise MechanismError(
@@ -199,7 +198,8 @@ def _check_mobility(robot: Mechanism, home: ChainState, differentiate: PoseDeriv
         )
     target = read_coordinates(home.T[0], robot.controlled)
     _, slope = compare_coordinates(home.T[0], target, robot.controlled, robot.size)
-    independent = _count_rank(slope[0] / robot.twist_scale @ scaled)
+    rates = slope[0] / robot.twist_scale @ scaled
+    independent = count_rank(np.linalg.svd(rates, compute_uv=False))
     if independent < c:
         finding = report_finding(
             "mechanism.chain-singular-home",
@@ -208,9 +208,3 @@ def _check_mobility(robot: Mechanism, home: ChainState, differentiate: PoseDeriv
             independent=independent,
         )
         raise MechanismError(finding)
-
-
-def _count_rank(matrix: FloatArray) -> int:
-    """Return how many singular values are above RANK times the largest one."""
-    s = np.linalg.svd(matrix, compute_uv=False)
-    return int((s > RANK * s.max(initial=1e-300)).sum())
