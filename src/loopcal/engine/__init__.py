@@ -7,6 +7,7 @@ them at the same time.
 """
 
 from loopcal.engine.program import CONVERGED as CONVERGED
+from loopcal.engine.program import ENDINGS as ENDINGS
 from loopcal.engine.program import EXHAUSTED as EXHAUSTED
 from loopcal.engine.program import LENGTH as LENGTH
 from loopcal.engine.program import NEAR_GOAL as NEAR_GOAL

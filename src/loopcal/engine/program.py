@@ -22,6 +22,8 @@ from loopcal.typing import FloatArray, IntArray
 
 PITCH, LENGTH = 6, 7
 """Values of `Slot.axis` beside the axes 0..5 of a twist."""
+ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
+"""Endings of a limb, with the number of their closure equations."""
 CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 """Values of `State.status`."""
 NEAR_GOAL = 8
@@ -139,6 +141,19 @@ class Program:
     def with_fixed_platform(self) -> Program:
         """The same limbs with a platform that stays where the start has it."""
         return replace(self, freedoms=())
+
+    @cached_property
+    def with_driven_joints(self) -> Program:
+        """The same limbs with each joint driven by an actuator of its own, and all closure rows."""
+        groups, count = [], 0
+        for group in self.groups:
+            joints, k = len(group.joints) + (group.ending == "distance"), len(group.limbs)
+            actuator = np.full((len(group.joints) + 1, k), -1)
+            actuator[:joints] = count + np.arange(joints * k).reshape(joints, k)
+            count += joints * k
+            rows = tuple(range(ENDINGS[group.ending]))
+            groups.append(replace(group, actuator=actuator, rows=rows))
+        return replace(self, groups=tuple(groups), n_joints=count)
 
     @cached_property
     def idle_groups(self) -> tuple[int, ...]:

@@ -21,9 +21,6 @@ from loopcal.units import Dimension
 AXES = ("rx", "ry", "rz", "x", "y", "z")
 """Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""
 
-ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
-"""Endings of a limb, with the number of their closure equations."""
-
 BASE = "base"
 """Name of the base of a chain of stages."""
 

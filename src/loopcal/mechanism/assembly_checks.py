@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+from loopcal.engine import ENDINGS
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import (
     AXES,
-    ENDINGS,
     MOST_ACTUATORS,
     MOST_JOINTS,
     MOST_LIMBS,

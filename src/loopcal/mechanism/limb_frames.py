@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames along a limb for displacements and joint values, from the base to its tip."""
+"""Frames along a limb for displacements and joint values, and the length of its rod."""
 
 from __future__ import annotations
 
@@ -38,6 +38,18 @@ def follow_limb(
         motion = _move_joint(letter, joints[..., j], pitch[:, None, j])
         frames.append(frames[-1] @ motion @ placed[:, :, j + 1])
     return frames, placed[:, :, -1]
+
+
+def measure_rod(group: Group, k: int, displacements: FloatArray) -> FloatArray:
+    """Return the lengths (t,) of the rod that ends limb k of a group [m]; 0 without one.
+
+    displacements : (t, s) of this limb. The value of its joint, if it is driven, is added to it.
+    """
+    length = np.full(len(displacements), group.length[k] if group.ending == "distance" else 0.0)
+    for slot, value in zip(group.slots, displacements.T, strict=True):
+        if slot.axis == LENGTH:
+            length = length + value
+    return length
 
 
 def _move_joint(letter: str, value: FloatArray, pitch: FloatArray) -> FloatArray:

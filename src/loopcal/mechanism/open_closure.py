@@ -24,9 +24,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.engine import LENGTH, ParameterMap, Program, State, TwistRows
-from loopcal.mechanism.assembly import ENDINGS
-from loopcal.mechanism.limb_frames import follow_limb
+from loopcal.engine import ParameterMap, Program, State, TwistRows
+from loopcal.mechanism.limb_frames import follow_limb, measure_rod
 from loopcal.mechanism.states import make_start
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -72,10 +71,7 @@ class _Rows:
             tip, end = frames[-1][:, 0], (self.T @ attachment)[:, 0]
             gap = end[:, :3, 3] - tip[:, :3, 3]
             if group.ending == "distance":
-                length = group.length[k] + joints[:, 0, k, -1]
-                length += sum(
-                    own[:, k, i] for i, slot in enumerate(group.slots) if slot.axis == LENGTH
-                )
+                length = measure_rod(group, k, own[:, k]) + joints[:, 0, k, -1]
                 gap = (np.linalg.norm(gap, axis=1) - length)[:, None]
             elif group.ending == "rigid":
                 R = end[:, :3, :3] @ tip[:, :3, :3].swapaxes(1, 2)
@@ -146,7 +142,7 @@ def differentiate_unknowns(
     for first in range(0, t * n, CHUNK):
         trial, pose = np.divmod(np.arange(first, min(first + CHUNK, t * n)), n)
         rows = _Rows(
-            _drive_all_joints(program),
+            program.with_driven_joints,
             e[trial if len(e) > 1 else 0 * trial],
             state.T[trial, pose][:, None],
             tuple(own[trial, pose][:, None] for own in joints),
@@ -190,25 +186,6 @@ def fold_open_poses(
     return factor, np.broadcast_to(is_finite, shape)
 
 
-def _drive_all_joints(program: Program) -> Program:
-    """Return the program with each joint driven by an actuator of its own, and all rows; it is kept
-    with the program.
-    """
-    kept = vars(program).get("_all_driven")
-    if kept is None:
-        groups, count = [], 0
-        for group in program.groups:
-            joints, k = len(group.joints) + (group.ending == "distance"), len(group.limbs)
-            actuator = np.full((len(group.joints) + 1, k), -1)
-            actuator[:joints] = count + np.arange(joints * k).reshape(joints, k)
-            count += joints * k
-            rows = tuple(range(ENDINGS[group.ending]))
-            groups.append(replace(group, actuator=actuator, rows=rows))
-        kept = replace(program, groups=tuple(groups), n_joints=count)
-        vars(program)["_all_driven"] = kept
-    return kept
-
-
 @dataclass(frozen=True)
 class _InputMap:
     """Derivatives by p parameters and a readings: of displacements (N, d, p + a), and of driven
@@ -249,6 +226,31 @@ def _map_inputs(
     return _InputMap(displacements, joints)
 
 
+@dataclass(frozen=True)
+class _Places:
+    """Where the rows of one limb have their unknowns.
+
+    columns : of its freedoms and unknown joints among all `total` unknowns. joints : the numbers
+    of these joints in the limb.
+    """
+
+    columns: IntArray
+    joints: list[int]
+    total: int
+
+    def spread(
+        self, A: FloatArray, E: FloatArray, Q: FloatArray, *, moved: FloatArray
+    ) -> FloatArray:
+        """Return rows by all unknowns and all inputs, (N, r, total + p + a).
+
+        A, E, Q : (N, r, ..) by freedoms, slots and joints. moved : of `_InputMap.select`.
+        """
+        out = np.zeros((*A.shape[:2], self.total + moved.shape[2]))
+        out[:, :, self.columns] = np.concatenate([A, Q[..., self.joints]], axis=2)
+        out[:, :, self.total :] = np.concatenate([E, Q], axis=2) @ moved
+        return out
+
+
 def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> FloatArray:
     """Return the unknowns by parameters and readings (N, u, p + a)."""
     m, N, width = len(program.freedoms), len(rows.T), inputs.joints.shape[2]
@@ -262,21 +264,15 @@ def _differentiate_rows(program: Program, rows: _Rows, inputs: _InputMap) -> Flo
         group, own = program.groups[number], unknown[number]
         exact = _correct_slopes(program, number, block, residuals[number])
         for k in range(len(group.limbs)):
-            columns = np.array([*range(m), *range(first, first + len(own))])
+            places = _Places(np.array([*range(m), *range(first, first + len(own))]), own, total)
             first += len(own)
-            moved = inputs.select(program, number, k)
-            chosen = list(group.rows)
-
-            def place(A: FloatArray, E: FloatArray, Q: FloatArray) -> FloatArray:
-                """Return rows of one limb in all unknowns and inputs, (N, r, total + width)."""
-                out = np.zeros((N, A.shape[1], total + width))
-                out[:, :, columns] = np.concatenate([A, Q[..., own]], axis=2)  # noqa: B023
-                out[:, :, total:] = np.concatenate([E, Q], axis=2) @ moved  # noqa: B023
-                return out
-
-            J.append(place(*(a[:, k, chosen] for a in (block.A, block.E, block.Q)))[..., :total])
-            dr.append(place(*(a[:, k, chosen] for a in exact)))
-            bent[:, columns] += place(*(a[:, k] for a in bends[number]))
+            moved, chosen = inputs.select(program, number, k), list(group.rows)
+            slopes = places.spread(
+                *(a[:, k, chosen] for a in (block.A, block.E, block.Q)), moved=moved
+            )
+            J.append(slopes[..., :total])
+            dr.append(places.spread(*(a[:, k, chosen] for a in exact), moved=moved))
+            bent[:, places.columns] += places.spread(*(a[:, k] for a in bends[number]), moved=moved)
     return _solve(np.concatenate(J, axis=1), np.concatenate(dr, axis=1), bent)
 
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.engine import LENGTH, PITCH, Group
-from loopcal.mechanism.limb_frames import follow_limb
+from loopcal.engine import PITCH, Group
+from loopcal.mechanism.limb_frames import follow_limb, measure_rod
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.mechanism.stages.chain_state import list_carrying_stages
@@ -74,20 +74,11 @@ def _bound_by_limbs(robot: Mechanism, values: FloatArray) -> tuple[FloatArray, F
             points = np.stack([frame[:, 0, :3, 3] for frame in frames], axis=1)
             length = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(axis=1)
             length = length + np.linalg.norm(attachment[:, 0, :3, 3], axis=-1)
-            length = length + _measure_rod(group, k, own)
+            length = length + measure_rod(group, k, own)
             shorter = length < radius
             center = np.where(shorter[:, None], points[:, 0], center)
             radius = np.where(shorter, length, radius)
     return center, radius
-
-
-def _measure_rod(group: Group, k: int, displacements: FloatArray) -> FloatArray:
-    """Return the lengths (t,) of the rod that ends limb k of a group [m]; 0 without one."""
-    length = np.full(len(displacements), group.length[k] if group.ending == "distance" else 0.0)
-    for slot, value in zip(group.slots, displacements.T, strict=True):
-        if slot.axis == LENGTH:
-            length = length + value
-    return length
 
 
 def _has_fixed_links(group: Group, k: int) -> bool:
