@@ -25,18 +25,19 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.geometry.alignment import FLATNESS, align_point_sets
 from loopcal.measure import Measurements, Observations, Position
 from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import find_unit
 
 LEVEL = 0.01
-"""Probability of reporting anything although no frame and no target moved, of each of both tests.
-"""
+"""Probability, for each of the two tests, of a report although no frame and no target moved."""
 
 TINY = 1e-99
-"""Probabilities below this are not written."""
+"""Smallest probability that is written; a smaller one is stated as below this."""
 
 EXACT = 1e-9
-"""Standard deviation of stated places [m]: none, beside that of any instrument."""
+"""Standard deviation of stated places [m], negligible beside the noise of any instrument."""
 
 RANK = 1e-9
 """Singular values of whitened rows with scaled columns, relative to the largest, that are zero."""
@@ -120,7 +121,9 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
     angle : symbol of the unit in which angles are reported.
     """
     shapes = compare_shapes(data)
-    changed = [shape for shape in shapes if shape.p_value * len(shapes) < LEVEL]
+    changed = [
+        shape for shape in shapes if compute_any_probability(shape.p_value, len(shapes)) < LEVEL
+    ]
     drifts = estimate_frame_drifts(_leave_out(data, changed))
     shown = find_unit(angle)
     findings = [
@@ -149,7 +152,7 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
             tiny=drift.p_value < TINY,
         )
         for drift in drifts
-        if drift.p_value * len(drifts) < LEVEL
+        if compute_any_probability(drift.p_value, len(drifts)) < LEVEL
     ]
     if unused := _list_unused_sessions(data):
         names = tuple(f"session {name!r}" if name else "rows without a session" for name in unused)
@@ -237,8 +240,9 @@ def _states_places(kind: Position) -> bool:
 
 
 def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[_Repeats]:
-    """Give the measurements of the same targets in frames of one name, in their order; before them,
-    if asked for, their stated places as an exact measurement without a session.
+    """Yield the measurements of the same targets in frames of one name, in their order.
+
+    with_places : whether the stated places come first, as an exact measurement without a session.
     """
     groups: dict[tuple[str, tuple[str, ...]], list[Observations]] = {}
     for rows in data.base_observations:
@@ -273,10 +277,10 @@ def _order_rows(rows: Observations) -> IntArray:
 
 def _spans_plane(points: FloatArray) -> bool:
     """Return whether at least three of points (k, 3) are measured and not collinear."""
-    seen = points[np.isfinite(points).all(axis=1)]
-    if len(seen) < 3:
+    measured = points[np.isfinite(points).all(axis=1)]
+    if len(measured) < 3:
         return False
-    extent = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+    extent = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
     return bool(extent[1] > FLATNESS * extent[0])
 
 
@@ -329,7 +333,7 @@ def _solve(A: FloatArray, b: FloatArray) -> _Solution:
     length = np.linalg.norm(A, axis=0)
     scale = np.where(length > 0.0, length, 1.0)
     u, s, vt = np.linalg.svd(A / scale, full_matrices=False)
-    used = s > RANK * s[0]
+    used = are_nonzero(s, RANK)
     root = (vt[used].T / s[used]) / scale[:, None]
     part = u[:, used].T @ b
     rest = b - u[:, used] @ part
