@@ -82,14 +82,13 @@ class Loops:
 
     def select(self, trials: np.ndarray, count: int | None = None) -> Loops:
         """Return the loops of these trials, of `count` that may have arrays in common."""
-        parts = [self.e, self.weights]
-        if count is not None:
-            parts = [
-                None if a is None else np.broadcast_to(a, (count, *a.shape[1:])) for a in parts
-            ]
-        e, weights = (None if a is None else a[trials] for a in parts)
-        assert e is not None
-        return Loops(self.robot, e, weights)
+
+        def take(array: FloatArray) -> FloatArray:
+            shape = array.shape if count is None else (count, *array.shape[1:])
+            return np.broadcast_to(array, shape)[trials]
+
+        weights = None if self.weights is None else take(self.weights)
+        return Loops(self.robot, take(self.e), weights)
 
 
 def follow_path(

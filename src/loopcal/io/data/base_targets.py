@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from loopcal.measure import Kind
 
 FEWEST = 2
-"""Targets on the base, at least, by which an instrument finds its frame. One shows no rotation, and
-a wrong one could not be noticed.
+"""Fewest targets on the base that may determine the frame of an instrument. A single one shows no
+rotation, and no other target would reveal its error.
 """
 
 
@@ -60,14 +60,14 @@ def check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRow
     """
     from loopcal.measure.base_rows import list_moving_targets
 
-    every = [entry.kind for of_file in kinds for entry in of_file]
-    known = {target for kind in every if kind.is_of_base for target in kind.target_columns}
-    moving = [kind for kind in every if not kind.is_of_base]
+    all_kinds = [entry.kind for of_file in kinds for entry in of_file]
+    known = {target for kind in all_kinds if kind.is_of_base for target in kind.target_columns}
+    moving = [kind for kind in all_kinds if not kind.is_of_base]
     frames = tuple(dict.fromkeys(name for kind in moving if (name := _find_frame(kind))))
     for table, of_file in zip(tables, kinds, strict=True):
         for entry in (entry for entry in of_file if entry.kind.is_of_base):
             place = (*entry.location, "targets")
-            if shared := list_moving_targets(entry.kind, every):
+            if shared := list_moving_targets(entry.kind, all_kinds):
                 finding = report_finding("data.target-on-two-bodies", targets=shared)
                 raise table.settings.error(finding, place)
             name = _find_frame(entry.kind)

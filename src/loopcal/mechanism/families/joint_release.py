@@ -4,9 +4,9 @@
 With the combinations w of repeated equations, limb k exerts the wrench F = A_k'w_k on the platform.
 A joint more, with the twist x at the platform, frees the direction in which this wrench does work:
 x'F. Joints whose works are independent for all w, as many as equations that repeat others, leave
-none, and do not let the machine move in any other way. Joints that people replace are tried: R by
-U or C, U by S, P by C. The machine with these joints is then built, and must close with drawn
-errors of all parameters. Derivation: docs/theory/over-constraint.md.
+none, and do not let the machine move in any other way. The freedoms that people build are tried: R
+to U, S or C, U to S, and a rotation at C or P. The machine with these joints is then built, and
+must close with drawn errors of all parameters. Derivation: docs/theory/over-constraint.md.
 """
 
 from __future__ import annotations
@@ -40,15 +40,18 @@ from loopcal.mechanism.over_constraint import (
 from loopcal.mechanism.states import Status, compute_limb_frames, driven_values
 from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 INDEPENDENT = 1e-6
 """Smallest singular value of the works, relative to the largest, of independent joints."""
 SHOWN = 3
-"""Sets of joints that are proposed."""
+"""Most sets of joints that are proposed."""
 TRIED = 12
-"""Sets of joints that are built."""
+"""Most sets of joints that are built and verified."""
 DEFAULT_ERROR = 1e-3
-"""Standard deviation of drawn errors without tolerance: of the robot's size, or in radians."""
+"""Standard deviation of an error without tolerance: of a length, relative to the robot's size; of
+an angle [rad]; of a ratio [1].
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +71,8 @@ class AddedJoint:
     @property
     def line(self) -> str:
         """The line of the robot file."""
-        one = self.record
-        return f"- {{joint: {one.joint}, name: {one.name}, axis: {one.axis}}}"
+        record = self.record
+        return f"- {{joint: {record.joint}, name: {record.name}, axis: {record.axis}}}"
 
 
 def propose_added_joints(robot: Mechanism) -> Finding | None:
@@ -151,7 +154,7 @@ def _last_axis(joint: JointRecord) -> FloatArray:
 
 
 def _list_additions(joint: JointRecord, name: str) -> Iterator[Revolute | Prismatic]:
-    """Yield the joints that make a record one that people build: R to U, S or C, U to S, P to C."""
+    """Yield joints to add behind one: R to U, S or C, U to S, and a rotation at C or P."""
     if isinstance(joint, Spherical) or getattr(joint, "actuated", None):
         return
     own = {joint.axis} if not isinstance(joint, Universal) else set(joint.axes)
@@ -166,23 +169,24 @@ def _list_additions(joint: JointRecord, name: str) -> Iterator[Revolute | Prisma
 def _choose_sets(candidates: list[AddedJoint]) -> list[list[AddedJoint]]:
     """Return sets of joints of independent works that leave no self-stress, few joints first."""
     ordered = sorted(candidates, key=lambda c: c.record.joint == "P")
-    found: dict[frozenset[int], list[AddedJoint]] = {}
+    sets: dict[frozenset[int], list[AddedJoint]] = {}
     for first in candidates:
         own = [c for c in candidates if (c.limb, c.joint) == (first.limb, first.joint)]
         chosen, works = [], np.zeros((len(first.works), 0))
-        for one in [first, *own, *ordered]:
-            more = np.concatenate([works, one.works], axis=1)
-            s = np.linalg.svd(more, compute_uv=False)
-            if more.shape[1] <= len(more) and s[-1] > INDEPENDENT * max(s[0], INDEPENDENT):
-                chosen, works = [*chosen, one], more
+        for candidate in [first, *own, *ordered]:
+            extended = np.concatenate([works, candidate.works], axis=1)
+            s = np.linalg.svd(extended, compute_uv=False)
+            is_possible = extended.shape[1] <= len(extended)
+            if is_possible and s[-1] > INDEPENDENT * max(s[0], INDEPENDENT):
+                chosen, works = [*chosen, candidate], extended
         if works.shape[1] == len(works):
-            found.setdefault(frozenset(map(id, chosen)), chosen)
+            sets.setdefault(frozenset(map(id, chosen)), chosen)
 
     def count(chosen: list[AddedJoint]) -> tuple[int, int, int]:
         slides = sum(c.record.joint == "P" for c in chosen)
         return len({(c.limb, c.joint) for c in chosen}), len(chosen), slides
 
-    return sorted(found.values(), key=count)
+    return sorted(sets.values(), key=count)
 
 
 def _is_verified(robot: Mechanism, record: Limbs, chosen: list[AddedJoint]) -> bool:
@@ -199,9 +203,9 @@ def _is_verified(robot: Mechanism, record: Limbs, chosen: list[AddedJoint]) -> b
     ]:
         return False
     table, rng = freer.parameters, np.random.default_rng(0)
-    unit = [DEFAULT_ERROR * (freer.size if p.dimension.value == "length" else 1.0)
-            for p in table.entries]  # fmt: skip
-    sd = np.where(np.isnan(table.tolerance), unit, table.tolerance)
+    is_length = np.array([p.dimension is Dimension.LENGTH for p in table.entries])
+    assumed = DEFAULT_ERROR * np.where(is_length, freer.size, 1.0)
+    sd = np.where(np.isnan(table.tolerance), assumed, table.tolerance)
     values = table.nominal + sd * rng.standard_normal((2, len(table)))
     joints = driven_values(robot.program, find_nearby_states(robot))
     slots = robot.slots

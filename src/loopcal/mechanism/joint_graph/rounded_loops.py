@@ -27,7 +27,7 @@ class Repair:
 
     Attributes
     ----------
-    graph : it. gap, angle : largest gap of a closure before [m, rad].
+    graph : with closed loops. gap, angle : largest gap of a closure before the repair [m, rad].
     turn : largest rotation of an axis [rad].
     """
 
@@ -93,7 +93,7 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
             far[:3, 3] = frame[:3, 3]
             return replace(joint, T_b=geometry.invert_pose(B) @ far)
         frame[:3, :3] = turn_between(axes[joint], aligned[joint]) @ frame[:3, :3]
-        one = replace(joint, T_a=geometry.invert_pose(A) @ frame, T_b=np.eye(4))
+        near = replace(joint, T_a=geometry.invert_pose(A) @ frame, T_b=np.eye(4))
         if joint in graph.tree:
             value = tree[joint.name]
         elif joint.kind == "R":
@@ -101,8 +101,8 @@ def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGr
         else:
             value = float((far[:3, 3] - frame[:3, 3]) @ aligned[joint])
         # the far frame is where the joint moves the near one
-        far = A @ one.move(np.array(value))
-        return replace(one, T_b=geometry.invert_pose(B) @ far)
+        far = A @ near.move(np.array(value))
+        return replace(near, T_b=geometry.invert_pose(B) @ far)
 
     turned = replace(
         graph,

@@ -57,8 +57,8 @@ class ClosedStage:
     Attributes
     ----------
     paths : its limbs, from a base frame of its own.
-    mount : (4, 4) that frame in the body that
-        carries the stage [m]; turned where the plane of the loops is not one of that body's axes.
+    mount : (4, 4) that frame in the body that carries the stage [m]; turned where the normal of
+        the plane of the loops is not an axis of that body.
     frame : (4, 4) of its platform in the body that carries what follows [m].
     """
 
@@ -222,8 +222,8 @@ def _repair_blocks(
     ]
     joints = {joint.name: joint for repair in repairs for joint in repair.graph.joints}
     tree, closing = (
-        tuple(joints.get(joint.name, joint) for joint in some)
-        for some in (graph.tree, graph.closing)
+        tuple(joints.get(joint.name, joint) for joint in before)
+        for before in (graph.tree, graph.closing)
     )
     return Repair(
         replace(graph, tree=tree, closing=closing),
@@ -239,7 +239,7 @@ def _choose_home(
     """Return the first home that is firm enough, with its motions."""
     motions = [find_freedoms(graph, home, platform) for home in homes]
     share = FIRM_DRAWN if is_drawn_pose(graph, homes[0]) else FIRM
-    limit = share * max(one.firmness for one in motions)
+    limit = share * max(freedoms.firmness for freedoms in motions)
     return next(pair for pair in zip(homes, motions, strict=True) if pair[1].firmness >= limit)
 
 
