@@ -453,9 +453,9 @@ def test_readings_far_from_the_start_follow_a_path_or_state_why_not() -> None:
     robot = load_cached_robot("pulley-3")
     q = np.random.default_rng(9).uniform([1, 2, 2], [5, 6, 6], (200, 3))
     solved = forward(robot, q)
-    assert set(np.unique(solved.status)) <= {int(s) for s in Status}
+    assert not (solved.status == Status.NOT_FINITE).any()
     good = solved.converged
-    assert good.sum() > 5
+    assert 30 < good.sum() < 100  # of 200; other readings are far out of reach
     assert (solved.state.closure_sign[0, good] == robot.home_state.closure_sign).all()
     for i in np.flatnonzero(good):
         T = solved.T[i]
@@ -467,6 +467,8 @@ def test_assembly_modes_of_sums_have_the_readings_of_home() -> None:
     robot = load_cached_robot("pulley-3")
     home = inverse(robot, np.zeros((1, 3))).q[0]
     modes = find_assembly_modes(robot, home).solution
+    assert len(modes.T) > 1
+    assert np.abs(modes.T - robot.home).max(axis=(1, 2)).min() < 1e-9
     for T in modes.T:
         y = np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
         np.testing.assert_allclose(compute_readings(robot, y, robot.values), home, atol=1e-9)
