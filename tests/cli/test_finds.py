@@ -118,7 +118,7 @@ FINDS = {
     "closure of a list": Find(
         "import r.urdf --closures c.yaml -o new.yaml",
         {"r.urdf": URDF, "c.yaml": "closed_loop: [[[aj], bj]]\ntype: ['6d']\nname_mot: [aj]\n"},
-        says="write 'closed_loop:' as a list of pairs",
+        says="must be the names of two frames",
     ),
 }
 

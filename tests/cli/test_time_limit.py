@@ -70,11 +70,11 @@ def test_long_calibration_ends_with_exit_code_4_and_leaves_nothing(tmp_path, cap
     assert main(["simulate", "hexapod-42", "--draw", "400", "-o", str(data)]) == 0
     names = sorted(tmp_path.iterdir())
     capsys.readouterr()
-    words = ["calibrate", "hexapod-42", str(data), "-o", str(run), "--time-limit", "0.3s"]
+    words = ["calibrate", "hexapod-42", str(data), "-o", str(run), "--time-limit", "0.1s"]
     assert main(words) == 4
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("loopcal: the time limit of 0.3 s was reached")
+    assert err.startswith("loopcal: the time limit of 0.1 s was reached")
     assert err.rstrip().endswith("; no result was written.")
     assert sorted(tmp_path.iterdir()) == names
 
