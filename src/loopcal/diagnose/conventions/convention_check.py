@@ -186,6 +186,8 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     ----------
     robot : as given, before any fit: its values, and its tolerances (stated or default).
     data : as read. The `source` of its observations, such as a file, appears in the messages.
+        Targets on the base are left out: they say nothing about the robot, and
+        `loopcal.diagnose.report_base_targets` compares them with each other.
 
     Raises
     ------
@@ -194,6 +196,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     """
     check_types(robot, data)
     check_actuators(data, robot)
+    data = replace(data, base_observations=())
     robot = fix_breaking_parameters(robot)  # no data contain other values of them
     free = select_free_parameters(robot)
     known = _select_known_readings(data, is_redundant(free))
