@@ -307,6 +307,18 @@ def test_simulate_skips_and_names_unreachable_poses(run, tmp_path) -> None:
     assert "reaches none of 1 poses" in err
 
 
+def test_check_names_one_actuator(run, tmp_path) -> None:
+    (tmp_path / "slide.yaml").write_text(
+        "format: 1\nfamily: stages\nname: slide\nunits: {length: mm, angle: deg}\n"
+        "controlled: [x]\nstages:\n"
+        "  - {name: a, joint: {kind: P, axis: x, stroke: [0, 100], errors: [offset]}}\n"
+        "tolerances: {lengths: {sd: 0.1}}\n"
+    )
+    code, out, _ = run("check slide.yaml")
+    assert code == 0
+    assert out.startswith("slide: 1 actuator, 1 parameter, 1 free")
+
+
 def test_check_shows_a_robot_without_unknowns(run, tmp_path) -> None:
     lines = list_shipped_robots()["five-bar"].read_text("utf-8").split("\n")
     kept = [line for line in lines if "errors" not in line and "{of:" not in line]

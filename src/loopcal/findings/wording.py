@@ -55,6 +55,11 @@ def round_to_digits(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
+def name_count(count: float, singular: str, plural: str = "") -> str:
+    """Return a number with its noun, whose plural has an s unless it is stated."""
+    return f"{count} {singular if count == 1 else plural or singular + 's'}"
+
+
 def count_decimals(uncertainty: float) -> int:
     """Return the decimals that show three significant digits of a number above 0, at most 12."""
     rounded = float(f"{uncertainty:.2e}")  # 9.996 shows as 10.0, which has one decimal less
@@ -184,7 +189,7 @@ def _word(value: Any, spec: str) -> str:
         return f"{text[0].upper()}{text[1:].rstrip('.')}."
     if spec.startswith("count "):
         singular, _, plural = spec.removeprefix("count ").partition("/")
-        return f"{value} {singular if value == 1 else plural or singular + 's'}"
+        return name_count(value, singular, plural)
     if isinstance(value, Quantity):
         return str(value)
     if spec == "" and isinstance(value, float):

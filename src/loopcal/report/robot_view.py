@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from loopcal.findings.wording import name_count
 from loopcal.mechanism import TRIANGLE_TERMS, Mechanism, compute_range
 from loopcal.report.numbers import format_in, format_number, format_with_uncertainty, units_of
 from loopcal.report.tables import Column, Table, build_table, word_column
@@ -27,8 +28,9 @@ def view_robot(inspection: RobotInspection) -> list[Block]:
     """Return the page of a robot."""
     robot = inspection.robot
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
+    actuators, parameters = name_count(len(robot.actuators), "actuator"), name_count(n, "parameter")
     return [
-        f"{robot.name}: {len(robot.actuators)} actuators, {n} parameters, {free} free",
+        f"{robot.name}: {actuators}, {parameters}, {free} free",
         f"file: {robot.record.path}",
         f"freedoms: {' '.join(robot.freedoms)}",
         f"commanded in: {' '.join(robot.controlled)}",

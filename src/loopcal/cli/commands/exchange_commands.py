@@ -267,10 +267,12 @@ def _view_import(
     correction: _Correction | None,
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
+    from loopcal.findings.wording import name_count
     from loopcal.report.calibration_view import view_fit, with_hint
 
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
-    counts = f"{len(robot.actuators)} actuators, {n} parameters, {free} free"
+    actuators, parameters = name_count(len(robot.actuators), "actuator"), name_count(n, "parameter")
+    counts = f"{actuators}, {parameters}, {free} free"
     page: list[Block] = [f"{document['robot']}: {counts}"]
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.findings.wording import name_count
 from loopcal.mechanism import Mechanism, Solution
 from loopcal.report.figures.style import (
     COLORS,
@@ -174,7 +175,7 @@ def _caption(robot: Mechanism, where: str, symbol: str) -> str:
         "rod": sum(limb.ending == "distance" for limb in limbs),
         "actuator": len(robot.actuators),
     }
-    words = ", ".join(f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if n)
+    words = ", ".join(name_count(n, what) for what, n in counts.items() if n)
     return f"{robot.name} {where}: {words}; lengths in {symbol}"
 
 
