@@ -12,6 +12,7 @@ from loopcal import engine, geometry
 from loopcal.diagnose import identifiability
 from loopcal.engine import numpy_engine
 from loopcal.errors import MechanismError
+from loopcal.io import load_robot
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
 from loopcal.mechanism import (
     Mechanism,
@@ -30,6 +31,7 @@ from loopcal.mechanism.over_constraint import (
     find_nearby_states,
     find_over_constraint,
     fix_breaking_parameters,
+    is_over_constrained,
 )
 from loopcal.mechanism.states import driven_values
 from tests.over_constrained import (
@@ -329,3 +331,29 @@ def test_stage_of_a_chain_names_its_parameters_and_closes_by_least_squares(tmp_p
     assert again.converged.all()
     error = compare_coordinates(again.T, asked, robot.controlled, robot.size)[0]
     assert_allclose(error, 0, atol=1e-10)  # [m]
+
+
+BALL_ON_A_PIN = """format: 1
+family: limbs
+name: swing
+units: {length: mm, angle: deg}
+controlled: [pitch]
+limbs:
+  - {name: pin, ending: rigid, chain: [{joint: R, axis: y}]}
+  - name: arm
+    ending: ball
+    chain:
+      - {joint: R, name: m, at: [100, 0, 0], axis: y, actuated: m}
+      - {joint: P, name: s, axis: z, start: 200}
+    attach: [100, 0, 200]
+"""
+
+
+def test_freedoms_without_shifts_are_refused_where_a_limb_ends_in_a_ball(tmp_path) -> None:
+    path = tmp_path / "swing.yaml"
+    path.write_text(BALL_ON_A_PIN.replace("controlled", "freedoms: [ry]\ncontrolled"))
+    with pytest.raises(MechanismError, match="'arm' ends in a ball, whose closure equations are"):
+        load_robot(path)
+    # `check` tried these freedoms by itself, which ended in an exception of the engine
+    path.write_text(BALL_ON_A_PIN)
+    assert is_over_constrained(load_robot(path))

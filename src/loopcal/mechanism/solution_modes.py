@@ -180,7 +180,7 @@ def judge_modes(
             sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
         state = replace(state, closure_sign=sign[None])
     is_other = closed & (sign != begin.closure_sign[0])
-    if has_bends(robot):
+    if has_bends(robot) and closed.any():
         is_other |= closed & (compute_bend(robot, state) != compute_bend(robot, begin))
     rows = np.flatnonzero(closed & ~is_other & ~is_sure)
     if not len(rows):
