@@ -117,6 +117,10 @@ MISTAKES = {
         ("unknown: [frame]", "unknown: [frame]\n# frame: tracker"),
         "base.csv:6: The frame 'tracker' of targets on the base",
     ),
+    "a frame that is not unknown": (
+        ("# unknown: [frame]\n", ""),
+        "base.csv:2: The frame of the instrument is not unknown for N1, N2 and N3",
+    ),
 }
 
 

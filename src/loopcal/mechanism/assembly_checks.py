@@ -106,6 +106,13 @@ def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
         raise MechanismError(
             f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}; name each once"
         )
+    balls = [limb.name for limb in assembly.limbs if limb.ending == "ball"]
+    if balls and not set(freedoms) & set(AXES[3:]):
+        raise MechanismError(
+            f"limb {balls[0]!r} ends in a ball, whose closure equations are shifts, but the "
+            f"freedoms of the platform are {', '.join(freedoms)}; state the shifts of its origin, "
+            "too, or leave out `freedoms:`"
+        )
     rotations = [f for f in freedoms if f.startswith("r")]
     if len(rotations) == 2:
         raise MechanismError(

@@ -86,7 +86,6 @@ def _compile(
     slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.driven_joints)
-    _refuse_limbs_without_equations(assembly)
     groups, places, count = _group_limbs(assembly, slots, {})
     guess = _make_first_guess(assembly, groups)
     idle = find_idle_joints(Program(groups, freedoms, size, count, a), guess)
@@ -182,17 +181,6 @@ def _find_slot(limb: Limb, address: Address) -> Slot | None:
     if address.element not in links or address.axis not in AXES:
         return None
     return Slot(links.index(address.element), AXES.index(address.axis))
-
-
-def _refuse_limbs_without_equations(assembly: Assembly) -> None:
-    """Refuse a limb that ends in a ball on a platform without shifts, which are its equations."""
-    for limb in assembly.limbs:
-        if not _select_rows(limb.ending, assembly.freedoms):
-            raise MechanismError(
-                f"limb {limb.name!r} ends in a ball, whose closure equations are shifts, but the "
-                f"freedoms of the platform are {', '.join(assembly.freedoms)}; state the shifts of "
-                "its origin, too, or leave out `freedoms:`"
-            )
 
 
 def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> None:

@@ -21,6 +21,7 @@ from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.assembly import AXES, Assembly
+from loopcal.mechanism.assembly_checks import check_assembly
 from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials
 from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.mobility import RANK, count_rank
@@ -248,8 +249,10 @@ def _find_sufficient_freedoms(
     names = tuple(AXES[f] for f, moves in zip(freedoms, used, strict=True) if moves)
     if len(names) == len(freedoms):
         return ()
+    narrow = replace(robot.assembly, freedoms=names, closure="exact")
     try:
-        flat = compile_assembly(replace(robot.assembly, freedoms=names, closure="exact"))
+        check_assembly(narrow)
+        flat = compile_assembly(narrow)
     except MechanismError:
         return ()
     return () if is_over_constrained(flat) else names

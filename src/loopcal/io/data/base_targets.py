@@ -55,8 +55,8 @@ def check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRow
     Raises
     ------
     FileError
-        `data.target-on-two-bodies`, `data.single-base-target` or `data.base-frame-unused`, at the
-        settings of the kind.
+        `data.target-on-two-bodies`, `data.base-frame-known`, `data.base-frame-unused` or
+        `data.single-base-target`, at the settings of the kind.
     """
     from loopcal.measure.base_rows import list_moving_targets
 
@@ -71,11 +71,15 @@ def check_base_targets(tables: Sequence[Table], kinds: Sequence[Sequence[KindRow
                 finding = report_finding("data.target-on-two-bodies", targets=shared)
                 raise table.settings.error(finding, place)
             name = _find_frame(entry.kind)
-            if moving and name and name not in frames:
+            if not name:
+                targets = tuple(entry.kind.target_columns)
+                finding = report_finding("data.base-frame-known", targets=targets)
+                raise table.settings.error(finding, (*entry.location, "of"))
+            if moving and name not in frames:
                 finding = report_finding("data.base-frame-unused", frame=name, frames=frames)
                 key = "frame" if name != "frame" else "unknown"
                 raise table.settings.error(finding, (*entry.location, key))
-            if len(known) < FEWEST and "frame" in entry.kind.unknown:
+            if len(known) < FEWEST:
                 finding = report_finding("data.single-base-target", targets=tuple(known))
                 raise table.settings.error(finding, place)
 
