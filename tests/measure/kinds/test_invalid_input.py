@@ -51,7 +51,7 @@ EXAMPLES = [
         ),
         (
             lambda: Position(targets=("a", "b"), places=POINT),
-            r"the places of the targets has shape \(1, 3\); .*\(2, 3\)",
+            r"number of places is 1, but there are 2 targets \(a, b\); state one place",
         ),
         (
             lambda: Position(unknown=("tracker",)),

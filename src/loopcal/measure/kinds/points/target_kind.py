@@ -82,6 +82,11 @@ class TargetKind(Kind):
             one = np.ndim(self.places[0]) == 0 if len(self.places) else False
             places = [self.places] if one else self.places
             shape = (len(targets), 3)
+            if len(places) != len(targets):
+                raise DataError(
+                    f"the number of places is {len(places)}, but there are {len(targets)} targets "
+                    f"({', '.join(targets)}); state one place [x, y, z] for each target"
+                )
             set_fields(self, places=check_array(places, "the places of the targets", shape))
         elif self.is_of_base and "targets" not in self.unknown:
             raise DataError(
