@@ -249,6 +249,18 @@ def test_a_wrong_stated_place_and_interchanged_names_are_found():
     assert sum(map(len, right)) == 0
 
 
+@pytest.mark.parametrize(("order", "unit"), [([1, 0, 2], 1.0), ([0, 1, 2], 25.4)])
+def test_targets_on_the_base_in_another_order_or_unit_are_refused(order, unit):
+    """They ended in a robot that does not reach its poses, or in a fit without an end."""
+    data, _ = measure(4)
+    (rows,) = data.base_observations
+    measured = (rows.measured.reshape(-1, 3, 3)[:, order] / unit).reshape(rows.measured.shape)
+    wrong = replace(data, base_observations=(replace(rows, measured=measured),))
+    with pytest.raises(DataError, match="stated places") as caught:
+        lc.calibrate(ROBOT, wrong)
+    assert caught.value.code == "residuals.base-targets-moved"
+
+
 def test_rows_of_the_base_stay_when_poses_are_taken_held_out_weighted_or_excluded():
     data, _ = measure(2)
     fitted, held_out = data.split(hold_out=0.3, seed=1)

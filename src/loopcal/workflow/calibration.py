@@ -65,6 +65,12 @@ uncertainty, validation, examination, uncertainty budget, suggestions.
 """
 
 
+GROSS = 1000.0
+"""Standard deviations (rms) by which targets on the base contradict each other or their stated
+places, above which their unit, order or places are wrong: one that was hit moves by less.
+"""
+
+
 def calibrate(
     robot: Mechanism,
     data: Measurements,
@@ -109,6 +115,8 @@ def calibrate(
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
     if options.has_limit and split.held_out is None:
         raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
+    if options.check_conventions:
+        _refuse_wrong_base_targets(data)
     count = StepCounter(progress, STEPS)
     count.begin("checking conventions")
     conventions = check_conventions(
@@ -128,6 +136,17 @@ def calibrate(
     count.begin("testing the residuals for patterns and slow errors")
     result = replace(result, fit=adjust_uncertainty(result.fit, split.fitted))
     return _report(result, split, conventions, options, count)
+
+
+def _refuse_wrong_base_targets(data: Measurements) -> None:
+    """Refuse targets on the base in another unit or order, which no frame of an instrument fits.
+
+    No pose can be reached from such a frame, and a fit would blame the robot.
+    """
+    for finding in report_base_targets(data):
+        has_moved = finding.code == "residuals.base-targets-moved"
+        if has_moved and finding.data["chi_square"] > GROSS**2 * finding.data["degrees"]:
+            raise DataError(finding)
 
 
 def _refuse_far_rows(conventions: ConventionCheck, options: CalibrationOptions) -> None:
