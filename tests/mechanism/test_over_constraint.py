@@ -357,3 +357,39 @@ def test_freedoms_without_shifts_are_refused_where_a_limb_ends_in_a_ball(tmp_pat
     # `check` tried these freedoms by itself, which ended in an exception of the engine
     path.write_text(BALL_ON_A_PIN)
     assert is_over_constrained(load_robot(path))
+
+
+PARALLELOGRAM = """format: 1
+family: limbs
+name: parallelogram
+units: {length: mm, angle: deg}
+controlled: [x]
+home: {x: 100, y: 150}
+limbs:
+  - name: crank
+    ending: rigid
+    chain:
+      - {joint: R, name: motor, axis: z, actuated: m, start: 90}
+      - {joint: R, name: pin, at: [100, 0, 0], axis: z, start: -90}
+    tip: [100, 50, 0]
+  - name: rocker
+    ending: rigid
+    chain:
+      - {joint: R, name: low, at: [200, 0, 0], axis: z, start: 90}
+      - {joint: R, name: high, at: [100, 0, 0], axis: z, start: -90}
+    tip: [-100, 50, 0]
+    errors: [{of: high, shift: [x], tolerance: {sd: 0.1}}]
+"""
+
+
+def test_proposed_freedoms_keep_the_rotation_that_errors_cause(tmp_path) -> None:
+    """The platform of a parallelogram rotates only if its sides are not equal."""
+    robot = load_text(tmp_path, PARALLELOGRAM)
+    finding = find_over_constraint(robot)
+    assert finding is not None
+    assert finding.data["freedoms"] == ("rz", "x", "y")
+    flat = build(replace(robot.assembly, freedoms=finding.data["freedoms"]))
+    long = forward(flat.with_values(flat.values + 1e-4), [[1.3]])
+    assert long.converged.all()
+    # the rocker is 0.1 mm longer at a distance of 200 mm from the crank
+    assert abs(np.arctan2(long.T[0, 1, 0], long.T[0, 0, 0])) == pytest.approx(5e-4, rel=0.1)

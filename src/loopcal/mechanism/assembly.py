@@ -293,3 +293,11 @@ def refuse_more(most: int, count: int, subject: str, noun: str) -> None:
     """Raise MechanismError where `count` is above `most`: `subject count noun`."""
     if count > most:
         raise MechanismError(f"{subject} {count} {noun}, but at most {most} are allowed; use fewer")
+
+
+def select_rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the rows of an ending in the platform's freedoms, such as those of a plane."""
+    if ending == "distance":
+        return (0,)
+    axes = AXES if ending == "rigid" else AXES[3:]
+    return tuple(i for i, axis in enumerate(axes) if axis in freedoms)

@@ -15,6 +15,7 @@ from loopcal.mechanism.assembly import (
     Limb,
     is_serial,
     refuse_more,
+    select_rows,
 )
 from loopcal.mechanism.platform_coordinates import COORDINATES, check_coordinates
 from loopcal.units import SI_SYMBOLS
@@ -106,8 +107,8 @@ def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
         raise MechanismError(
             f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}; name each once"
         )
-    balls = [limb.name for limb in assembly.limbs if limb.ending == "ball"]
-    if balls and not set(freedoms) & set(AXES[3:]):
+    balls = [limb.name for limb in assembly.limbs if not select_rows(limb.ending, freedoms)]
+    if balls:
         raise MechanismError(
             f"limb {balls[0]!r} ends in a ball, whose closure equations are shifts, but the "
             f"freedoms of the platform are {', '.join(freedoms)}; state the shifts of its origin, "

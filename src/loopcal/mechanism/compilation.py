@@ -13,7 +13,7 @@ from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb
+from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb, select_rows
 from loopcal.mechanism.assembly_checks import check_assembly
 from loopcal.mechanism.batch_kinematics import (
     compute_closure_sign,
@@ -81,6 +81,15 @@ def _compile(
     assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
 ) -> Mechanism:
     """Compile a checked mechanism of one stage; see `build`."""
+    robot = _close_at_home(assembly, units, record)
+    is_placed = robot.is_serial and not robot.controlled
+    return robot if is_placed else report_over_constraint(robot, _close_at_home)
+
+
+def _close_at_home(
+    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
+) -> Mechanism:
+    """Return a mechanism of one stage with its loops closed at home, and its mobility checked."""
     table = ParameterTable(assembly.parameters, assembly.common_errors)
     check_nominal_values(table)
     slots = _find_slots(assembly)
@@ -111,7 +120,7 @@ def _compile(
         return replace(robot, home_state=_place_at_start(robot))
     robot = replace(robot, home_state=_find_home(robot))
     check_mobility(robot)
-    return report_over_constraint(robot, _compile)
+    return robot
 
 
 def compute_characteristic_length(assembly: Assembly) -> float:
@@ -187,7 +196,7 @@ def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> No
     """Refuse a limb whose drive moves nothing but the limb itself."""
     for i, limb in enumerate(assembly.limbs):
         joints = len(limb.joints) + bool(limb.actuator) - len(idle.get(i, ()))
-        equations = len(_select_rows(limb.ending, assembly.freedoms))
+        equations = len(select_rows(limb.ending, assembly.freedoms))
         if limb.drives and joints > equations:
             excess = joints - equations
             raise MechanismError(
@@ -230,7 +239,7 @@ def _group_limbs(
                 _number_actuators(assembly, limbs),
                 tuple(j in fixed for j in range(len(kinds))),
                 ending,
-                _select_rows(ending, assembly.freedoms),
+                select_rows(ending, assembly.freedoms),
                 np.array(transforms),
                 pitch.reshape(len(limbs), len(kinds)),
                 np.array([m.length for m in limbs]),
@@ -249,14 +258,6 @@ def _number_actuators(assembly: Assembly, limbs: list[Limb]) -> IntArray:
         for m in limbs
     ]
     return np.array(drives, dtype=np.int64).T.reshape(len(limbs[0].joints) + 1, len(limbs))
-
-
-def _select_rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the rows of an ending in the platform's freedoms, such as those of a plane."""
-    if ending == "distance":
-        return (0,)
-    axes = AXES if ending == "rigid" else AXES[3:]
-    return tuple(i for i, axis in enumerate(axes) if axis in freedoms)
 
 
 def _weigh_actuators(

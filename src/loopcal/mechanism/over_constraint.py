@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -130,17 +131,16 @@ def _stack_displacements(
 
 
 def report_over_constraint(
-    robot: Mechanism, compile_assembly: Callable[[Assembly], Mechanism]
+    robot: Mechanism, close_at_home: Callable[[Assembly], Mechanism]
 ) -> Mechanism:
     """Return the robot with a finding of its closure equations that repeat others, if any do, and
     with loops that may stay open where its file asks for the least-squares closure.
 
-    compile_assembly : returns the robot of an assembly, to try fewer freedoms.
+    close_at_home : returns the robot of an assembly, to try fewer freedoms.
     """
     asks = robot.assembly.closure == "least-squares"
     rows = _linearize(robot, robot.home_state)[0]
-    numbers = np.arange(len(robot.assembly.limbs))
-    count = len(rows.find_repeated(numbers))
+    count = _count_repeated(robot, rows)
     if not count:
         without = (report_finding("mechanism.closure-without-effect"),) if asks else ()
         return replace(robot, findings=(*robot.findings, *without))
@@ -150,10 +150,15 @@ def report_over_constraint(
         tolerance=RANK,
         closes=asks,
         repeated=_list_repeated(robot, rows),
-        freedoms=_find_sufficient_freedoms(robot, compile_assembly),
+        freedoms=_find_sufficient_freedoms(robot, close_at_home),
     )
     program = replace(robot.program, may_stay_open=asks)
     return replace(robot, program=program, findings=(*robot.findings, finding))
+
+
+def _count_repeated(robot: Mechanism, rows: _Rows) -> int:
+    """Return how many closure equations repeat others."""
+    return len(rows.find_repeated(np.arange(len(robot.assembly.limbs))))
 
 
 def _list_repeated(robot: Mechanism, rows: _Rows) -> tuple[dict[str, Any], ...]:
@@ -234,10 +239,12 @@ def _choose_axes(vectors: FloatArray) -> FloatArray:
 
 
 def _find_sufficient_freedoms(
-    robot: Mechanism, compile_assembly: Callable[[Assembly], Mechanism]
+    robot: Mechanism, close_at_home: Callable[[Assembly], Mechanism]
 ) -> tuple[str, ...]:
-    """Return freedoms in which the platform moves, home and near it, and with which no equation
-    repeats another; none where there are no such freedoms.
+    """Return the most freedoms with which no equation repeats another; none where there are none.
+
+    Those in which the platform moves, home and near it, are among them. A freedom that is left out
+    hides the errors that move the platform in it, so that as few as possible are.
     """
     freedoms = robot.program.freedoms
     used = np.zeros(len(freedoms), bool)
@@ -246,16 +253,26 @@ def _find_sufficient_freedoms(
         motions = W[count_rank(s) :, : len(freedoms)]
         largest = np.abs(motions).max(axis=0, initial=0.0)
         used |= largest > SAME * largest.max(initial=1e-300)
-    names = tuple(AXES[f] for f, moves in zip(freedoms, used, strict=True) if moves)
-    if len(names) == len(freedoms):
-        return ()
-    narrow = replace(robot.assembly, freedoms=names, closure="exact")
+    still = np.flatnonzero(~used)
+    for left_out in range(1, len(still) + 1):
+        for dropped in combinations(still.tolist(), left_out):
+            names = tuple(AXES[f] for i, f in enumerate(freedoms) if i not in dropped)
+            if _is_exact_with(robot, names, close_at_home):
+                return names
+    return ()
+
+
+def _is_exact_with(
+    robot: Mechanism, freedoms: tuple[str, ...], close_at_home: Callable[[Assembly], Mechanism]
+) -> bool:
+    """Return whether the robot can have these freedoms, and then no equation repeats another."""
+    narrow = replace(robot.assembly, freedoms=freedoms, closure="exact")
     try:
         check_assembly(narrow)
-        flat = compile_assembly(narrow)
+        flat = close_at_home(narrow)
     except MechanismError:
-        return ()
-    return () if is_over_constrained(flat) else names
+        return False
+    return not _count_repeated(flat, _linearize(flat, flat.home_state)[0])
 
 
 def find_self_stress(robot: Mechanism) -> FloatArray:
