@@ -20,10 +20,9 @@ from loopcal.estimate import (
     identify,
     identify_trials,
 )
-from loopcal.estimate.poses import exact
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import sample_truth, simulate, simulate_trials
-from loopcal.mechanism import forward, forward_trials
+from loopcal.mechanism import forward
 from tests import zoo
 from tests.estimate.problems import (
     bed_points,
@@ -134,34 +133,12 @@ def test_order_of_poses_changes_rounding_only(data, fit):
     np.testing.assert_allclose(shuffled.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
 
 
-@pytest.mark.parametrize("kept", [0, 10_000])
-def test_block_size_of_poses_changes_rounding_only(data, fit, monkeypatch, kept):
+def test_block_size_of_poses_changes_rounding_only(data, fit, monkeypatch):
     monkeypatch.setattr(problem_module, "BLOCK", 7)
-    monkeypatch.setattr(exact, "KEPT_POSES", kept)
     blocked = identify(hexapod(), data, LeastSquares())
     np.testing.assert_allclose(blocked.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
     np.testing.assert_allclose(blocked.residuals[0].raw, fit.residuals[0].raw, rtol=0, atol=1e-12)
     assert blocked.residuals[0].poses == fit.residuals[0].poses
-
-
-def test_poses_of_several_blocks_begin_where_the_last_step_ended(data, fit, monkeypatch):
-    begins = []
-
-    def solve(robot, values, q, start, follow):
-        begins.append((start.T, follow))
-        return forward_trials(robot, values, q, start, follow)
-
-    monkeypatch.setattr(problem_module, "BLOCK", 12)
-    monkeypatch.setattr(exact, "forward_trials", solve)
-    assert identify(hexapod(), data, LeastSquares()).history.iterations == fit.history.iterations
-    blocks = -(-data.n_poses // 12)
-    home, near = begins[:blocks], begins[blocks:]
-    assert all(follow and np.ptp(T, axis=1).max() == 0.0 for T, follow in home)
-    reached = forward(fit.robot, data.readings).T
-    for i, (T, follow) in enumerate(near):
-        poses = slice(12 * (i % blocks), 12 * (i % blocks) + T.shape[1])
-        assert not follow
-        np.testing.assert_allclose(T[0], reached[poses], rtol=0, atol=1e-2)  # [m], errors of values
 
 
 @pytest.mark.parametrize(

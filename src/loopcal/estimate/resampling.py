@@ -19,7 +19,6 @@ from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.penalties import decompose_for
 from loopcal.estimate.minimization.descent import LeastSquaresProblem, descend
-from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.numerics.gauss_newton import DescentStatus
@@ -156,7 +155,7 @@ def fit_resamples(
     if fit.options.prior is not None:
         problem = fit.options.prior.added(problem, resamples.prior)
     centered = CenteredProblem(problem, resamples.center, resamples.equations)
-    start = repeat_trial(linear.problem, linear.linearization.next_start, t)
+    start = repeat_trial(linear.linearization.next_start, t)
     estimate = np.repeat(linear.linearization.deviation, t, axis=0)
     z = estimate - resamples.center
     rows = replace(problem.linearize(estimate, start), deviation=z, equations=resamples.equations)
@@ -194,13 +193,8 @@ def draw_centers(linear: FitLinearization, count: int, rng: np.random.Generator)
     return d.deviation(rng.standard_normal((count, len(penalty))) * sd)
 
 
-def repeat_trial(problem: Problem, start: Start, count: int) -> Start:
-    """Return a start of one trial as that of `count` trials.
-
-    Exact poses of several blocks begin at home: all their states would fill the memory.
-    """
-    if isinstance(problem.poses, ExactPoses) and not problem.poses.is_single_block:
-        start = replace(start, poses=None)
+def repeat_trial(start: Start, count: int) -> Start:
+    """Return a start of one trial as that of `count` trials."""
     return map_arrays(lambda array: np.repeat(array[:1], count, axis=0), start)
 
 

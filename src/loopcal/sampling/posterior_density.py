@@ -77,7 +77,7 @@ class PosteriorDensity:
         z, x = self.parameters(coordinates), self.setup(coordinates)
         count = len(z)
         problem = resample_rows(self.linear.problem, None, None, self._prior_mean(count))
-        start = repeat_trial(problem, self.linear.linearization.next_start, count)
+        start = repeat_trial(self.linear.linearization.next_start, count)
         has_setup = x.shape[1] > 0
         if has_setup:
             start = start.with_nuisance(x)

@@ -31,18 +31,12 @@ from loopcal.estimate.poses.linearization import (
     locate_poses,
 )
 from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_states
-from loopcal.mechanism import Status, drive_joints, fold_pose_rows, forward_trials
+from loopcal.mechanism import drive_joints, fold_pose_rows, forward_trials
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-KEPT_POSES = 2**17
-"""Poses whose states are kept between linearizations where they form several blocks: 33 MB of a
-hexapod. More poses begin at home each time. The number of trials, which are fitted part by part,
-makes no difference, so that it changes no bit.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +90,7 @@ class ExactPoses:
 
     def first_states(self, trials: int) -> PoseStates | None:
         """Return the home pose for all trials and poses; None where poses are not kept."""
-        is_kept = self.is_single_block or self.count <= KEPT_POSES
-        if not is_kept or self.located is not None:
+        if not self.is_single_block:
             return None
         state = spread_states(self.free.robot.home_state, trials, self.count)
         return PoseStates(state, np.zeros((trials, self.count, 0)))
@@ -105,11 +98,9 @@ class ExactPoses:
     def next_start(self, solution: PoseSolution, start: Start) -> tuple[PoseStates | None, bool]:
         """Return the states for the next start, and whether they were solved."""
         linearized, states, old = solution.linearized, solution.states, start.poses
-        if states is None or old is None:
+        if linearized is None or states is None or old is None:
             return start.poses, start.is_near
-        a, ok = len(start), np.asarray(states.state.status == Status.CONVERGED.value)
-        if linearized is not None:
-            ok = linearized.is_reached
+        a, ok = len(start), linearized.is_reached
 
         def kept(new: np.ndarray, before: np.ndarray) -> np.ndarray:
             if ok.all():
@@ -146,27 +137,16 @@ class ExactPoses:
             else:
                 begin = start.states
                 single = PoseSolution(None, self._locate(self.blocks[0], z, begin))
-        if single is None:
-            single = PoseSolution(None, None, self._solve_states(z, start))
-        if self.nuisance is None or fixed is not None:
-            return replace(single, nuisance=fixed)
-        located = [poses for _, poses in self.iterate_poses(single, z)]
-        predicted = start.predict_nuisance(z)
-        return replace(
-            single, nuisance=self._solve_for_nuisance(located, predicted, trials, control)
-        )
-
-    def _solve_states(self, z: FloatArray, start: Start) -> PoseStates | None:
-        """Solve the poses of several blocks from those of the start; None where it has none."""
-        if start.poses is None:
-            return None
-        values, parts = self.free.values(z), []
-        for block in self.blocks:
-            begin, follow = self._take_states(block, start.poses), not start.is_near
-            state = forward_trials(self.free.robot, values, block.readings, begin, follow)
-            parts.append(PoseStates(state, np.zeros((*state.T.shape[:2], 0))))
-        _, first = np.unique(np.concatenate([b.poses for b in self.blocks]), return_index=True)
-        return PoseStates.join_poses(parts, first)
+        linearized = None if single is None else single.linearized
+        nuisance = fixed
+        if self.nuisance is not None and fixed is None:
+            located = (
+                [linearized]
+                if linearized is not None
+                else [self._locate(b, z) for b in self.blocks]
+            )
+            nuisance = self._solve_for_nuisance(located, start.predict_nuisance(z), trials, control)
+        return PoseSolution(nuisance, linearized, None if single is None else single.states)
 
     def solve_single_block(
         self, z: FloatArray, trials: IntArray, start: Start, derivatives: bool = True
@@ -192,8 +172,10 @@ class ExactPoses:
         """
         robot, is_lost = self.free.robot, np.zeros(len(z), dtype=bool)
         for block in self.blocks:
-            state, poses = self._find_states(block, z, solution), solution.linearized
-            if poses is None:
+            if solution.states is not None and solution.linearized is not None:
+                state, poses = solution.states.state, solution.linearized
+            else:
+                state = forward_trials(robot, self.free.values(z), block.readings)
                 poses = locate_poses(self.free, block.readings, state, self.names)
             observed = [list_twist_rows(r, poses, trials) for r in block.rows if len(r.poses)]
             values = self.free.values(z[: len(state.T)])  # one trial may stand for all
@@ -225,22 +207,14 @@ class ExactPoses:
     ) -> Iterator[tuple[PoseBlock, LinearizedPoses]]:
         """Give every block with its solved poses."""
         for block in self.blocks:
-            poses = solution.linearized
-            if poses is None:
-                state = self._find_states(block, z, solution)
-                poses = locate_poses(self.free, block.readings, state, self.names)
-            yield block, poses
+            yield block, solution.linearized or self._locate(block, z)
 
     def iterate_linearized(
         self, solution: PoseSolution, z: FloatArray, trials: IntArray
     ) -> Iterator[tuple[PoseBlock, LinearizedPoses]]:
         """Give every block with its poses, linearized."""
         for block in self.blocks:
-            poses = solution.linearized
-            if poses is None and solution.states is not None:
-                state, values = self._find_states(block, z, solution), self.free.values(z)
-                poses = linearize_poses(self.free, values, block.readings, state, self.names)
-            yield block, poses or self._linearize(block, z, trials)[0]
+            yield block, solution.linearized or self._linearize(block, z, trials, None)[0]
 
     def find_unreached(self, z: FloatArray, start: Start) -> IntArray:
         """Return the poses that a row needs and that cannot be reached at deviation z (1, p)."""
@@ -261,8 +235,7 @@ class ExactPoses:
         if solution is not None and solution.linearized is not None:
             located = [solution.linearized]
         else:
-            begin = [self._take_states(block, start.poses) for block in self.blocks]
-            located = [self._locate(b, z, s) for b, s in zip(self.blocks, begin, strict=True)]
+            located = [self._locate(block, z, start.states) for block in self.blocks]
         pairs = zip(self.blocks, located, strict=True)
         if any(poses.is_lost(block.is_needed)[0] for block, poses in pairs):
             return None
@@ -313,17 +286,6 @@ class ExactPoses:
         state = forward_trials(self.free.robot, values, block.readings, begin, follow)
         poses = linearize_poses(self.free, values, block.readings, state, self.names)
         return poses, state
-
-    def _take_states(self, block: PoseBlock, states: PoseStates | None) -> engine.State | None:
-        """Return the states of the poses of a block."""
-        if states is None or len(self.blocks) == 1:
-            return states and states.state
-        return states.take_poses(block.poses).state
-
-    def _find_states(self, block: PoseBlock, z: FloatArray, solution: PoseSolution) -> engine.State:
-        """Return the solved states of a block; where none are kept, solve for them from home."""
-        state = self._take_states(block, solution.states)
-        return state or forward_trials(self.free.robot, self.free.values(z), block.readings)
 
     def _locate(
         self, block: PoseBlock, z: FloatArray, begin: engine.State | None = None

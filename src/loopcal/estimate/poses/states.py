@@ -23,11 +23,8 @@ class PoseStates(TrialBatch):
     q: FloatArray
 
     def take_poses(self, poses: IntArray) -> PoseStates:
-        """Return some poses, without copying where they follow each other."""
-        first, n = int(poses[:1].sum()), len(poses)
-        follow = np.array_equal(poses, np.arange(first, first + n))
-        chosen = slice(first, first + n) if follow else poses
-        return map_arrays(lambda array: array[:, chosen], self)
+        """Return some poses."""
+        return map_arrays(lambda array: array[:, poses], self)
 
     def put_poses(self, trials: IntArray, poses: IntArray, other: PoseStates) -> PoseStates:
         """Return a copy in which k poses of given trials and numbers (k,) are other ones (k,)."""
@@ -77,10 +74,9 @@ class PoseSolution:
     Attributes
     ----------
     nuisance : (a, U) values that fit best, or as given; None without any.
-    linearized : the poses of the only block; None where there are several, which are linearized
+    linearized : the poses of the only block; None where there are several, which are solved again
         block by block.
-    states : (a, n) for the next start; None where they are too many to be kept, and are solved
-        again block by block.
+    states : (a, n) of the only block, for the next start; None as above.
     estimates : of uncertain poses; None where readings are exact.
     driven : joints of the only block; None where the next step has no use for them.
     """
