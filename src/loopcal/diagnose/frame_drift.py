@@ -126,17 +126,7 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
     ]
     drifts = estimate_frame_drifts(_leave_out(data, changed))
     shown = find_unit(angle)
-    findings = [
-        report_finding(
-            "residuals.base-targets-moved",
-            targets=shape.targets,
-            suspects=shape.suspects,
-            is_stated=shape.is_stated,
-            chi_square=shape.chi_square,
-            degrees=shape.degrees,
-        )
-        for shape in changed
-    ]
+    findings = [report_moved_targets(shape) for shape in changed]
     findings += [
         report_finding(
             "residuals.frame-moved",
@@ -158,6 +148,18 @@ def report_base_targets(data: Measurements, angle: str = "arcsec") -> tuple[Find
         names = tuple(f"session {name!r}" if name else "rows without a session" for name in unused)
         findings.append(report_finding("data.base-session-unused", sessions=names))
     return tuple(findings)
+
+
+def report_moved_targets(shape: ShapeTest) -> Finding:
+    """Return the finding of targets that did not keep their distances."""
+    return report_finding(
+        "residuals.base-targets-moved",
+        targets=shape.targets,
+        suspects=shape.suspects,
+        is_stated=shape.is_stated,
+        chi_square=shape.chi_square,
+        degrees=shape.degrees,
+    )
 
 
 def _list_unused_sessions(data: Measurements) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings.wording import name_count
 from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb, select_rows
 from loopcal.mechanism.assembly_checks import check_assembly
 from loopcal.mechanism.batch_kinematics import (
@@ -198,11 +199,11 @@ def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> No
         joints = len(limb.joints) + bool(limb.actuator) - len(idle.get(i, ()))
         equations = len(select_rows(limb.ending, assembly.freedoms))
         if limb.drives and joints > equations:
-            excess = joints - equations
+            excess = name_count(joints - equations, "joint")
             raise MechanismError(
                 f"limb {limb.name!r} has {joints} joints, but {equations} closure equations: its "
-                f"drive moves the limb and not the platform; leave out {excess} "
-                f"joint{'s' if excess > 1 else ''}, or let their axes spin the limb only"
+                f"drive moves the limb and not the platform; leave out {excess}, "
+                "or let their axes spin the limb only"
             )
 
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from loopcal.findings.wording import name_count
 from loopcal.report.text_page import Block
 from loopcal.studies.results.summary_view import explain_failures
 from loopcal.studies.simulation.fits import OUTCOMES
@@ -113,7 +114,7 @@ def view_estimate(
     study: Study, estimate: TimeEstimate, format_duration: Callable[[float], str]
 ) -> list[Block]:
     """Return the page of an estimate."""
-    cells = f"{estimate.cells} cell{'s' if estimate.cells > 1 else ''}"
+    cells = name_count(estimate.cells, "cell")
     lines: list[Block] = [f"{study.title}: {cells}, {estimate.trials} trials"]
     for name in list_factors(study):
         levels = dict.fromkeys(cell.levels[name] for cell in study.cells)

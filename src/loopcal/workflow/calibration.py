@@ -18,6 +18,7 @@ from loopcal.diagnose import (
     report_base_targets,
 )
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
+from loopcal.diagnose.frame_drift import compare_shapes, report_moved_targets
 from loopcal.errors import DataError
 from loopcal.estimate import Identification, identify
 from loopcal.estimate.fit_input import check_types, exclude_poses
@@ -143,10 +144,9 @@ def _refuse_wrong_base_targets(data: Measurements) -> None:
 
     No pose can be reached from such a frame, and a fit would blame the robot.
     """
-    for finding in report_base_targets(data):
-        has_moved = finding.code == "residuals.base-targets-moved"
-        if has_moved and finding.data["chi_square"] > GROSS**2 * finding.data["degrees"]:
-            raise DataError(finding)
+    for shape in compare_shapes(data):
+        if shape.chi_square > GROSS**2 * shape.degrees:
+            raise DataError(report_moved_targets(shape))
 
 
 def _refuse_far_rows(conventions: ConventionCheck, options: CalibrationOptions) -> None:
