@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import Mechanism
 
 Array = NDArray[np.float64]
@@ -133,13 +130,6 @@ limbs:
 home: {z: 200}
 """
 """A table on two parallel rails, moved by a cylinder."""
-
-
-def load_text(folder: Path, text: str) -> Mechanism:
-    """Return the robot of the text of a file."""
-    path = folder / "robot.yaml"
-    path.write_text(text)
-    return load_robot(path)
 
 
 def close_by_least_squares(text: str) -> str:

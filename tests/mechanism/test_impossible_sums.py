@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from loopcal.errors import FileError, MechanismError
-from tests.mechanism.test_summed_drives import CELL, PLATE, WRIST, load_text
+from tests.mechanism.test_summed_drives import CELL, PLATE, WRIST
+from tests.robot_texts import load_text
 
 SECOND, THIRD = "q2: {reads: length, sum: {m: 1, k: 2}}", "q3: {reads: length, sum: {n: 1, h: 2}}"
 

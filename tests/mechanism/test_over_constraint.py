@@ -40,10 +40,10 @@ from tests.over_constrained import (
     RAILS,
     THREE_RRR,
     close_by_least_squares,
-    load_text,
     put_on_wrist,
     solve_exechon,
 )
+from tests.robot_texts import load_text
 from tests.zoo import move_base, place
 
 BOTH = pytest.mark.parametrize("text", [EXECHON, FOUR_BAR], ids=["exechon", "four-bar"])

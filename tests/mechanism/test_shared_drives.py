@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.optimize import root
 
 from loopcal.estimate import LeastSquares, identify_trials
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
 from loopcal.mechanism import (
     Mechanism,
@@ -23,6 +22,7 @@ from loopcal.mechanism import (
 )
 from loopcal.mechanism.stages.chain_state import ChainState
 from tests.jacobians import check_jacobian
+from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -53,13 +53,6 @@ limbs:
     errors: [{of: elbow, shift: [x], tolerance: {sd: 0.5}}]
 home: {x: 400, y: 650, yaw: 5}
 """
-
-
-def load_text(folder: Path, text: str) -> Mechanism:
-    """Return the robot of a file with this text."""
-    path = folder / "robot.yaml"
-    path.write_text(text, "utf-8")
-    return load_robot(path)
 
 
 def solve_four_bar(angle: float) -> tuple[Array, float]:

@@ -11,7 +11,7 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from loopcal.estimate import LeastSquares, identify_trials
-from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import (
     Gaussian,
     Instrument,
@@ -39,6 +39,7 @@ from loopcal.mechanism import (
 )
 from loopcal.workflow import calibrate
 from tests.jacobians import central_difference, check_jacobian
+from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -146,13 +147,6 @@ limbs:
   - {name: K, tip: [-1000, -700, 0], ending: distance, attach: [150, -100, 0], actuated: k}
   - {name: H, tip: [1000, -700, 0], ending: distance, attach: [150, 100, 0], actuated: h}
 """
-
-
-def load_text(folder: Path, text: str) -> Mechanism:
-    """Return the robot of a file with this text."""
-    path = folder / "robot.yaml"
-    path.write_text(text, "utf-8")
-    return load_robot(path)
 
 
 def draw_errors(robot: Mechanism, seed: int) -> Mechanism:

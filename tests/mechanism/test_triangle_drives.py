@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from loopcal.diagnose import identifiability
 from loopcal.errors import FileError, MechanismError
-from loopcal.io.robot.robot_file import load_robot
 from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, simulate
 from loopcal.mechanism import (
     Mechanism,
@@ -32,6 +31,7 @@ from loopcal.mechanism.triangle import (
     differentiate_length,
 )
 from tests.jacobians import check_jacobian
+from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]
@@ -57,13 +57,6 @@ stages:
         stroke: [1.8, 2.8]
         unknown: {ALL}
 """
-
-
-def load_text(folder: Path, text: str) -> Mechanism:
-    """Return the robot of a file with this text."""
-    path = folder / "robot.yaml"
-    path.write_text(text, "utf-8")
-    return load_robot(path)
 
 
 def measure_distance(angle: float, foot: Array, head: Array, skew: Array) -> float:

@@ -21,7 +21,8 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import Mechanism, forward
-from tests.over_constrained import EXECHON, FOUR_BAR, close_by_least_squares, load_text
+from tests.over_constrained import EXECHON, FOUR_BAR, close_by_least_squares
+from tests.robot_texts import load_text
 
 SIGMA = np.array([20e-6] * 3 + [20e-6] * 3)
 """Of angles [rad] and positions [m]."""
