@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 FLAT = 0.05
 """Width of an upright plane that contains a machine, as a share of its largest extent."""
 
+MARGIN = 0.08
+"""Room around the second view for names of limbs, as a share of the machine's larger extent."""
+
 VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"}
 """Directions of the second view, by the axes that it shows."""
 
@@ -148,8 +151,10 @@ def _finish(
     space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str, shown: tuple[int, int]
 ) -> None:
     """Set equal scales, and units on all axes."""
+    room = MARGIN * (high - low)[[*shown]].max()  # for names beside the outermost feet
+    above.update_datalim([(low - room)[[*shown]], (high + room)[[*shown]]])
     above.set_aspect("equal", adjustable="datalim")
-    above.margins(0.15 if space is None else 0.1)
+    above.autoscale_view()
     across, up = (f"{'xyz'[axis]} [{symbol}]" for axis in shown)
     if space is None:
         label_axes(above, across, up)
