@@ -15,6 +15,7 @@ from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.closure_start import descend_from_closure
 from loopcal.estimate.minimization.descent import Descent, descend
+from loopcal.estimate.minimization.part_start import descend_in_parts
 from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions
@@ -66,6 +67,20 @@ def descend_weighted(
     return robust.fit, robust.weight, robust.problem
 
 
+def _descend_from_part(
+    problem: Problem, z: FloatArray, options: FitOptions, progress: Progress
+) -> Descent | None:
+    """Descend first with a part of very many poses; None where this is of no use or not possible.
+
+    A loss needs all poses to tell which of them are far off, and the rows of an earlier calibration
+    would outweigh a part.
+    """
+    if options.begin != "kinematics" or options.loss is not None or options.prior is not None:
+        return None
+    control, tolerance = options.control, options.rank_tolerance
+    return descend_in_parts(problem, z, get_method(options), control, tolerance, progress)
+
+
 def descend_to_prior(
     problem: Problem,
     data: Measurements,
@@ -77,7 +92,11 @@ def descend_to_prior(
     """Descend, and again as long as the data ask for other components of the tolerances; return
     also the options with these.
     """
-    fit, weights, weighted = descend_weighted(problem, data, z, options, progress)
+    first = _descend_from_part(problem, z, options, progress)
+    if first is None:
+        fit, weights, weighted = descend_weighted(problem, data, z, options, progress)
+    else:
+        fit, weights, weighted = first, np.ones(data.n_poses), problem
     for _ in range(ROUNDS):
         method = choose_methods(free, fit, get_method(options)).get(0)
         if method is None:

@@ -55,7 +55,9 @@ class History:
     ----------
     status : how it ended. iterations : steps taken.
     cost : (i + 1,) whitened sum of squares. With a loss, the first and those after the last change
-        of weights use the final weights; those between use the weights of their time.
+        of weights use the final weights; those between use the weights of their time. A fit of very
+        many poses begins with a part of them, of which these are the sums times the ratio of the
+        numbers of equations.
     estimate : (i + 1, p) [SI].
     """
 

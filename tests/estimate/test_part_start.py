@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits of very many poses that begin with a part of them end where the plain ones do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal.errors import EstimationError
+from loopcal.estimate import (
+    MAP,
+    FitOptions,
+    Huber,
+    Identification,
+    LeastSquares,
+    StepControl,
+    TruncatedSVD,
+    identify,
+    prior_from,
+)
+from loopcal.estimate import fit_descent as module
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.minimization.part_start import SHARE, select_part, spread_poses
+from loopcal.estimate.observation_rows import BLOCK
+from loopcal.estimate.problem_construction import problem_of
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Kind,
+    Measurements,
+    Position,
+    Sensor,
+    sample_truth,
+    simulate,
+)
+from loopcal.mechanism import sample_workspace
+
+DELTA = load_robot("linear-delta")
+MANY = SHARE * BLOCK
+SIGMA = 1e-5  # [m]
+
+
+def measure(poses: np.ndarray, kind: Kind | None = None, seed: int = 0) -> Measurements:
+    """Return measurements at poses of a machine that is drawn from the tolerances."""
+    kind = Component(("x", "y", "z")) if kind is None else kind
+    truth = DELTA.with_values(sample_truth(DELTA, 1, 0)[0])
+    noise = Gaussian(np.full(len(kind.noise_columns), SIGMA))
+    return simulate(truth, poses, Instrument((Sensor(kind, noise),)), seed)
+
+
+def list_poses(n: int = MANY) -> np.ndarray:
+    """Return the coordinates of n poses, of which each 500 are the same."""
+    return np.resize(sample_workspace(DELTA, 500, 1).coordinates, (n, len(DELTA.controlled)))
+
+
+@pytest.fixture(scope="module")
+def data() -> Measurements:
+    """Measured positions of a delta with 9 parameters."""
+    return measure(list_poses())
+
+
+def fit_both(
+    monkeypatch: pytest.MonkeyPatch, data: Measurements, options: FitOptions
+) -> tuple[Identification, Identification]:
+    """Return the fit, and the one that begins with all poses."""
+    fit = identify(DELTA, data, options=options)
+    monkeypatch.setattr(module, "descend_in_parts", lambda *_: None)
+    return fit, identify(DELTA, data, options=options)
+
+
+def require_same_bits(fit: Identification, plain: Identification) -> None:
+    """Compare two fits, and their iterations, bit for bit."""
+    assert np.array_equal(fit.robot.values, plain.robot.values)
+    assert np.array_equal(fit.history.cost, plain.history.cost)
+    assert fit.history.status == plain.history.status
+    assert fit.history.iterations == plain.history.iterations
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP(), None], ids=repr)
+def test_the_result_is_that_of_all_poses_from_the_beginning(monkeypatch, data, method):
+    fit, plain = fit_both(monkeypatch, data, FitOptions(method=method))
+    assert fit.converged
+    assert plain.converged
+    assert len(fit.history.cost) != len(plain.history.cost)  # it did begin with a part
+    sigma = np.sqrt(np.diag(plain.covariance))
+    # steps end where they change the residuals by less than 1e-6 of their norm, here 3e-4 standard
+    # deviations; the error is the next one of a quadratic convergence
+    assert (np.abs(fit.estimate - plain.estimate) < 1e-6 * sigma).all()
+    difference = (fit.covariance - plain.covariance) / np.outer(sigma, sigma)
+    np.testing.assert_allclose(difference, 0.0, atol=1e-7)  # linear in that error
+    np.testing.assert_allclose(fit.history.cost[-1], plain.history.cost[-1], rtol=1e-10)
+    np.testing.assert_allclose(
+        fit.residuals[0].raw, plain.residuals[0].raw, rtol=0, atol=1e-6 * SIGMA
+    )
+
+
+def test_the_history_has_the_steps_of_the_part_with_comparable_sums_of_squares(monkeypatch, data):
+    said: list[str] = []
+    fit = identify(DELTA, data, LeastSquares(), progress=lambda *parts: said.append(parts[2]))
+    monkeypatch.setattr(module, "descend_in_parts", lambda *_: None)
+    plain = identify(DELTA, data, LeastSquares())
+    history = fit.history
+    assert history.iterations == len(history.cost) - 1 == len(history.estimate) - 1
+    np.testing.assert_array_equal(history.estimate[0], plain.history.estimate[0])
+    np.testing.assert_array_equal(history.estimate[-1], fit.estimate)
+    # 6144 residuals of the part: 10 standard deviations of their mean square, sqrt(2 / 6144)
+    np.testing.assert_allclose(history.cost[0], plain.history.cost[0], rtol=0.2)
+    np.testing.assert_allclose(history.cost[-3:], plain.history.cost[-1], rtol=0.2)
+    assert any(f"({BLOCK} of {MANY} poses)" in text for text in said)
+    assert "poses)" not in said[-1]
+
+
+@pytest.mark.parametrize("period", [2, 3, 10, 49, 50, 100, 160])
+def test_spread_poses_take_all_phases_of_what_repeats(period):
+    n = 100_000
+    poses = spread_poses(n, BLOCK)
+    assert len(np.unique(poses)) == BLOCK
+    assert poses.min() >= 0
+    assert poses.max() < n
+    assert (np.diff(poses) > 0).all()
+    count = np.bincount(poses % period, minlength=period)
+    assert (count > 0.3 * BLOCK / period).all()  # an even stride of 49 takes one phase of 49
+
+
+def test_poses_that_are_degenerate_at_even_strides_give_a_part_of_full_rank(monkeypatch):
+    poses = list_poses()
+    poses[::SHARE] = poses[0]
+    fit, plain = fit_both(monkeypatch, measure(poses), FitOptions(method=LeastSquares()))
+    assert len(fit.history.cost) != len(plain.history.cost)
+    sigma = np.sqrt(np.diag(plain.covariance))
+    assert (np.abs(fit.estimate - plain.estimate) < 1e-6 * sigma).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        FitOptions(method=LeastSquares(), loss=Huber()),
+        FitOptions(method=TruncatedSVD(6)),
+        FitOptions(method=LeastSquares(), control=StepControl(iterations=1)),
+    ],
+    ids=["loss", "chosen-rank", "out-of-steps"],
+)
+def test_other_fits_begin_with_all_poses(monkeypatch, data, options):
+    require_same_bits(*fit_both(monkeypatch, data, options))
+
+
+def test_a_fit_with_an_earlier_calibration_begins_with_all_poses(monkeypatch, data):
+    earlier = identify(DELTA, measure(list_poses(40), seed=1), LeastSquares())
+    options = FitOptions(method=LeastSquares(), prior=prior_from(earlier.posterior))
+    require_same_bits(*fit_both(monkeypatch, data, options))
+
+
+def test_a_part_that_does_not_determine_all_parameters_is_not_used(monkeypatch):
+    poses = list_poses()
+    others = np.setdiff1d(np.arange(MANY), spread_poses(MANY, BLOCK))
+    poses[np.setdiff1d(np.arange(MANY), others[:300])] = poses[0]  # 300 poses that are no part
+    fit, plain = fit_both(monkeypatch, measure(poses), FitOptions(method=LeastSquares()))
+    assert plain.spectrum.rank == len(plain.free_parameters)
+    require_same_bits(fit, plain)
+
+
+def test_parts_are_only_of_many_poses_that_readings_determine(data):
+    free = select_free_parameters(DELTA)
+    part = select_part(problem_of(free, data))
+    assert part is not None
+    assert part.readings.shape[1] == BLOCK
+    assert (part.equations == 3 * BLOCK).all()
+    few = problem_of(free, measure(list_poses(MANY - 1)))
+    frame = problem_of(free, measure(list_poses(), Position(unknown=("frame",))))
+    uncertain = problem_of(free, replace(data, reading_sigma=np.full_like(data.readings, 1e-6)))
+    for problem in (few, frame, uncertain):
+        assert select_part(problem) is None
+
+
+def test_a_start_out_of_reach_is_refused_as_without_a_part(data):
+    with pytest.raises(EstimationError, match="poses"):
+        identify(DELTA, data, options=FitOptions(method=LeastSquares(), start=3.0 * DELTA.values))
