@@ -137,7 +137,9 @@ class ExactPoses:
             else:
                 begin = start.states
                 single = PoseSolution(None, self._locate(self.blocks[0], z, begin))
-        linearized = None if single is None else single.linearized
+        linearized, states, driven = None, None, None
+        if single is not None:
+            linearized, states, driven = single.linearized, single.states, single.driven
         nuisance = fixed
         if self.nuisance is not None and fixed is None:
             located = (
@@ -146,7 +148,7 @@ class ExactPoses:
                 else [self._locate(b, z) for b in self.blocks]
             )
             nuisance = self._solve_for_nuisance(located, start.predict_nuisance(z), trials, control)
-        return PoseSolution(nuisance, linearized, None if single is None else single.states)
+        return PoseSolution(nuisance, linearized, states, driven=driven)
 
     def solve_single_block(
         self, z: FloatArray, trials: IntArray, start: Start, derivatives: bool = True
