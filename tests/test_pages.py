@@ -18,8 +18,8 @@ import pytest
 from tests.cli.delta_printers import read_records
 from tests.cli.page_commands import list_blocks, run_command, run_page
 from tests.cli.test_executed_pages import PAGES as EXECUTED_PAGES
+from tests.io.formats.linuxcnc.test_linuxcnc import format_hal, read_geometry
 from tests.io.formats.printers import format_printer_cfg
-from tests.io.formats.test_linuxcnc import format_hal, read_geometry
 from tests.io.test_probe_reports import REPRAP
 
 OWN_TESTS = {

@@ -12,7 +12,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli import main
-from loopcal.io.formats.probe_reports import read_reports
+from loopcal.io.formats.delta_printers.probe_reports import read_reports
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_g30
 
 NOISE = 0.02

@@ -14,7 +14,7 @@ import pytest
 
 from loopcal.diagnose import identifiability, suggest_measurements
 from loopcal.estimate import FitOptions, LeastSquares, identify
-from loopcal.io.formats import klipper
+from loopcal.io.formats.delta_printers import klipper
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure import Measurements, Observations

@@ -10,7 +10,7 @@ from loopcal.diagnose import StartVerdict, check_start_values
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.inference.prior import prior_from
 from loopcal.estimate.minimization.descent import StepControl
-from loopcal.mechanism import batch_kinematics
+from loopcal.mechanism.kinematics import batch_kinematics
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, get_finding, list_codes
 

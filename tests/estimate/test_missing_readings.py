@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import loopcal.mechanism.batch_kinematics as trials_module
+import loopcal.mechanism.kinematics.batch_kinematics as trials_module
 from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.poses.estimate import report_doubtful_readings

@@ -9,8 +9,8 @@ import pytest
 import loopcal as lc
 from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
-from loopcal.io.formats.urdf_closures import read_mechanism
-from loopcal.io.formats.urdf_tree import read
+from loopcal.io.formats.urdf.closures import read_mechanism
+from loopcal.io.formats.urdf.tree import read
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
 from loopcal.measure import KINDS, Observations
 from tests.io.changed_documents import change_value, list_places

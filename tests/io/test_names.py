@@ -21,7 +21,7 @@ from loopcal.io.core.names import (
 from loopcal.io.core.yaml_file import parse_yaml, read_yaml
 from loopcal.io.exports.conversion import convert_export
 from loopcal.io.exports.profile_reader import read_profile
-from loopcal.io.formats import urdf_tree
+from loopcal.io.formats.urdf import tree as urdf_tree
 from loopcal.io.robot.robot_file import find_robot_file
 
 CONTROLS = ["\x1b[31m", "\x07", "\x9b31m", "\x7f", "\u202e", "\u2066", "\u200b", "\ufeff", "\ud800"]

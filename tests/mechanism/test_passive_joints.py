@@ -17,7 +17,7 @@ from loopcal.mechanism.families.gough import Gough
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
-from tests.mechanism.test_kinematics import sample_inverse
+from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
 
 def build_ups_hexapod():

@@ -15,7 +15,7 @@ from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
-from tests.mechanism.test_kinematics import sample_inverse
+from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
 RANK = 1e-10  # relative; the smallest true singular values are above 1e-6, null ones below 1e-13
 

@@ -9,6 +9,15 @@ from typing import TYPE_CHECKING
 from loopcal.lazy_names import import_lazily
 
 if TYPE_CHECKING:
+    from loopcal.mechanism.actuation.driven_joints import DrivenJoints as DrivenJoints
+    from loopcal.mechanism.actuation.driven_joints import drive_joints as drive_joints
+    from loopcal.mechanism.actuation.redundant_actuation import (
+        PoseDrivenSensitivity as PoseDrivenSensitivity,
+    )
+    from loopcal.mechanism.actuation.redundant_actuation import (
+        differentiate_at_pose as differentiate_at_pose,
+    )
+    from loopcal.mechanism.actuation.redundant_actuation import solve_at_pose as solve_at_pose
     from loopcal.mechanism.analysis.modes import Modes as Modes
     from loopcal.mechanism.analysis.modes import find_assembly_modes as find_assembly_modes
     from loopcal.mechanism.analysis.modes import find_working_modes as find_working_modes
@@ -39,17 +48,19 @@ if TYPE_CHECKING:
     from loopcal.mechanism.assembly import LinearMap as LinearMap
     from loopcal.mechanism.assembly import Link as Link
     from loopcal.mechanism.assembly import SharedMap as SharedMap
-    from loopcal.mechanism.batch_kinematics import compute_closure_sign as compute_closure_sign
-    from loopcal.mechanism.batch_kinematics import compute_readings as compute_readings
-    from loopcal.mechanism.batch_kinematics import (
-        find_directly_reachable as find_directly_reachable,
+    from loopcal.mechanism.compilation.assembly_compilation import build as build
+    from loopcal.mechanism.compilation.over_constraint import (
+        fix_breaking_parameters as fix_breaking_parameters,
     )
-    from loopcal.mechanism.batch_kinematics import forward_trials as forward_trials
-    from loopcal.mechanism.batch_kinematics import inverse_trials as inverse_trials
-    from loopcal.mechanism.batch_kinematics import step_towards_closure as step_towards_closure
-    from loopcal.mechanism.compilation import build as build
-    from loopcal.mechanism.driven_joints import DrivenJoints as DrivenJoints
-    from loopcal.mechanism.driven_joints import drive_joints as drive_joints
+    from loopcal.mechanism.compilation.over_constraint import (
+        refuse_drawn_errors as refuse_drawn_errors,
+    )
+    from loopcal.mechanism.compilation.over_constraint import (
+        refuse_free_breaking_parameters as refuse_free_breaking_parameters,
+    )
+    from loopcal.mechanism.compilation.possible_values import (
+        find_impossible_values as find_impossible_values,
+    )
     from loopcal.mechanism.families import FAMILIES as FAMILIES
     from loopcal.mechanism.families.joint_release import (
         propose_added_joints as propose_added_joints,
@@ -63,21 +74,30 @@ if TYPE_CHECKING:
     from loopcal.mechanism.families.records import Workspace as Workspace
     from loopcal.mechanism.families.records import match_parameter_names as match_parameter_names
     from loopcal.mechanism.families.records import standard_deviation as standard_deviation
-    from loopcal.mechanism.kinematics import Jacobian as Jacobian
-    from loopcal.mechanism.kinematics import Solution as Solution
-    from loopcal.mechanism.kinematics import forward as forward
-    from loopcal.mechanism.kinematics import inverse as inverse
-    from loopcal.mechanism.kinematics import jacobian as jacobian
-    from loopcal.mechanism.kinematics import make_solution as make_solution
-    from loopcal.mechanism.model import Mechanism as Mechanism
-    from loopcal.mechanism.nearest_pose import (
+    from loopcal.mechanism.kinematics.batch_kinematics import (
+        compute_closure_sign as compute_closure_sign,
+    )
+    from loopcal.mechanism.kinematics.batch_kinematics import compute_readings as compute_readings
+    from loopcal.mechanism.kinematics.batch_kinematics import (
+        find_directly_reachable as find_directly_reachable,
+    )
+    from loopcal.mechanism.kinematics.batch_kinematics import forward_trials as forward_trials
+    from loopcal.mechanism.kinematics.batch_kinematics import inverse_trials as inverse_trials
+    from loopcal.mechanism.kinematics.batch_kinematics import (
+        step_towards_closure as step_towards_closure,
+    )
+    from loopcal.mechanism.kinematics.link_frames import compute_limb_frames as compute_limb_frames
+    from loopcal.mechanism.kinematics.nearest_pose import (
         differentiate_by_coordinates as differentiate_by_coordinates,
     )
-    from loopcal.mechanism.over_constraint import fix_breaking_parameters as fix_breaking_parameters
-    from loopcal.mechanism.over_constraint import refuse_drawn_errors as refuse_drawn_errors
-    from loopcal.mechanism.over_constraint import (
-        refuse_free_breaking_parameters as refuse_free_breaking_parameters,
-    )
+    from loopcal.mechanism.kinematics.pose_solutions import Jacobian as Jacobian
+    from loopcal.mechanism.kinematics.pose_solutions import Solution as Solution
+    from loopcal.mechanism.kinematics.pose_solutions import forward as forward
+    from loopcal.mechanism.kinematics.pose_solutions import inverse as inverse
+    from loopcal.mechanism.kinematics.pose_solutions import jacobian as jacobian
+    from loopcal.mechanism.kinematics.pose_solutions import make_solution as make_solution
+    from loopcal.mechanism.kinematics.triangle_anchors import locate_anchors as locate_anchors
+    from loopcal.mechanism.model import Mechanism as Mechanism
     from loopcal.mechanism.parameter_units import ParameterUnits as ParameterUnits
     from loopcal.mechanism.platform_coordinates import POSITION as POSITION
     from loopcal.mechanism.platform_coordinates import TILT as TILT
@@ -87,10 +107,6 @@ if TYPE_CHECKING:
         pose_from_coordinates as pose_from_coordinates,
     )
     from loopcal.mechanism.platform_coordinates import read_coordinates as read_coordinates
-    from loopcal.mechanism.possible_values import find_impossible_values as find_impossible_values
-    from loopcal.mechanism.redundant_actuation import PoseDrivenSensitivity as PoseDrivenSensitivity
-    from loopcal.mechanism.redundant_actuation import differentiate_at_pose as differentiate_at_pose
-    from loopcal.mechanism.redundant_actuation import solve_at_pose as solve_at_pose
     from loopcal.mechanism.sensitivity import PassiveSensitivity as PassiveSensitivity
     from loopcal.mechanism.sensitivity import PoseSensitivity as PoseSensitivity
     from loopcal.mechanism.sensitivity import (
@@ -108,21 +124,19 @@ if TYPE_CHECKING:
         select_platform_entries as select_platform_entries,
     )
     from loopcal.mechanism.states import Status as Status
-    from loopcal.mechanism.states import compute_limb_frames as compute_limb_frames
     from loopcal.mechanism.states import driven_values as driven_values
     from loopcal.mechanism.states import select_poses as select_poses
-    from loopcal.mechanism.transmission import TERMS as TERMS
-    from loopcal.mechanism.transmission import WEIGHT as WEIGHT
-    from loopcal.mechanism.transmission import harmonic_frequencies as harmonic_frequencies
-    from loopcal.mechanism.transmission import joint_slopes as joint_slopes
-    from loopcal.mechanism.transmission import joints_from_readings as joints_from_readings
-    from loopcal.mechanism.transmission import nominal_terms as nominal_terms
-    from loopcal.mechanism.transmission import readings_from_joints as readings_from_joints
-    from loopcal.mechanism.transmission import term_derivatives as term_derivatives
-    from loopcal.mechanism.transmission import transmit_readings as transmit_readings
-    from loopcal.mechanism.triangle import TRIANGLE_TERMS as TRIANGLE_TERMS
-    from loopcal.mechanism.triangle import compute_range as compute_range
-    from loopcal.mechanism.triangle_anchors import locate_anchors as locate_anchors
+    from loopcal.mechanism.transmission.terms import TERMS as TERMS
+    from loopcal.mechanism.transmission.terms import WEIGHT as WEIGHT
+    from loopcal.mechanism.transmission.terms import harmonic_frequencies as harmonic_frequencies
+    from loopcal.mechanism.transmission.terms import joint_slopes as joint_slopes
+    from loopcal.mechanism.transmission.terms import joints_from_readings as joints_from_readings
+    from loopcal.mechanism.transmission.terms import nominal_terms as nominal_terms
+    from loopcal.mechanism.transmission.terms import readings_from_joints as readings_from_joints
+    from loopcal.mechanism.transmission.terms import term_derivatives as term_derivatives
+    from loopcal.mechanism.transmission.terms import transmit_readings as transmit_readings
+    from loopcal.mechanism.transmission.triangle import TRIANGLE_TERMS as TRIANGLE_TERMS
+    from loopcal.mechanism.transmission.triangle import compute_range as compute_range
 else:
     __getattr__ = import_lazily(
         __name__,
@@ -140,25 +154,25 @@ else:
             "loopcal.mechanism.assembly": """
                 AXES Actuator Address Assembly Cone Joint Limb LinearMap Link SharedMap
             """,
-            "loopcal.mechanism.batch_kinematics": """
+            "loopcal.mechanism.kinematics.batch_kinematics": """
                 compute_closure_sign compute_readings find_directly_reachable forward_trials
                 step_towards_closure
                 inverse_trials
             """,
-            "loopcal.mechanism.compilation": "build",
-            "loopcal.mechanism.driven_joints": "DrivenJoints drive_joints",
+            "loopcal.mechanism.compilation.assembly_compilation": "build",
+            "loopcal.mechanism.actuation.driven_joints": "DrivenJoints drive_joints",
             "loopcal.mechanism.families": "FAMILIES",
             "loopcal.mechanism.families.joint_release": "propose_added_joints",
             "loopcal.mechanism.families.records": """
                 AngleTolerance LengthTolerance Point PoseRecord RatioTolerance RobotRecord
                 Workspace match_parameter_names standard_deviation
             """,
-            "loopcal.mechanism.kinematics": """
+            "loopcal.mechanism.kinematics.pose_solutions": """
                 Jacobian Solution forward inverse jacobian make_solution
             """,
             "loopcal.mechanism.model": "Mechanism",
-            "loopcal.mechanism.nearest_pose": "differentiate_by_coordinates",
-            "loopcal.mechanism.over_constraint": """
+            "loopcal.mechanism.kinematics.nearest_pose": "differentiate_by_coordinates",
+            "loopcal.mechanism.compilation.over_constraint": """
                 fix_breaking_parameters refuse_drawn_errors refuse_free_breaking_parameters
             """,
             "loopcal.mechanism.parameter_units": "ParameterUnits",
@@ -166,8 +180,8 @@ else:
                 POSITION TILT check_coordinates compare_coordinates pose_from_coordinates
                 read_coordinates
             """,
-            "loopcal.mechanism.possible_values": "find_impossible_values",
-            "loopcal.mechanism.redundant_actuation": """
+            "loopcal.mechanism.compilation.possible_values": "find_impossible_values",
+            "loopcal.mechanism.actuation.redundant_actuation": """
                 PoseDrivenSensitivity differentiate_at_pose solve_at_pose
             """,
             "loopcal.mechanism.sensitivity": """
@@ -177,12 +191,13 @@ else:
             "loopcal.mechanism.stages.chain_kinematics": """
                 name_platform_entries select_platform_entries
             """,
-            "loopcal.mechanism.states": "Status compute_limb_frames driven_values select_poses",
-            "loopcal.mechanism.transmission": """
+            "loopcal.mechanism.kinematics.link_frames": "compute_limb_frames",
+            "loopcal.mechanism.states": "Status driven_values select_poses",
+            "loopcal.mechanism.transmission.terms": """
                 TERMS WEIGHT harmonic_frequencies joint_slopes joints_from_readings nominal_terms
                 readings_from_joints term_derivatives transmit_readings
             """,
-            "loopcal.mechanism.triangle": "TRIANGLE_TERMS compute_range",
-            "loopcal.mechanism.triangle_anchors": "locate_anchors",
+            "loopcal.mechanism.transmission.triangle": "TRIANGLE_TERMS compute_range",
+            "loopcal.mechanism.kinematics.triangle_anchors": "locate_anchors",
         },
     )

@@ -117,7 +117,7 @@ class Address:
 
     `owner` is a limb or an actuator; `element` a link or joint of the limb, `rod`, or
     `transmission`; `axis` one of AXES, `pitch`, `length`, or a term (see
-    `loopcal.mechanism.transmission`).
+    `loopcal.mechanism.transmission.terms`).
     """
 
     owner: str

@@ -16,7 +16,7 @@ from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap, is_serial
 from loopcal.mechanism.parameter_units import MovedSlots, ParameterUnits, find_moved_slots
-from loopcal.mechanism.transmission import select_weights
+from loopcal.mechanism.transmission.terms import select_weights
 from loopcal.parameters import ParameterTable
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray

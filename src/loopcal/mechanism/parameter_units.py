@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal.engine import MapPattern, ParameterMap
-from loopcal.mechanism.sums import invert_weights
-from loopcal.mechanism.transmission import (
+from loopcal.mechanism.transmission.sums import invert_weights
+from loopcal.mechanism.transmission.terms import (
     differentiate_sums,
     find_triangles,
     joint_slopes,

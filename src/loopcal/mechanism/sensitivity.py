@@ -19,15 +19,25 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
-from loopcal.mechanism.driven_joints import DrivenJoints, drive_joints
-from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
-from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.open_closure import (
+from loopcal.mechanism.actuation.driven_joints import DrivenJoints, drive_joints
+from loopcal.mechanism.actuation.summed_drives import (
+    Motion,
+    differentiate_driven_joints,
+    differentiate_joints_by_readings,
+    differentiate_open_sums,
+)
+from loopcal.mechanism.closure.limb_rows import (
+    linearize_limbs,
+    name_passive_joints,
+    solve_passive_motion,
+)
+from loopcal.mechanism.closure.open_closure import (
     differentiate_open,
     differentiate_unknowns,
     fold_open_poses,
     list_unknown_joints,
 )
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.parameter_units import ParameterUnits
 from loopcal.mechanism.stages.chain_kinematics import (
     differentiate_end,
@@ -36,13 +46,7 @@ from loopcal.mechanism.stages.chain_kinematics import (
     name_platform_entries,
 )
 from loopcal.mechanism.states import is_closed
-from loopcal.mechanism.summed_drives import (
-    Motion,
-    differentiate_driven_joints,
-    differentiate_joints_by_readings,
-    differentiate_open_sums,
-)
-from loopcal.mechanism.transmission import joints_from_readings
+from loopcal.mechanism.transmission.terms import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
 
 

@@ -6,16 +6,11 @@ A format is a `Format` with `read`, `write` or both, in a module of its own, and
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import (
-    delta_gcode,
-    hangprinter,
-    klipper,
-    linuxcnc,
-    linuxcnc_ini,
-    parameter_table,
-    urdf,
-)
+from loopcal.io.formats import hangprinter, parameter_table
+from loopcal.io.formats.delta_printers import delta_gcode, klipper
+from loopcal.io.formats.linuxcnc import hal_file, ini_file
 from loopcal.io.formats.program_format import Format
+from loopcal.io.formats.urdf import urdf_format
 
 FORMATS: Mapping[str, Format] = {
     entry.name: entry
@@ -23,9 +18,9 @@ FORMATS: Mapping[str, Format] = {
         klipper.FORMAT,
         delta_gcode.MARLIN,
         delta_gcode.REPRAP,
-        linuxcnc.FORMAT,
-        linuxcnc_ini.FORMAT,
-        urdf.FORMAT,
+        hal_file.FORMAT,
+        ini_file.FORMAT,
+        urdf_format.FORMAT,
         hangprinter.FORMAT,
         parameter_table.JSON,
         parameter_table.CSV,

@@ -18,19 +18,19 @@ from numpy.typing import ArrayLike
 from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
-from loopcal.mechanism.batch_kinematics import (
+from loopcal.mechanism.actuation.summed_drives import solve_open_sums
+from loopcal.mechanism.kinematics.batch_kinematics import (
     compute_closure_sign,
     compute_readings,
     inverse_trials,
 )
-from loopcal.mechanism.kinematics import Solution, check_arguments, make_solution
+from loopcal.mechanism.kinematics.pose_solutions import Solution, check_arguments, make_solution
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.stages.chain_kinematics import solve_stages
 from loopcal.mechanism.stages.chain_state import join_stage_states
 from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
-from loopcal.mechanism.summed_drives import solve_open_sums
-from loopcal.mechanism.transmission import evaluate_sums, joints_from_readings, select_weights
+from loopcal.mechanism.transmission.terms import evaluate_sums, joints_from_readings, select_weights
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension

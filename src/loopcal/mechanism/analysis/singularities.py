@@ -24,12 +24,13 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.actuation.summed_drives import differentiate_lengths
 from loopcal.mechanism.analysis.workspace import sample_workspace
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.batch_kinematics import compute_closure_sign, compute_readings
-from loopcal.mechanism.kinematics import Solution, forward, inverse, make_solution
-from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
-from loopcal.mechanism.mobility import list_main_freedoms
+from loopcal.mechanism.closure.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.compilation.mobility import list_main_freedoms
+from loopcal.mechanism.kinematics.batch_kinematics import compute_closure_sign, compute_readings
+from loopcal.mechanism.kinematics.pose_solutions import Solution, forward, inverse, make_solution
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
@@ -39,9 +40,8 @@ from loopcal.mechanism.stages.chain_state import (
     transport_to_end,
 )
 from loopcal.mechanism.states import driven_values, join_states
-from loopcal.mechanism.summed_drives import differentiate_lengths
-from loopcal.mechanism.sums import invert_weights
-from loopcal.mechanism.transmission import select_weights
+from loopcal.mechanism.transmission.sums import invert_weights
+from loopcal.mechanism.transmission.terms import select_weights
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension

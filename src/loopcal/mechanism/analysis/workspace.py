@@ -14,9 +14,9 @@ from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.mechanism.kinematics import Solution, check_arguments, inverse
+from loopcal.mechanism.kinematics.link_frames import compute_limb_frames
+from loopcal.mechanism.kinematics.pose_solutions import Solution, check_arguments, inverse
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.states import compute_limb_frames
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension

@@ -16,7 +16,7 @@ from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import Address, LinearMap
 from loopcal.mechanism.families.error_models import ErrorModel, join_errors, single_error
 from loopcal.mechanism.families.records import RatioTolerance, standard_deviation
-from loopcal.mechanism.sums import count_independent
+from loopcal.mechanism.transmission.sums import count_independent
 from loopcal.units import Dimension
 
 WEIGHT = "weight"

@@ -2,7 +2,7 @@
 """Records of triangle drives: a linear actuator that turns a revolute joint through two anchors.
 
 Both anchors are in the frame in which the file places the joint, with the joint at zero; its axes
-are those of the joint's errors. Formulas: `loopcal.mechanism.triangle`.
+are those of the joint's errors. Formulas: `loopcal.mechanism.transmission.triangle`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from loopcal.mechanism.families.records import (
     RatioTolerance,
     standard_deviation,
 )
-from loopcal.mechanism.triangle import TRIANGLE_TERMS, compute_range, find_side
+from loopcal.mechanism.transmission.triangle import TRIANGLE_TERMS, compute_range, find_side
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length, Ratio
 

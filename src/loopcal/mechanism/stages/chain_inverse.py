@@ -33,7 +33,7 @@ from loopcal.mechanism.stages.chain_kinematics import PoseDerivative
 from loopcal.mechanism.stages.chain_reach import measure_target_excess
 from loopcal.mechanism.stages.chain_state import find_carrying_actuators
 from loopcal.mechanism.states import Status, driven_values
-from loopcal.mechanism.transmission import joint_slopes, readings_from_joints
+from loopcal.mechanism.transmission.terms import joint_slopes, readings_from_joints
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

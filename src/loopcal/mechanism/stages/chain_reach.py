@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.engine import PITCH, Group
-from loopcal.mechanism.limb_frames import follow_limb, measure_rod
+from loopcal.mechanism.closure.limb_frames import follow_limb, measure_rod
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.mechanism.stages.chain_state import list_carrying_stages

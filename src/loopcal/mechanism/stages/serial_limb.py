@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED, NOT_FINITE, State
-from loopcal.mechanism.limb_frames import follow_limb
+from loopcal.mechanism.closure.limb_frames import follow_limb
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 

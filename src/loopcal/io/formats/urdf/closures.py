@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mechanism of a URDF: its tree, the closures of a YAML file, and its own constraints.
+
+`closed_loop: [[A, B]]` names frames: links, or joints, which mean the links that they carry. With
+`type: ['6d']` the two frames coincide (a cut through a rigid link, or through a pin that two
+revolute joints describe), with `3d` their origins do (a ball joint). `name_mot` lists the motors.
+`joint_name` and `joint_type` replace joints of the tree: SPHERICAL by a ball joint, UJOINT_XY by a
+rotary joint about x, then one about y of the joint's frame, FIXED by none. This is the dialect of
+the example-parallel-robots collection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import FileError, MechanismError, suggest_names
+from loopcal.io.core.yaml_file import YamlFile, read_yaml, refuse_unknown_keys
+from loopcal.io.formats.urdf.elements import UrdfConstraint, UrdfJoint
+from loopcal.io.formats.urdf.tree import Urdf
+from loopcal.mechanism.joint_graph import (
+    Bodies,
+    GraphJoint,
+    JointGraph,
+    Weld,
+    assemble_graph,
+    find_perpendicular,
+    list_axes_across,
+    turn_between,
+    weld_bodies,
+)
+from loopcal.plain_text import quote
+from loopcal.typing import FloatArray
+
+WHAT = "file of loop closures"
+KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+
+OVERRIDES = ("SPHERICAL", "FIXED", *(f"UJOINT_{a}{b}" for a, b in permutations("XYZ", 2)))
+"""Types by which a closure file replaces joints."""
+
+WELD, BALL = "6d", "3d"
+
+BALL_NAME = "_ball"
+"""Ending of the name of a ball joint at the origin of a movable joint, which has its own name."""
+
+
+@dataclass(frozen=True)
+class Closures:
+    """The content of a closure file.
+
+    Attributes
+    ----------
+    file : None without one. pairs : names of the two frames of each closure. kinds : WELD or BALL.
+    motors : driven joints. overrides : joint -> type, of OVERRIDES.
+    """
+
+    file: YamlFile | None = None
+    pairs: tuple[tuple[str, str], ...] = ()
+    kinds: tuple[str, ...] = ()
+    motors: tuple[str, ...] = ()
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class UrdfMechanism:
+    """A URDF with its loops closed.
+
+    Attributes
+    ----------
+    urdf : with the joints that the closure file fixes. graph : bodies and joints.
+    bodies : rigid bodies that closures make of links. frames : links that close loops only.
+    """
+
+    urdf: Urdf
+    graph: JointGraph
+    bodies: Bodies
+    frames: frozenset[str]
+
+    def locate(self, link: str) -> tuple[str, FloatArray]:
+        """Return the rigid body of a link, and T_body_link (4, 4)."""
+        body, T = self.bodies.locate(self.urdf.find_body(link))
+        return body, T @ self.urdf.place_in_body(link)
+
+    def measure_rounding(self, bodies: Collection[str]) -> tuple[float, float]:
+        """Return the rounding error of all origins that join or are on bodies [m, rad]."""
+        ends = [end for constraint in self.urdf.constraints for end in constraint.ends]
+        chosen = [
+            *(j for j in self.urdf.joints.values() if self.locate(j.child)[0] in bodies),
+            *(end for end in ends if self.locate(end.parent)[0] in bodies),
+        ]
+        return math.hypot(*(j.rounding[0] for j in chosen)), math.hypot(
+            *(j.rounding[1] for j in chosen)
+        )
+
+    def list_links(self, body: str) -> tuple[str, ...]:
+        """Return the links of a rigid body."""
+        links = (self.urdf.root, *self.urdf.carrier)
+        return tuple(link for link in links if self.locate(link)[0] == body)
+
+
+def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
+    """Return the mechanism of a URDF with its closures.
+
+    Raises
+    ------
+    FileError : an unknown frame or joint, a closure of a rigid body with itself, a motor that is
+        not a movable joint.
+    """
+    closures = Closures() if path is None else _read_closures(path, urdf)
+    fixed = {name for name, kind in closures.overrides.items() if kind == "FIXED"}
+    urdf = urdf.with_fixed(fixed)
+    motors = closures.motors or tuple(urdf.motors)
+    welds, balls = [], []
+    for i, (pair, kind) in enumerate(zip(closures.pairs, closures.kinds, strict=True)):
+        closure = _build_closure(urdf, closures, i, pair, kind)
+        (welds if isinstance(closure, Weld) else balls).append(closure)
+    _check_motors(urdf, closures, motors)
+    constraints = [_build_constraint(urdf, constraint) for constraint in urdf.constraints]
+    welds += [closure for one in constraints for closure in one if isinstance(closure, Weld)]
+    # a ball joint at the origin of a movable joint has no origin of its own to shift
+    centers = {
+        joint.body_a if not joint.origin_a else joint.body_b
+        for joint in balls
+        if not (joint.origin_a and joint.origin_b)
+    }
+    joints = [
+        *(
+            replace(joint, shifts="xyz") if joint.body_b in centers else joint
+            for joint in _list_joints(urdf, closures.overrides)
+        ),
+        *balls,
+        *(closure for one in constraints for closure in one if isinstance(closure, GraphJoint)),
+    ]
+    found = [_find_link(urdf, name) for pair in closures.pairs for name in pair]
+    ends = frozenset(link for link in found if link is not None)
+    try:
+        bodies = weld_bodies(urdf.root, welds)
+        graph = assemble_graph(urdf.root, [bodies.move(joint) for joint in joints], motors)
+    except MechanismError as error:
+        raise _locate_error(error, urdf, closures) from None
+    return UrdfMechanism(urdf, graph, bodies, ends)
+
+
+def _read_closures(path: Path, urdf: Urdf) -> Closures:
+    """Return the content of a closure file."""
+    file = read_yaml(path, WHAT)
+    refuse_unknown_keys(file, tuple(file.content), KEYS)
+    pairs, kinds, motors, names, types = (file.content.get(key, []) for key in KEYS)
+    _check_lists(file, pairs, kinds, motors)
+    for i, kind in enumerate(kinds):
+        if str(kind).lower() not in (WELD, BALL):
+            sentence = f"closure {pairs[i][0]!r} is of type {quote(str(kind))}; allowed: 6d (the"
+            raise file.error(f"{sentence} frames coincide), 3d (their origins do)", ("type", i))
+    return Closures(
+        file,
+        tuple((a, b) for a, b in pairs),
+        tuple(str(kind).lower() for kind in kinds),
+        tuple(str(name) for name in motors),
+        _read_overrides(file, names, types, urdf),
+    )
+
+
+def _check_lists(file: YamlFile, pairs: Any, kinds: Any, motors: Any) -> None:
+    """Refuse closures, types and motors that are no lists, or do not belong together."""
+    for key, value in zip(KEYS, (pairs, kinds, motors), strict=False):
+        if not isinstance(value, list):
+            raise file.error(f"{key!r} is {quote(str(value))}, but must be a list", (key,))
+    for i, pair in enumerate(pairs):
+        if not isinstance(pair, list) or [type(name) for name in pair] != [str, str]:
+            sentence = f"closure {i + 1} is {quote(str(pair))}, but must be the names of two frames"
+            raise file.error(f"{sentence}: [A, B]", ("closed_loop", i))
+    if len(kinds) != len(pairs):
+        sentence = f"'closed_loop' has {len(pairs)} pairs, but 'type' has {len(kinds)} entries"
+        raise file.error(f"{sentence}; write 6d or 3d for each pair", ("type",))
+
+
+def _read_overrides(file: YamlFile, names: Any, types: Any, urdf: Urdf) -> dict[str, str]:
+    """Return joint -> type of the joints that a closure file replaces."""
+    if not isinstance(names, list) or not isinstance(types, list) or len(names) != len(types):
+        sentence = "'joint_name:' and 'joint_type:' must be lists of the same length; correct them"
+        raise file.error(sentence, ("joint_name",))
+    overrides: dict[str, str] = {}
+    for i, (name, kind) in enumerate(zip(map(str, names), map(str, types), strict=True)):
+        if name not in urdf.joints or not urdf.joints[name].kind:
+            near = suggest_names(name, [n for n, joint in urdf.joints.items() if joint.kind])
+            sentence = f"{quote(name)} is not a movable joint of {urdf.path.name}{near}"
+            raise file.error(f"{sentence}; correct it", ("joint_name", i))
+        if kind.upper() not in OVERRIDES:
+            sentence = f"joint {name!r} is replaced by {quote(kind)}; allowed: "
+            raise file.error(sentence + ", ".join(OVERRIDES), ("joint_type", i))
+        if name in overrides:
+            raise file.error(f"joint {name!r} is replaced twice; remove one", ("joint_name", i))
+        overrides[name] = kind.upper()
+    return overrides
+
+
+def _check_motors(urdf: Urdf, closures: Closures, motors: Sequence[str]) -> None:
+    """Refuse motors that are no movable joints of the tree."""
+    ends = {name for pair in closures.pairs for name in pair}
+    for i, name in enumerate(motors):
+        if name in motors[:i] and closures.file is not None:
+            raise closures.file.error(f"motor {name!r} is named twice; remove one", ("name_mot", i))
+        joint = urdf.joints.get(name)
+        if joint is not None and joint.kind and name not in ends | {*closures.overrides}:
+            continue
+        near = suggest_names(name, [n for n, joint in urdf.joints.items() if joint.kind])
+        reason = f"is not a movable joint of {urdf.path.name}{near}"
+        if name in ends:
+            reason = f"is not a movable joint of {urdf.path.name} that a motor can drive: it closes"
+            reason += " a loop"
+        elif name in closures.overrides:
+            reason = "is not a movable joint that a motor can drive: joint_type replaces it"
+        sentence = f"the motor {quote(name)} {reason}; correct it"
+        if closures.file is None or name not in closures.motors:
+            raise FileError(sentence, urdf.path, urdf.motors.get(name))
+        raise closures.file.error(sentence, ("name_mot", i))
+    if not motors:
+        sentence = "no motor is named; list the driven joints in 'name_mot:'"
+        if closures.file is not None:
+            raise closures.file.error(sentence)
+        raise FileError(f"{sentence} of a YAML file beside the URDF", urdf.path)
+
+
+def _find_link(urdf: Urdf, name: str) -> str | None:
+    """Return the link of a frame: a link, or the one that a joint carries; None where unknown."""
+    if name in urdf.joints:
+        return urdf.joints[name].child
+    return name if name in urdf.carrier or name == urdf.root else None
+
+
+def _build_closure(
+    urdf: Urdf, closures: Closures, i: int, pair: tuple[str, str], kind: str
+) -> Weld | GraphJoint:
+    """Return one closure of the YAML file."""
+    file = closures.file
+    assert file is not None
+    if pair[0] == pair[1]:
+        sentence = f"closure {i + 1} names the frame {pair[0]!r} twice; name two frames"
+        raise file.error(sentence, ("closed_loop", i))
+    ends: list[tuple[str, FloatArray, str]] = []
+    for name in pair:
+        link = _find_link(urdf, name)
+        if link is None:
+            near = suggest_names(name, [*urdf.joints, *urdf.carrier])
+            sentence = f"the closure {quote(name)} is not a joint or link of {urdf.path.name}"
+            raise file.error(f"{sentence}{near}; correct it", ("closed_loop", i))
+        carrier = urdf.carrier.get(link)
+        origin = carrier.name if carrier is not None and not carrier.kind else ""
+        ends.append((urdf.find_body(link), urdf.place_in_body(link), origin))
+    (a, T_a, near), (b, T_b, far) = ends
+    if kind == WELD:
+        return Weld(pair[0], a, b, T_a, T_b)
+    name = pair[0] + BALL_NAME if pair[0] in urdf.joints else pair[0]
+    return GraphJoint(name, "S", a, b, T_a, T_b, np.array([0.0, 0.0, 1.0]), near, far)
+
+
+def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | GraphJoint, ...]:
+    """Return a `<constraint>` of the URDF; a universal one has a body between its two joints."""
+    (a, A), (b, B) = (
+        (urdf.find_body(end.parent), urdf.place_in_body(end.parent) @ end.origin)
+        for end in constraint.ends
+    )
+    near, far = (end.name for end in constraint.ends)
+    name, (first, second) = constraint.name, constraint.axes
+    if not constraint.kind:
+        return (Weld(name, a, b, A, B),)
+    if constraint.kind != "U":
+        kind: Literal["R", "S"] = "R" if constraint.kind == "R" else "S"
+        shifts = list_axes_across(first) if kind == "R" else "xyz"
+        return (GraphJoint(name, kind, a, b, A, B, first, near, far, shifts),)
+    # the cross: at value zero the second axis is turned across the first
+    cross = f"cross of {name}"
+    across = find_perpendicular(first, second)
+    turn = geometry.make_pose(turn_between(second, across), np.zeros(3))
+    return (
+        GraphJoint(f"{name}_1", "R", a, cross, A, np.eye(4), first, near),
+        GraphJoint(f"{name}_2", "R", cross, b, turn, B, second, "", far),
+    )
+
+
+def _list_joints(urdf: Urdf, overrides: Mapping[str, str]) -> Iterator[GraphJoint]:
+    """Yield the movable joints of the tree, with those that the closure file replaces."""
+    for joint in urdf.joints.values():
+        if joint.kind:
+            kind = overrides.get(joint.name, "")
+            yield from _replace_joint(urdf, joint, kind) if kind else [_make_joint(urdf, joint)]
+
+
+def _make_joint(urdf: Urdf, joint: UrdfJoint) -> GraphJoint:
+    """Return a joint of the tree."""
+    kind: Literal["R", "P"] = "R" if joint.kind == "R" else "P"
+    return GraphJoint(
+        joint.name,
+        kind,
+        urdf.find_body(joint.parent),
+        joint.child,
+        urdf.place_in_body(joint.parent) @ joint.origin,
+        np.eye(4),
+        joint.axis,
+        joint.name,
+        shifts=list_axes_across(joint.axis),
+        limits=joint.limits,
+    )
+
+
+def _replace_joint(urdf: Urdf, joint: UrdfJoint, kind: str) -> Iterator[GraphJoint]:
+    """Yield the joints by which a closure file replaces one: of a ball joint z, y, x."""
+    first = _make_joint(urdf, joint)
+    letters = "ZYX" if kind == "SPHERICAL" else kind[-2:]
+    body, bodies = first.body_a, [f"cross {i + 1} of {joint.name}" for i in range(len(letters) - 1)]
+    for i, (letter, after) in enumerate(zip(letters, [*bodies, first.body_b], strict=True)):
+        yield replace(
+            first,
+            name=f"{joint.name}_{letter}",
+            kind="R",
+            body_a=body,
+            body_b=after,
+            T_a=first.T_a if i == 0 else np.eye(4),
+            axis=np.eye(3)["XYZ".index(letter)],
+            origin_a=joint.name if i == 0 else "",
+            shifts="xyz",
+            limits=None,
+        )
+        body = after
+
+
+def _locate_error(error: MechanismError, urdf: Urdf, closures: Closures) -> FileError:
+    """Return an error of the mechanism at the line of the closure that it names."""
+    finding = error.finding
+    name = "" if finding is None else finding.data.get("closure", "")
+    frame = name.removesuffix(BALL_NAME)
+    places = [i for i, pair in enumerate(closures.pairs) if frame == pair[0]]
+    places = places or [i for i, pair in enumerate(closures.pairs) if frame in pair]
+    if places and closures.file is not None:
+        return closures.file.error(finding, ("closed_loop", places[-1]))
+    lines = {constraint.name: constraint.line for constraint in urdf.constraints}
+    line = lines.get(name) or (urdf.joints[name].line if name in urdf.joints else None)
+    return FileError(error.args[0], urdf.path, line)

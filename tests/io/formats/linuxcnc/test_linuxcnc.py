@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LinuxCNC's genhexkins settings: agreement with LinuxCNC's own code, import, export, refusals."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal import geometry as rigid
+from loopcal.diagnose import list_parameter_sets
+from loopcal.errors import DataError, FileError
+from loopcal.io import load_robot
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.linuxcnc import hal_file
+from loopcal.io.formats.program_format import ExportSource, ImportOptions
+from loopcal.io.robot import robot_file
+from loopcal.mechanism import Mechanism, inverse
+
+PINS = {
+    "base": "base",
+    "platform": "platform",
+    "base-n": "base_joint_axis",
+    "platform-n": "platform_joint_axis",
+}
+
+
+def format_hal(geometry: dict, lead: float = 0.0, lift: float = 0.0) -> str:
+    """Return the settings as the text of a HAL file."""
+    lines = ["# ours", "loadrt genhexkins", "setp stepgen.0.maxvel 1"]
+    for pin, name in PINS.items():
+        for n, point in enumerate(geometry[name]):
+            for axis, value in zip("xyz", point, strict=True):
+                shown = value - (lift if axis == "z" and not pin.endswith("-n") else 0.0)
+                lines.append(f"setp genhexkins.{pin}.{n}.{axis} {shown}  # as built")
+    lines += [f"setp genhexkins.screw-lead = {lead}"] if lead else []
+    lines += [f"setp genhexkins.spindle-offset {lift}"] if lift else []
+    return "\n".join([*lines, "net xpos joint.0.motor-pos-cmd", ""])
+
+
+def read(folder: Path, text: str, **options) -> Mechanism:
+    path = folder / "hexapod.hal"
+    path.write_text(text)
+    return build_imported_robot(
+        path, hal_file.read(path, ImportOptions("hexapod", **{"length_unit": "mm", **options}))
+    )
+
+
+def read_geometry(data_folder: Path) -> dict:
+    return json.loads((data_folder / "kinematics_oracles" / "genhexkins_geometry.json").read_text())
+
+
+@pytest.fixture
+def geometry(data_folder) -> dict:
+    return read_geometry(data_folder)
+
+
+def test_pins_are_the_parameters_that_the_controller_stores(tmp_path, geometry) -> None:
+    sets = list_parameter_sets(read(tmp_path, format_hal(geometry), home_height=0.020))
+    assert len(sets["controller"]) == 36
+    assert not any(name.endswith("length") for name in sets["controller"])
+
+
+@pytest.mark.parametrize("lift", [0.0, 7.5])
+@pytest.mark.parametrize(("lead", "oracle"), [(0.0, "default"), (4.0, "screwlead4")])
+def test_strut_lengths_agree_with_linuxcnc(
+    tmp_path, data_folder, geometry, lead, oracle, lift
+) -> None:
+    robot = read(tmp_path, format_hal(geometry, lead, lift), home_height=0.020)
+    table = np.genfromtxt(
+        data_folder / "kinematics_oracles" / f"genhexkins_{oracle}_200poses.csv",
+        delimiter=",",
+        names=True,
+    )
+    angles = np.radians(np.stack([table[f"{axis}_deg"] for axis in "abc"], axis=1))
+    position = np.stack([table[axis] for axis in "xyz"], axis=1) * 1e-3
+    found = inverse(robot, rigid.make_pose(rigid.euler_to_matrix(angles, "xyz"), position))
+    expected = np.stack([table[f"L{n}"] for n in range(6)], axis=1) * 1e-3
+    off = np.abs(found.q - expected)
+    if lead:
+        # asin(sin a) is a while no strut turns past a quarter turn from where it was at home
+        R, struts = rigid.euler_to_matrix(angles, "xyz"), np.array(geometry["platform"])
+        along = position[:, None] * 1e3 + struts @ np.swapaxes(R, 1, 2) - np.array(geometry["base"])
+        along /= np.linalg.norm(along, axis=2, keepdims=True)
+        low, high = (
+            np.array(geometry["base_joint_axis"]) + 0 * along,
+            np.array(geometry["platform_joint_axis"]) @ np.swapaxes(R, 1, 2),
+        )
+        across = (low * high).sum(2) - (low * along).sum(2) * (high * along).sum(2)
+        near = np.sign(across) == np.sign(across[0])  # the first pose is home
+        assert near.mean() > 0.7
+        off, reached = off[near], near.all(axis=1)
+        # with a strut past a quarter turn, forward kinematics from home may lead elsewhere
+        assert reached.mean() > 0.1
+        assert found.converged[reached].all()
+    else:
+        assert found.converged.all()
+    assert off.max() < 1e-12  # [m]
+
+
+def test_corrected_pins_are_read_as_written_and_other_lines_are_kept(tmp_path, geometry) -> None:
+    text = format_hal(geometry, 4.0, 7.5)
+    robot = read(tmp_path, text)
+    names = robot.parameters.names
+    shift = 1e-4 * np.random.default_rng(1).uniform(-1, 1, len(names))
+    moved = robot.with_values(robot.values + shift)
+    written = hal_file.write(ExportSource(moved), tmp_path / "hexapod.hal")
+    again = read(tmp_path, written.text)
+    centres = [i for i, name in enumerate(names) if not name.endswith("length")]
+    np.testing.assert_allclose(
+        again.values[centres], moved.values[centres], rtol=0, atol=1e-15
+    )  # [m]
+    changed = [
+        a for a, b in zip(text.splitlines(), written.text.splitlines(), strict=True) if a != b
+    ]
+    assert len(changed) == 36
+    assert all(
+        line.startswith(("setp genhexkins.base.", "setp genhexkins.platform.")) for line in changed
+    )
+    assert written.text.count("# as built") == text.count("# as built")
+    # lengths have no pin, and that is said
+    said = [str(f) for f in written.findings if f.code == "files.strut-length"]
+    assert len(said) == 6
+    assert "HOME_OFFSET of [JOINT_0]" in said[0]
+
+
+def test_unchanged_hexapod_keeps_the_file_and_new_lines_are_read_as_written(
+    tmp_path, geometry
+) -> None:
+    text = format_hal(geometry).rstrip("\n")
+    robot = read(tmp_path, text)
+    assert hal_file.write(ExportSource(robot), tmp_path / "hexapod.hal").text == text
+    np.testing.assert_array_equal(
+        read(tmp_path, hal_file.write(ExportSource(robot), None).text).values, robot.values
+    )
+
+
+def test_missing_pin_is_added(tmp_path, geometry) -> None:
+    text = "".join(
+        line for line in format_hal(geometry).splitlines(keepends=True) if ".base.0.z" not in line
+    )
+    robot = read(tmp_path, text)
+    values = robot.values.copy()
+    values[robot.parameters.index("leg1.base.z")] = 2.5e-4
+    written = hal_file.write(ExportSource(robot.with_values(values)), tmp_path / "hexapod.hal").text
+    assert written == text + "setp genhexkins.base.0.z 0.25\n"
+
+
+def test_export_reports_strut_lengths_without_a_pin() -> None:
+    found = hal_file.write(ExportSource(load_robot("hexapod-42")), None)
+    assert "strut 0 is 233.238076 mm long at reading zero" in "\n".join(map(str, found.findings))
+
+
+def test_screws_with_different_leads_are_refused(tmp_path, geometry) -> None:
+    robot = read(tmp_path, format_hal(geometry, 4.0))
+    source = robot.record
+    assert isinstance(source, robot_file.RobotSource)
+    (tmp_path / "two.yaml").write_text(
+        source.text.replace("  lead: [", "  lead: [5.0, 4, 4, 4, 4, 4]  # [")
+    )
+    with pytest.raises((DataError, FileError), match="screws of different lead"):
+        hal_file.write(ExportSource(load_robot(tmp_path / "two.yaml")), None)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "sentence"),
+    [
+        (("genhexkins.", "hexkins."), {}, "this file has no 'setp genhexkins...'"),
+        (("setp genhexkins.base.0.x", "# setp"), {}, "'setp genhexkins.base.0.x ..' is missing"),
+        (
+            ("base.0.y 13.25", "base.0.y [HEX]B0Y"),
+            {},
+            r":5: genhexkins.base.0.y is '\[HEX\]B0Y', but a finite number",
+        ),
+        (("", ""), {"length_unit": None}, "a HAL file states no unit of length"),
+    ],
+)
+def test_invalid_hal_file_is_refused_in_one_sentence(
+    tmp_path, geometry, change, options, sentence
+) -> None:
+    with pytest.raises(FileError, match=sentence):
+        read(
+            tmp_path,
+            format_hal(geometry).replace(*change) if change[0] else format_hal(geometry),
+            **options,
+        )
