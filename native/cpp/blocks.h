@@ -52,6 +52,12 @@ class PlacedUnit {
 
     const Lanes *lanes() const { return lanes_; }
     const double *numbers() const { return numbers_; }
+    template <class Number> const Number *links() const {
+        if constexpr (sizeof(Number) == sizeof(double))
+            return numbers_;
+        else
+            return lanes_;
+    }
 
     void place(int64_t unit, const loopcal::Strided &e) {
         if (unit == unit_ || (unit_ >= 0 && !e.trial)) return;
@@ -111,7 +117,20 @@ inline void gather_platform(const loopcal::Strided &T, const int64_t *trial, con
     }
 }
 
-// The same of one T (4, 4).
+// Write rotations (9) and positions (3) to the rows of T (rows, 4, 4).
+INLINE void write_platforms(const Lanes *from, const int64_t *row, int used, double *T) {
+    Lanes whole[16] = {};
+    double *to[W];
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) whole[4 * i + j] = from[3 * i + j];
+        whole[4 * i + 3] = from[9 + i];
+    }
+    whole[15] = splat(1.0);
+    for (int lane = 0; lane < W; lane++) to[lane] = T + 16 * row[lane];
+    write_rows(whole, 16, used, to);
+}
+
+// Rotation (9) and position (3) of one T (4, 4).
 inline void read_platform(const double *T, double *out) {
     for (int i = 0; i < 3; i++) {
         for (int j = 0; j < 3; j++) out[3 * i + j] = T[4 * i + j];

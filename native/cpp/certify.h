@@ -3,7 +3,7 @@
 // whose words are used here.
 #pragma once
 
-#include "newton.h"
+#include "rods.h"
 
 namespace INSTRUCTION_SET {
 
@@ -43,7 +43,7 @@ struct Begin {
         sign;
 
     // placed : the links of a program that has driven rods. platform : rotation and position.
-    void prepare(const Program &program, const Equations &equations, const double *placed,
+    void prepare(const Program &program, const RodEquations &equations, const double *placed,
                  const double *platform) {
         double square[6], sum = 0.0;
         Lanes lanes[12];
@@ -148,11 +148,9 @@ inline int certify(const int64_t *structure, const double *numbers, const loopca
     if (!memory.ok()) return loopcal::NO_MEMORY;
     Program program(structure, numbers, memory.take<Group>((size_t)structure[0]));
     Division division(t, n, false);
-    Arena arena(Frames::need(0) + PlacedUnit::need(program));
+    Arena arena(PlacedUnit::need(program));
     if (!arena.ok()) return loopcal::NO_MEMORY;
-    Frames frames(arena, 0);
-    NewtonWork work{frames, nullptr, nullptr};
-    Equations equations(program, work);
+    RodEquations equations(program);
     PlacedUnit placed;
     placed.prepare(program, division, arena);
     Begin begin;

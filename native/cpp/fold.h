@@ -91,12 +91,11 @@ inline void load_factors(const double *factor, int64_t count, int64_t p, Lanes *
 
 inline void store_factors(const Lanes *R, int64_t count, int64_t p, double *out) {
     for (int64_t i = 0; i < p; i++) {
-        const Lanes *row = R + packed(i, p) - i;
-        for (int64_t lane = 0; lane < count; lane++) {
-            double *to = out + lane * p * p + i * p;
-            for (int64_t j = 0; j < i; j++) to[j] = 0.0;
-            for (int64_t j = i; j < p; j++) to[j] = row[j][lane];
-        }
+        double *to[W];
+        for (int64_t lane = 0; lane < W; lane++) to[lane] = out + lane * p * p + i * p + i;
+        for (int64_t lane = 0; lane < count; lane++)
+            std::memset(to[lane] - i, 0, sizeof(double) * (size_t)i);
+        write_rows(R + packed(i, p), p - i, (int)count, to);
     }
 }
 

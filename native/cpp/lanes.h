@@ -91,6 +91,82 @@ template <class Real> INLINE Real constant(double value);
 template <> INLINE double constant<double>(double value) { return value; }
 template <> INLINE Lanes constant<Lanes>(double value) { return splat(value); }
 
+// --- between rows of memory and lanes ---------------------------------------------------------
+
+#if !defined(__has_builtin)
+#define __has_builtin(name) 0
+#endif
+#if __has_builtin(__builtin_shufflevector) && (LANES == 2 || LANES == 4 || LANES == 8)
+#define TRANSPOSES 1
+// Exchange an off-diagonal block of `SIZE` numbers of two vectors that are `SIZE` rows apart.
+template <int SIZE> INLINE void exchange(Lanes &a, Lanes &b) {
+    Lanes x = a, y = b;
+#if LANES == 2
+    a = __builtin_shufflevector(x, y, 0, 2);
+    b = __builtin_shufflevector(x, y, 1, 3);
+#elif LANES == 4
+    if (SIZE == 1) {
+        a = __builtin_shufflevector(x, y, 0, 4, 2, 6);
+        b = __builtin_shufflevector(x, y, 1, 5, 3, 7);
+    } else {
+        a = __builtin_shufflevector(x, y, 0, 1, 4, 5);
+        b = __builtin_shufflevector(x, y, 2, 3, 6, 7);
+    }
+#else
+    if (SIZE == 1) {
+        a = __builtin_shufflevector(x, y, 0, 8, 2, 10, 4, 12, 6, 14);
+        b = __builtin_shufflevector(x, y, 1, 9, 3, 11, 5, 13, 7, 15);
+    } else if (SIZE == 2) {
+        a = __builtin_shufflevector(x, y, 0, 1, 8, 9, 4, 5, 12, 13);
+        b = __builtin_shufflevector(x, y, 2, 3, 10, 11, 6, 7, 14, 15);
+    } else {
+        a = __builtin_shufflevector(x, y, 0, 1, 2, 3, 8, 9, 10, 11);
+        b = __builtin_shufflevector(x, y, 4, 5, 6, 7, 12, 13, 14, 15);
+    }
+#endif
+}
+
+template <int SIZE = 1> INLINE void transpose(Lanes *square) {
+    if constexpr (SIZE < W) {
+        for (int i = 0; i < W; i++)
+            if (!(i & SIZE)) exchange<SIZE>(square[i], square[i + SIZE]);
+        transpose<2 * SIZE>(square);
+    }
+}
+
+template <int SIZE = W / 2>
+INLINE void store_first(const double *from, int64_t count, double *to) {
+    if constexpr (SIZE > 0) {
+        if (count & SIZE) std::memcpy(to, from, sizeof(double) * SIZE), from += SIZE, to += SIZE;
+        store_first<SIZE / 2>(from, count, to);
+    }
+}
+#endif
+
+// Write `count` numbers of each of the first `used` lanes to the row of the lane.
+INLINE void write_rows(const Lanes *from, int64_t count, int used, double *const *to) {
+#if defined(TRANSPOSES)
+    for (int64_t i = 0; i < count; i += W) {
+        Lanes square[W];
+        int64_t left = count - i;
+        for (int k = 0; k < W; k++) square[k] = from[i + (k < left ? k : left - 1)];
+        transpose(square);
+        if (left >= W) {
+            for (int lane = 0; lane < used; lane++) store(to[lane] + i, square[lane]);
+            continue;
+        }
+        double numbers[W * W];
+        for (int lane = 0; lane < used; lane++) {
+            store(numbers + W * lane, square[lane]);
+            store_first(numbers + W * lane, left, to[lane] + i);
+        }
+    }
+#else
+    for (int lane = 0; lane < used; lane++)
+        for (int64_t i = 0; i < count; i++) to[lane][i] = from[i][lane];
+#endif
+}
+
 // Memory for the vectors of one call. `ok` is false where there is not enough.
 class Arena {
   public:

@@ -64,10 +64,10 @@ void linearize_block(const Program &program, const Number *placed, const Lanes *
                 linearize_limb<Number, BALL>(program, group, k, placed, T, theta, work);
             else
                 linearize_limb<Number, DISTANCE>(program, group, k, placed, T, theta, work);
-            for (int lane = 0; lane < used; lane++) {
-                double *to = out[g] + (row[lane] * group.limbs + k) * numbers;
-                for (int64_t i = 0; i < numbers; i++) to[i] = work.rows[i][lane];
-            }
+            double *to[W];
+            for (int lane = 0; lane < W; lane++)
+                to[lane] = out[g] + (row[lane] * group.limbs + k) * numbers;
+            write_rows(work.rows, numbers, used, to);
             placed += group.placed();
             theta += group.joints + 1;
         }

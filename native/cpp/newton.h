@@ -39,106 +39,24 @@ struct TaskRows {
     const double *residual[W], *slopes[W];
 };
 
-// The Jacobian of six driven rods at a platform that all rows of a unit start from: its reflectors,
-// its factor by columns, and what `evaluate` derives from them.
-struct SharedFactor {
-    Lanes factor[36], v[5][6], beta[5], inverse[6], distance[6], sign;
-
-    // y with factor . y = -right, both in the order of rows and freedoms; right becomes Q' right.
-    INLINE void solve(Lanes *right, Lanes *y) const {
-        for (int j = 0; j < 5; j++) reflect_column(v[j] + j, beta[j], right + j, 6 - j);
-        for (int f = 5; f >= 0; f--) {
-            Lanes known{};
-            for (int c = f + 1; c < 6; c++) known = known + factor[6 * c + f] * y[c];
-            y[f] = (-right[f] - known) * inverse[f];
-        }
+// The largest part of a twist, an angle times the robot's size.
+INLINE Lanes measure_twist(const Lanes *twist, double size) {
+    Lanes angle{}, shift{};
+    for (int i = 0; i < 3; i++) {
+        angle = larger(angle, magnitude(twist[i]));
+        shift = larger(shift, magnitude(twist[3 + i]));
     }
-};
+    return larger(angle * size, shift);
+}
 
 class Equations {
   public:
     Equations(const Program &program, const NewtonWork &work)
-        : program_(program), work_(work), redundant_(program.sigma && !program.free) {
-        int limbs = 0;
-        has_rods_ = !redundant_ && !program.free;
-        for (int g = 0; g < program.groups; g++) {
-            const Group &group = program.group[g];
-            has_rods_ = has_rods_ && group.ending == DISTANCE && !group.joints && !group.unknown;
-            limbs += group.limbs;
-        }
-        has_rods_ = has_rods_ && limbs == 6 && program.freedoms == 6;
-    }
+        : program_(program), work_(work), redundant_(program.sigma && !program.free),
+          step_size_(6 + program.unknown_joints()), coordinate_size_(12 + program.joint_values()) {}
 
-    // Whether the mechanism has six freedoms and six limbs, each a rod of given length.
-    bool has_rods() const { return has_rods_; }
-
-    // The factor at coordinates that differ between rows by the lengths of rods only.
-    template <class Number> void factorize(const Number *placed, const Lanes *T, SharedFactor &out) const {
-        Lanes *matrix = out.factor, none{};
-        int row = 0;
-        for (int g = 0; g < program_.groups; g++)
-            for (int k = 0; k < program_.group[g].limbs; k++, row++) {
-                Limb<Number, DISTANCE> limb(program_.group[g], k, placed, work_.frames,
-                                            program_.size, T, &none, 1, false);
-                for (int f = 0; f < 6; f++) limb.freedom(program_.freedom[f], matrix + 6 * f + row);
-                out.distance[row] = limb.distance;
-                placed += program_.group[g].placed();
-            }
-        out.sign = splat(1.0);
-        for (int j = 0; j < 5; j++) {
-            for (int i = j; i < 6; i++) out.v[j][i] = matrix[6 * j + i];
-            Reflector h = make_reflector(out.v[j] + j, 6 - j);
-            for (int c = j + 1; c < 6; c++)
-                reflect_column(out.v[j] + j, h.beta, matrix + 6 * c + j, 6 - j);
-            matrix[6 * j + j] = h.alpha;
-            out.beta[j] = h.beta;
-            out.sign = select(h.alpha != 0.0, -out.sign, out.sign);
-        }
-        for (int f = 0; f < 6; f++) {
-            out.sign = out.sign * signum(matrix[7 * f]);
-            out.inverse[f] = 1.0 / matrix[7 * f];
-        }
-    }
-
-    // What `evaluate` gives there, by the same operations.
-    template <class Number>
-    void evaluate_shared(const Number *placed, const SharedFactor &at, const Lanes *coordinates,
-                         Lanes *step, Measures &measures) const {
-        Lanes right[6], y[6], square{}, left{};
-        for (int g = 0, row = 0; g < program_.groups; g++)
-            for (int k = 0; k < program_.group[g].limbs; k++, row++) {
-                right[row] = at.distance[row] - (placed[2 * LINK] + coordinates[12 + row]);
-                square = square + right[row] * right[row];
-                placed += program_.group[g].placed();
-            }
-        measures.residual = root(square);
-        at.solve(right, y);
-        for (int f = 0; f < 6; f++) step[program_.freedom[f]] = y[f];
-        for (int i = 0; i < 6; i++) left = left + right[i] * right[i];
-        measures.reducible = root(left);
-        measures.length = measure_step(step);
-        measures.sign = at.sign;
-        measures.pivot = splat(1.0);
-    }
-
-    // The residual of rods, by the same operations as in `evaluate`.
-    template <class Number> Lanes measure_rods(const Number *placed, const Lanes *coordinates) const {
-        Lanes square{};
-        const Lanes *theta = coordinates + 12;
-        for (int g = 0; g < program_.groups; g++)
-            for (int k = 0; k < program_.group[g].limbs; k++, theta++) {
-                Limb<Number, DISTANCE> limb(program_.group[g], k, placed, work_.frames,
-                                            program_.size, coordinates, theta, 1, false);
-                Lanes residual;
-                limb.residual(&residual);
-                square = square + residual * residual;
-                placed += program_.group[g].placed();
-            }
-        return root(square);
-    }
-
-    int step_size() const { return 6 + program_.unknown_joints(); }
-    int coordinate_size() const { return 12 + program_.joint_values(); }
+    int step_size() const { return step_size_; }
+    int coordinate_size() const { return coordinate_size_; }
 
     static int low_rows(const Program &program, int conditions) {
         int count = conditions;
@@ -154,15 +72,6 @@ class Equations {
     template <class Number>
     void evaluate(const Number *placed, const Lanes *coordinates, const TaskRows *task,
                   Mask may_stay, Mask alive, Lanes *step, Measures &measures) const {
-        if (has_rods_ && !any(alive & ~may_stay)) {
-            Lanes norm = measure_rods(placed, coordinates);
-            if (!any(alive & ~(norm <= RESIDUAL * program_.size))) {
-                for (int i = 0; i < 6; i++) step[i] = Lanes{};
-                measures.residual = measures.reducible = norm;
-                measures.length = Lanes{};
-                return;
-            }
-        }
         int m = program_.freedoms, rows = low_rows(program_, task ? task->conditions : 0);
         Lanes inner{}, sign = splat(1.0), pivot = splat(1.0), *reduced = work_.reduced;
         const Lanes *theta = coordinates + 12;
@@ -337,12 +246,7 @@ class Equations {
 
     // The largest part of a step, an angle times the robot's size.
     Lanes measure_step(const Lanes *step) const {
-        Lanes angle{}, shift{};
-        for (int i = 0; i < 3; i++) {
-            angle = larger(angle, magnitude(step[i]));
-            shift = larger(shift, magnitude(step[3 + i]));
-        }
-        Lanes length = larger(angle * program_.size, shift);
+        Lanes length = measure_twist(step, program_.size);
         step += 6;
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
@@ -358,7 +262,8 @@ class Equations {
 
     const Program &program_;
     const NewtonWork &work_;
-    bool redundant_, has_rods_;
+    bool redundant_;
+    int step_size_, coordinate_size_;
 };
 
 }  // namespace INSTRUCTION_SET

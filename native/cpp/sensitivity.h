@@ -137,6 +137,7 @@ class Differentiator {
                Arena::need<Lanes>(program.joint_values()) + Arena::need<Lanes>(12) +
                Arena::need<Lanes>(size.triangle) + Arena::need<Lanes>(size.closed * (size.closed + 6)) +
                2 * Arena::need<Lanes>(6 * size.closed) + Arena::need<Lanes>(size.values) +
+               Arena::need<bool>(size.values) +
                Arena::need<Lanes>(6 * (size_t)map.parameters()) +
                Arena::need<Lanes>(6 * (size_t)program.drives);
     }
@@ -155,6 +156,8 @@ class Differentiator {
         values_ = arena.take<Lanes>(size_.values);
         by_parameter = arena.take<Lanes>(6 * (size_t)map.parameters());
         by_reading = arena.take<Lanes>(6 * (size_t)program.drives);
+        begins_ = arena.take<bool>(size_.values);
+        find_first_products();
     }
 
     void differentiate(int64_t block) {
@@ -280,31 +283,52 @@ class Differentiator {
             }
     }
 
-    void multiply() {
+    // begins_ : of each product that `multiply` adds, whether it is the first one of its column. A
+    // column without products is zero, and so are the rows that are no freedoms.
+    void find_first_products() {
         int64_t p = map_.parameters(), a = program_.drives;
         for (int64_t i = 0; i < 6 * p; i++) by_parameter[i] = Lanes{};
         for (int64_t i = 0; i < 6 * a; i++) by_reading[i] = Lanes{};
+        bool *begins = begins_;
+        // a mark in the columns themselves: they are of use only later
+        visit([&](Lanes *to, int64_t, size_t) {
+            *begins++ = (*to)[0] == 0.0;
+            *to = splat(1.0);
+        });
+        for (int64_t i = 0; i < p; i++) by_parameter[i] = Lanes{};
+        for (int64_t i = 0; i < a; i++) by_reading[i] = Lanes{};
+    }
+
+    void multiply() {
+        const Lanes *value = values_;
+        const bool *begins = begins_;
+        visit([&](Lanes *to, int64_t stride, size_t row) {
+            const Lanes *inverse = inverse_ + row, factor = *value++;
+            bool begins_here = *begins++;
+            for (int f = 0; f < program_.freedoms; f++, inverse += size_.closed) {
+                Lanes *entry = to + program_.freedom[f] * stride, before{};
+                if (!begins_here) before = *entry;
+                *entry = before - *inverse * factor;
+            }
+        });
+    }
+
+    // Call `act` with the column, the stride of its rows and the closed row of every product, in the
+    // order of values_.
+    template <class Act> INLINE void visit(Act act) {
+        int64_t p = map_.parameters(), a = program_.drives;
         const int64_t *entries = map_.structure + 2;
-        const Lanes *values = values_;
         size_t row = 0;
         for (int g = 0; g < program_.groups; g++) {
             const Group &group = program_.group[g];
             for (int k = 0; k < group.limbs; k++, entries += 1 + 4 * entries[0])
                 for (int i = group.unknown; i < group.rows; i++, row++) {
-                    for (int64_t z = 0; z < entries[0]; z++)
-                        add_product(by_parameter + entries[2 + 4 * z], p, row, *values++);
+                    for (int64_t z = 0; z < entries[0]; z++) act(by_parameter + entries[2 + 4 * z], p, row);
                     for (int j = 0; j <= group.joints; j++) {
                         int64_t drive = group.actuator[j * group.limbs + k];
-                        if (drive >= 0) add_product(by_reading + drive, a, row, *values++);
+                        if (drive >= 0) act(by_reading + drive, a, row);
                     }
                 }
-        }
-    }
-
-    INLINE void add_product(Lanes *to, int64_t stride, size_t row, Lanes value) const {
-        for (int f = 0; f < program_.freedoms; f++) {
-            Lanes *entry = to + program_.freedom[f] * stride;
-            *entry = *entry - inverse_[f * size_.closed + row] * value;
         }
     }
 
@@ -317,13 +341,14 @@ class Differentiator {
     PlacedUnit placed_;
     LaneMap numbers_;
     Lanes *theta_, *platform_, *triangle_, *matrix_, *rows_, *inverse_, *values_;
+    bool *begins_;
 };
 
 INLINE void write_lanes(const Lanes *from, int64_t count, const Differentiator &rows, int64_t n, double *out) {
-    for (int lane = 0; lane < rows.used; lane++) {
-        double *to = out + (rows.trial[lane] * n + rows.pose[lane]) * count;
-        for (int64_t i = 0; i < count; i++) to[i] = from[i][lane];
-    }
+    double *to[W];
+    for (int lane = 0; lane < W; lane++)
+        to[lane] = out + (rows.trial[lane] * n + rows.pose[lane]) * count;
+    write_rows(from, count, rows.used, to);
 }
 
 // arrays : e, q, T, then the numbers of the map: displacements, joints, basis, readings.

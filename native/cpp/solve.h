@@ -3,100 +3,21 @@
 #pragma once
 
 #include "limbs.h"
+#include "workspace.h"
 
 namespace INSTRUCTION_SET {
-
-// One block of rows between two steps.
-struct RowBlock {
-    Lanes *now, *step, *next;  // coordinates, Newton step from there, coordinates tried
-    Measures measures;
-    Lanes share, applied, at_rounding, status, steps, fraction, length;
-    Mask alive;
-    int64_t trial[W], pose[W];
-    int used;
-    int64_t unit;
-    PlacedUnit *placed;
-};
-
-struct SolveInput {
-    loopcal::Strided e, q, T, goal;
-    const loopcal::Strided *joints;
-    int64_t t, n, max_iterations;
-    loopcal::Task task;
-    void *context;
-};
-
-struct SolveOutput {
-    double *T, *const *joints, *residual;
-    int64_t *iterations;
-    int8_t *status, *sign;
-};
-
-// The memory of a solver: blocks that are solved together, and the links placed for their units.
-struct Workspace {
-    RowBlock *block = nullptr;
-    PlacedUnit *unit = nullptr;
-    int64_t *rows = nullptr, blocks, units;
-    double *poses = nullptr;
-    Lanes *reduced = nullptr, *low = nullptr, *trial_step = nullptr;
-
-    static int most_joints(const Program &program) {
-        int most = 0;
-        for (int g = 0; g < program.groups; g++)
-            if (program.group[g].joints > most) most = program.group[g].joints;
-        return most;
-    }
-
-    Workspace(const Program &program, const Division &division, int most_conditions,
-              int64_t block_count, int64_t unit_count)
-        : blocks(block_count), units(unit_count), reduced_(NewtonWork::reduced_of(program)),
-          low_((size_t)Equations::low_rows(program, most_conditions) * (program.freedoms + 1)),
-          steps_(6 + (size_t)program.unknown_joints()),
-          values_(12 + (size_t)program.joint_values()), joints_(most_joints(program)),
-          arena_(need(program)) {
-        if (!arena_.ok()) return;
-        reduced = arena_.take<Lanes>(reduced_);
-        low = arena_.take<Lanes>(low_);
-        trial_step = arena_.take<Lanes>(steps_);
-        block = arena_.take<RowBlock>(blocks);
-        unit = arena_.take<PlacedUnit>(units);
-        rows = arena_.take<int64_t>(blocks * W);
-        poses = arena_.take<double>(12 * blocks * W);
-        for (int64_t u = 0; u < units; u++) unit[u].prepare(program, division, arena_);
-        for (int64_t b = 0; b < blocks; b++) {
-            block[b].now = arena_.take<Lanes>(values_);
-            block[b].next = arena_.take<Lanes>(values_);
-            block[b].step = arena_.take<Lanes>(steps_);
-        }
-    }
-
-    bool ok() const { return arena_.ok(); }
-
-    NewtonWork take_work() { return {Frames(arena_, joints_), reduced, low}; }
-
-  private:
-    size_t need(const Program &program) const {
-        return Frames::need(joints_) + Arena::need<Lanes>(reduced_) + Arena::need<Lanes>(low_) +
-               Arena::need<Lanes>(steps_) + Arena::need<RowBlock>(blocks) +
-               Arena::need<PlacedUnit>(units) + Arena::need<int64_t>(blocks * W) +
-               Arena::need<double>(12 * blocks * W) + units * PlacedUnit::need(program) +
-               blocks * (2 * Arena::need<Lanes>(values_) + Arena::need<Lanes>(steps_));
-    }
-
-    size_t reduced_, low_, steps_, values_;
-    int joints_;
-    Arena arena_;
-};
 
 class Solver {
   public:
     Solver(const Program &program, const SolveInput &input, const SolveOutput &output,
            const Division &division, const Equations &equations, const Workspace &space)
         : program_(program), in_(input), out_(output), division_(division), equations_(equations),
-          space_(space) {}
+          rods_(program), space_(space) {}
 
     // Rows solved together where a task is asked, which is called once for all of them.
     static constexpr int64_t ROWS_OF_TASK = 2048;
+    // Blocks that are solved together elsewhere, so that rods are evaluated in pairs.
+    static constexpr int64_t PAIR = 2;
 
     int run() {
         for (int64_t first = 0; first < division_.blocks(); first += space_.blocks) {
@@ -175,6 +96,13 @@ class Solver {
     // The first evaluation of all blocks, or that of the coordinates tried, by which better ones
     // replace the present ones.
     int evaluate_all(RowBlock *blocks, int64_t count, bool first) {
+        if (rods_.apply() && !in_.task) {
+            if (division_.by_trials)
+                evaluate_rods<Lanes>(blocks, count, first);
+            else
+                evaluate_rods<double>(blocks, count, first);
+            return 0;
+        }
         loopcal::TaskAnswer answer{};
         if (in_.task) {
             int64_t asked = 0;
@@ -203,15 +131,19 @@ class Solver {
                 task.residual[lane] = answer.residual + last * answer.conditions;
                 task.slopes[lane] = answer.slopes + last * answer.conditions * 6;
             }
-            if (first && !in_.task && !in_.T.pose && equations_.has_rods())
-                evaluate_shared(blocks[b]);
-            else if (first)
-                evaluate(blocks[b], blocks[b].now, in_.task ? &task : nullptr, Mask{},
-                         blocks[b].step, blocks[b].measures);
+            const TaskRows *asked_rows = in_.task ? &task : nullptr;
+            if (first)
+                evaluate(blocks[b], blocks[b].now, asked_rows, Mask{}, blocks[b].step, blocks[b].measures);
             else
-                accept(blocks[b], in_.task ? &task : nullptr);
+                try_coordinates(blocks[b], asked_rows);
         }
         return 0;
+    }
+
+    void try_coordinates(RowBlock &block, const TaskRows *task) const {
+        block.tried = block.measures;
+        evaluate(block, block.next, task, find_tiny(block), block.further, block.tried);
+        accept(block);
     }
 
     void evaluate(const RowBlock &block, const Lanes *coordinates, const TaskRows *task,
@@ -223,21 +155,47 @@ class Solver {
             equations_.evaluate(placed.numbers(), coordinates, task, may_stay, block.alive, step, measures);
     }
 
+    // The same as in `evaluate_all` for rods, two blocks at a time.
+    template <class Number> void evaluate_rods(RowBlock *blocks, int64_t count, bool first) {
+        RodRows<Number> rows[PAIR];
+        RowBlock *of[PAIR];
+        int waiting = 0;
+        for (int64_t b = 0; b < count; b++) {
+            RowBlock &block = blocks[b];
+            if (any(block.alive)) {
+                if (first && !in_.T.pose) {
+                    evaluate_shared<Number>(block);
+                    continue;
+                }
+                block.tried = block.measures;
+                of[waiting] = &block;
+                rows[waiting++] = {block.placed->links<Number>(), first ? block.now : block.next,
+                                   first ? Mask{} : find_tiny(block), block.alive,
+                                   first ? block.step : block.further,
+                                   first ? &block.measures : &block.tried};
+            }
+            if (!waiting || (waiting < PAIR && b + 1 < count)) continue;
+            if (waiting == PAIR)
+                rods_.evaluate<PAIR>(rows);
+            else
+                rods_.evaluate<1>(rows);
+            for (int i = 0; i < waiting && !first; i++) accept(*of[i]);
+            waiting = 0;
+        }
+    }
+
     // The first evaluation of rows that start from one pose of their trial.
-    void evaluate_shared(RowBlock &block) {
-        const PlacedUnit &placed = *block.placed;
+    template <class Number> void evaluate_shared(RowBlock &block) {
+        const Number *placed = block.placed->links<Number>();
         if (shared_unit_ != block.unit) {
             shared_unit_ = block.unit;
-            if (division_.by_trials)
-                equations_.factorize(placed.lanes(), block.now, shared_);
-            else
-                equations_.factorize(placed.numbers(), block.now, shared_);
+            rods_.factorize(placed, block.now, shared_);
         }
-        if (division_.by_trials)
-            equations_.evaluate_shared(placed.lanes(), shared_, block.now, block.step, block.measures);
-        else
-            equations_.evaluate_shared(placed.numbers(), shared_, block.now, block.step, block.measures);
+        rods_.evaluate_shared(placed, shared_, block.now, block.step, block.measures);
     }
+
+    // Which rows have tried a step that is a rounding error.
+    Mask find_tiny(const RowBlock &block) const { return block.length <= STEP * program_.size; }
 
     // End the rows that have converged, are near their goal, or can go no further.
     void end_rows(RowBlock &block) const {
@@ -271,13 +229,10 @@ class Solver {
         equations_.move(block.now, block.step, block.fraction, block.next);
     }
 
-    void accept(RowBlock &block, const TaskRows *task) {
+    void accept(RowBlock &block) const {
         double size = program_.size;
-        Mask tiny = block.length <= STEP * size;
-        Measures trial = block.measures;
-        Lanes *step = space_.trial_step;
-        evaluate(block, block.next, task, tiny, step, trial);
-        const Measures &now = block.measures;
+        const Measures &now = block.measures, &trial = block.tried;
+        const Lanes *step = block.further;
         Mask low = trial.reducible <= RESIDUAL * size;
         Mask better = low | (trial.residual <= (1.0 - 1e-4 * block.fraction) * now.residual) |
                       (trial.reducible <= 0.5 * now.reducible);
@@ -310,27 +265,24 @@ class Solver {
     }
 
     void write(const RowBlock &block) const {
+        int64_t row[W];
+        double *to[W];
+        for (int lane = 0; lane < W; lane++)
+            row[lane] = block.trial[lane] * division_.n + block.pose[lane];
+        write_platforms(block.now, row, block.used, out_.T);
+        const Lanes *theta = block.now + 12;
+        for (int g = 0; g < program_.groups; g++) {
+            int values = program_.group[g].limbs * (program_.group[g].joints + 1);
+            for (int lane = 0; lane < W; lane++) to[lane] = out_.joints[g] + row[lane] * values;
+            write_rows(theta, values, block.used, to);
+            theta += values;
+        }
         for (int lane = 0; lane < block.used; lane++) {
-            int64_t row = block.trial[lane] * division_.n + block.pose[lane];
-            double *T = out_.T + 16 * row;
-            for (int i = 0; i < 3; i++) {
-                for (int j = 0; j < 3; j++) T[4 * i + j] = block.now[3 * i + j][lane];
-                T[4 * i + 3] = block.now[9 + i][lane];
-                T[12 + i] = 0.0;
-            }
-            T[15] = 1.0;
-            const Lanes *theta = block.now + 12;
-            for (int g = 0; g < program_.groups; g++) {
-                int values = program_.group[g].limbs * (program_.group[g].joints + 1);
-                double *to = out_.joints[g] + row * values;
-                for (int i = 0; i < values; i++) to[i] = theta[i][lane];
-                theta += values;
-            }
             double sign = block.measures.sign[lane];
-            out_.residual[row] = block.measures.residual[lane];
-            out_.iterations[row] = (int64_t)block.steps[lane];
-            out_.status[row] = (int8_t)block.status[lane];
-            out_.sign[row] = (int8_t)((sign > 0.0) - (sign < 0.0));
+            out_.residual[row[lane]] = block.measures.residual[lane];
+            out_.iterations[row[lane]] = (int64_t)block.steps[lane];
+            out_.status[row[lane]] = (int8_t)block.status[lane];
+            out_.sign[row[lane]] = (int8_t)((sign > 0.0) - (sign < 0.0));
         }
     }
 
@@ -340,6 +292,7 @@ class Solver {
     const SolveOutput &out_;
     const Division &division_;
     const Equations &equations_;
+    const RodEquations rods_;
     const Workspace &space_;
     SharedFactor shared_;
     int64_t shared_unit_ = -1;
@@ -354,6 +307,10 @@ inline int solve(const int64_t *structure, const double *numbers, const SolveInp
     int64_t blocks = 1, units = 1;
     if (input.task) {
         blocks = Solver::ROWS_OF_TASK / W < division.blocks() ? Solver::ROWS_OF_TASK / W : division.blocks();
+        units = blocks / division.blocks_of_unit() + 2;
+    }
+    if (!input.task && division.blocks() > 1) {
+        blocks = Solver::PAIR;
         units = blocks / division.blocks_of_unit() + 2;
     }
     Workspace space(program, division, input.task ? loopcal::MOST_CONDITIONS : 0, blocks, units);

@@ -48,7 +48,7 @@ struct Target {
 
 class TargetCloser {
   public:
-    TargetCloser(const Program &program, const Equations &equations, Solver &solver, RowBlock &block,
+    TargetCloser(const Program &program, const RodEquations &equations, Solver &solver, RowBlock &block,
                  const Target &target, const loopcal::ReachOutput &out, int64_t n)
         : program_(program), equations_(equations), solver_(solver), block_(block), target_(target),
           out_(out), n_(n) {}
@@ -92,23 +92,19 @@ class TargetCloser {
             square = square + left * left;
         }
         Lanes residual = root(square), status = judge_closed(residual, program_.size);
+        int64_t rows[W];
+        double *to[W];
+        for (int lane = 0; lane < W; lane++) rows[lane] = row + lane;
+        write_platforms(T, rows, used, out_.T);
         for (int lane = 0; lane < used; lane++) {
-            double *to = out_.T + 16 * (row + lane);
-            for (int i = 0; i < 3; i++) {
-                for (int j = 0; j < 3; j++) to[4 * i + j] = T[3 * i + j][lane];
-                to[4 * i + 3] = T[9 + i][lane];
-                to[12 + i] = 0.0;
-            }
-            to[15] = 1.0;
             out_.residual[row + lane] = residual[lane];
             out_.status[row + lane] = (int8_t)status[lane];
         }
         const Lanes *value = theta;
         for (int g = 0; g < program_.groups; g++) {
             int limbs = program_.group[g].limbs;
-            for (int lane = 0; lane < used; lane++)
-                for (int k = 0; k < limbs; k++)
-                    out_.joints[g][(row + lane) * limbs + k] = value[k][lane];
+            for (int lane = 0; lane < W; lane++) to[lane] = out_.joints[g] + (row + lane) * limbs;
+            write_rows(value, limbs, used, to);
             value += limbs;
         }
     }
@@ -135,7 +131,7 @@ class TargetCloser {
     }
 
     const Program &program_;
-    const Equations &equations_;
+    const RodEquations &equations_;
     Solver &solver_;
     RowBlock &block_;
     const Target &target_;
@@ -168,7 +164,8 @@ inline int reach(const int64_t *structure, const double *numbers, const loopcal:
     Solver solver(program, input, none, division, equations, space);
     Target target{arrays[2], columns, {}};
     read_platform(base, target.base);
-    TargetCloser closer(program, equations, solver, *space.block, target, out, n);
+    RodEquations rods(program);
+    TargetCloser closer(program, rods, solver, *space.block, target, out, n);
     Begin begin;
     PlacedUnit &placed = *space.unit;
     for (int64_t i = 0; i < t; i++) {
@@ -176,7 +173,7 @@ inline int reach(const int64_t *structure, const double *numbers, const loopcal:
         if (!i || arrays[0].trial || arrays[1].trial) {
             double platform[12];
             read_platform(locate(arrays[1], i, 0), platform);
-            begin.prepare(program, equations, placed.numbers(), platform);
+            begin.prepare(program, rods, placed.numbers(), platform);
         }
         closer.close(i, begin, *locate(arrays[3], i, 0), placed.numbers());
     }
