@@ -23,7 +23,7 @@ from tests.engine.cases import (
     rotation,
     unknown_joint_values,
 )
-from tests.jacobians import check_jacobian
+from tests.jacobians import check_jacobian, compile_quickly
 
 # [size per size]: closure of 1e-13 times a condition of some tens, over a step of some 1e-4
 RESIDUAL = 3e-8
@@ -101,7 +101,7 @@ def compile_limb_derivative(letters, ending, chosen, slots, size):
         moved = homogeneous(jnp, rotation(jnp, twist[:3]) @ T[:3, :3], T[:3, 3] + twist[3:])
         return limb_residual(jnp, limb, 0, size, moved, joints, own)
 
-    return jax.jit(jax.jacfwd(rows))
+    return compile_quickly(jax.jacfwd(rows))
 
 
 @pytest.mark.parametrize(
