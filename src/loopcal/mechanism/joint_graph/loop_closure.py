@@ -101,6 +101,26 @@ class JointGraph:
         return {body: i for i, body in enumerate(self.bodies)}
 
     @cached_property
+    def _carriers(self) -> list[int]:
+        """Return the number of the first body of each joint of the tree."""
+        return [self._index[joint.body_a] for joint in self.tree]
+
+    @cached_property
+    def _axes(self) -> FloatArray:
+        """Axes (j, 3) of the joints of the tree in their frames."""
+        return np.reshape([joint.axis for joint in self.tree], (-1, 3))
+
+    @cached_property
+    def _frames(self) -> FloatArray:
+        """Frames (j, 4, 4) of the joints of the tree in their first bodies."""
+        return np.reshape([joint.T_a for joint in self.tree], (-1, 4, 4))
+
+    @cached_property
+    def _back(self) -> FloatArray:
+        """Second bodies (j, 4, 4) of the joints of the tree in the frames of the joints."""
+        return geometry.invert_pose(np.reshape([joint.T_b for joint in self.tree], (-1, 4, 4)))
+
+    @cached_property
     def _is_below(self) -> BoolArray:
         """Which joints (j,) of the tree move each body (bodies, j)."""
         below = np.zeros((len(self.bodies), len(self.tree)), dtype=bool)
@@ -113,13 +133,20 @@ class JointGraph:
         """Return the places of all bodies and joints at joint values (n, j)."""
         n, j = q.shape
         T = np.tile(np.eye(4), (n, j + 1, 1, 1))
-        axes, points = np.zeros((n, j, 3)), np.zeros((n, j, 3))
-        for i, joint in enumerate(self.tree):
-            carrier = T[:, self._index[joint.body_a]]
-            T[:, i + 1] = carrier @ joint.move(q[:, i]) @ geometry.invert_pose(joint.T_b)
-            frame = carrier @ joint.T_a
-            axes[:, i], points[:, i] = frame[:, :3, :3] @ joint.axis, frame[:, :3, 3]
+        moves = self._move_all(q)
+        for i, carrier in enumerate(self._carriers):
+            T[:, i + 1] = T[:, carrier] @ moves[:, i] @ self._back[i]
+        frames = T[:, self._carriers] @ self._frames
+        axes = (frames[..., :3, :3] @ self._axes[:, :, None])[..., 0]
+        points = frames[..., :3, 3]
         return Placement(T, axes, points)
+
+    def _move_all(self, q: FloatArray) -> FloatArray:
+        """Return the frames (n, j, 4, 4) of the second bodies of the joints in the first ones."""
+        vectors = q[..., None] * self._axes
+        turns = np.where(self.turns[:, None], vectors, 0.0)
+        shifts = np.where(self.turns[:, None], 0.0, vectors)
+        return self._frames @ geometry.make_pose(geometry.exp_so3(turns), shifts)
 
     def get_place(self, placement: Placement, body: str) -> FloatArray:
         """Return the places (n, 4, 4) of a body."""

@@ -201,77 +201,90 @@ class UrdfSolver:
         self.values = np.zeros(n)
         driven = [i for name in self.motors for i in range(n)[self.columns[name]]]
         self.driven, self.free = np.array(driven), np.setdiff1d(np.arange(n), driven)
+        self.order, self.root_link = self._order_joints()
+        self.origins = {name: read_origin(j.find("origin")) for name, j in self.joints.items()}
+
+    def _order_joints(self) -> tuple[list[tuple[str, str, str]], str]:
+        """Return (name, parent, child) of all joints, each after its parent, and the root link."""
+        ends = {n: (find_link(j, "parent"), find_link(j, "child")) for n, j in self.joints.items()}
+        children = {child for _, child in ends.values()}
+        links = [link.attrib["name"] for link in self.root.findall("link")]
+        root = next(link for link in links if link not in children)
+        order: list[tuple[str, str, str]] = []
+        placed, left = {root}, dict(ends)
+        while left:
+            for name, (parent, child) in list(left.items()):
+                if parent in placed:
+                    order.append((name, parent, child))
+                    placed.add(child)
+                    del left[name]
+        return order, root
 
     def place(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the poses of all links in the base."""
-        left = dict(self.joints)
-        children = {find_link(joint, "child") for joint in left.values()}
-        links = [link.attrib["name"] for link in self.root.findall("link")]
-        T = {next(link for link in links if link not in children): np.eye(4)}
-        while left:
-            for name, joint in list(left.items()):
-                parent = find_link(joint, "parent")
-                if parent in T:
-                    origin = read_origin(joint.find("origin"))
-                    motion = self._move(name, joint, values[self.columns[name]])
-                    T[find_link(joint, "child")] = T[parent] @ origin @ motion
-                    del left[name]
+        """Return the poses (..., 4, 4) of all links in the base at joint values (..., n)."""
+        T = {self.root_link: np.eye(4)}
+        for name, parent, child in self.order:
+            motion = self._move(name, self.joints[name], values[..., self.columns[name]])
+            T[child] = T[parent] @ self.origins[name] @ motion
         return T
 
     def _move(self, name: str, joint: ET.Element, value: np.ndarray) -> np.ndarray:
         kind: str = self.overrides.get(name, joint.attrib["type"])
-        if not value.size:
-            return np.eye(4)
-        if kind == "SPHERICAL":
-            return make_pose(Rotation.from_rotvec(value).as_matrix(), np.zeros(3))
-        if "UJOINT" in kind:
-            return make_pose(Rotation.from_euler(kind[-2:], value).as_matrix(), np.zeros(3))
+        motion = np.tile(np.eye(4), (*value.shape[:-1], 1, 1))
+        if not value.shape[-1]:
+            return motion
         axis = read_vector(joint.find("axis"), (1.0, 0.0, 0.0))
         axis /= np.linalg.norm(axis)
-        if kind == "prismatic":
-            return make_pose(np.eye(3), value[0] * axis)
-        return make_pose(Rotation.from_rotvec(value[0] * axis).as_matrix(), np.zeros(3))
+        if kind == "SPHERICAL":
+            motion[..., :3, :3] = Rotation.from_rotvec(value).as_matrix()
+        elif "UJOINT" in kind:
+            motion[..., :3, :3] = Rotation.from_euler(kind[-2:], value).as_matrix()
+        elif kind == "prismatic":
+            motion[..., :3, 3] = value * axis
+        else:
+            motion[..., :3, :3] = Rotation.from_rotvec(value * axis).as_matrix()
+        return motion
 
     def _residual(self, values: np.ndarray) -> np.ndarray:
+        """Return how far the loops are from closed (..., e), at joint values (..., n)."""
         T = self.place(values)
+        T = {link: np.broadcast_to(one, (*values.shape[:-1], 4, 4)) for link, one in T.items()}
         parts = []
         for pair, kind in zip(self.pairs, self.kinds, strict=True):
             A, B = (T[find_link(self.joints[n], "child") if n in self.joints else n] for n in pair)
-            parts.append(A[:3, 3] - B[:3, 3])
+            parts.append(A[..., :3, 3] - B[..., :3, 3])
             if kind == "6d":
-                parts.append(Rotation.from_matrix(A[:3, :3].T @ B[:3, :3]).as_rotvec())
+                parts.append(measure_turn(A, B))
         for constraint in self.root.findall("constraint"):
             A, B = (
                 T[find_link(constraint, end)] @ read_origin(constraint.find(f"{end}_origin"))
                 for end in ("parent", "child")
             )
-            parts.append(A[:3, 3] - B[:3, 3])
-            R = A[:3, :3].T @ B[:3, :3]
+            parts.append(A[..., :3, 3] - B[..., :3, 3])
+            R = A[..., :3, :3].swapaxes(-1, -2) @ B[..., :3, :3]
             first, second = (
                 read_vector(constraint.find(f"{end}_axis"), (0.0, 0.0, 1.0))
                 for end in ("parent", "child")
             )
             if constraint.get("type") == "fixed":
-                parts.append(Rotation.from_matrix(R).as_rotvec())
+                parts.append(measure_turn(A, B))
             elif constraint.get("type") == "revolute":
                 parts.append(np.cross(first, R @ first))
             elif constraint.get("type") == "universal":
-                parts.append(np.array([first @ R @ second]))
-        return np.concatenate(parts)
+                parts.append((R @ second @ first)[..., None])
+        return np.concatenate(parts, axis=-1)
 
     def solve(self, q: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
         """Return all joint values with the motors at q, with idle motions as at the start."""
         values = np.zeros(len(self.values)) if start is None else start.copy()
         values[self.driven] = q
+        step = 1e-7
+        steps = step * np.eye(len(values))[self.free]
         r = self._residual(values)
         for _ in range(25):
             if np.abs(r).max() < 1e-14:
                 break
-            J = np.empty((len(r), len(self.free)))
-            for column, i in enumerate(self.free):
-                moved = values.copy()
-                moved[i] += 1e-7
-                J[:, column] = (self._residual(moved) - r) / 1e-7
+            J = (self._residual(values + steps) - r).T / step
             values[self.free] -= np.linalg.lstsq(J, r, rcond=1e-6)[0]
             r = self._residual(values)
         assert np.abs(r).max() < 1e-11  # [m, rad]
@@ -287,6 +300,12 @@ def find_link(element: ET.Element, end: str) -> str:
     found = element.find(end)
     assert found is not None
     return found.attrib["link"]
+
+
+def measure_turn(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors (..., 3) [rad] between poses (..., 4, 4)."""
+    R = A[..., :3, :3].swapaxes(-1, -2) @ B[..., :3, :3]
+    return Rotation.from_matrix(R).as_rotvec()
 
 
 def read_origin(origin: ET.Element | None) -> np.ndarray:
