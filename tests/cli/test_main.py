@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line as a whole: help texts, imports, error messages and exit codes."""
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -127,3 +128,9 @@ def test_closed_output_pipe_causes_no_traceback() -> None:
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait() == 1
+
+
+def test_command_line_called_from_python_leaves_the_garbage_collection_as_it_was(capsys) -> None:
+    before = gc.get_threshold()
+    assert main(["check", "hexapod-42"]) == 0
+    assert gc.get_threshold() == before

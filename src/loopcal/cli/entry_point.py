@@ -9,7 +9,6 @@ Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met, 3 a
 
 from __future__ import annotations
 
-import gc
 import keyword
 import os
 import sys
@@ -95,12 +94,6 @@ MODULES = {
 }
 """Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
 
-
-COLLECTED_AT = 100_000
-"""New objects after which Python looks for reference cycles. With its own number, 700, it does so
-hundreds of times while modules are imported, in a tenth of the time of a short command, and finds
-nothing.
-"""
 
 NO_PLUGINS = ("PYDANTIC_DISABLE_PLUGINS", "__all__")
 """The records of loopcal need no plugins of pydantic, which are searched in all installed packages.
@@ -199,7 +192,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     os.environ.update(dict.fromkeys(THREADS, "1"))
     os.environ.setdefault(*NO_PLUGINS)
-    gc.set_threshold(COLLECTED_AT)
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_streams()
     command = None

@@ -336,9 +336,10 @@ def minimize_by_halving(
             if is_part_worse is not None:
                 parts = parts & is_part_worse(point, candidate)
             share = np.where(parts, (0.5 if attempt < control.attempts - 1 else 0.0) * share, share)
-        gained = point.cost - candidate.cost
-        promised = step.change > control.stuck * point.cost
-        stuck |= promised & ~(gained > control.stuck * step.change)
+        with np.errstate(invalid="ignore"):  # infinite sums of squares, which cannot be evaluated
+            gained = point.cost - candidate.cost
+            promised = step.change > control.stuck * point.cost
+            stuck |= promised & ~(gained > control.stuck * step.change)
         point = candidate
         if not share.any():
             break

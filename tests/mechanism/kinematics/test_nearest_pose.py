@@ -2,10 +2,14 @@
 """The inverse kinematics of an unreachable pose returns the nearest reachable one."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Status, inverse, read_coordinates
+from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.mechanism import POSITION, Status, inverse, read_coordinates
+from loopcal.mechanism.kinematics.nearest_pose import controls_all
 from tests import zoo
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
@@ -61,3 +65,53 @@ def test_hexapod_reaches_the_target_pose_exactly():
     assert_allclose(
         geometry.pose_difference(inverse(zoo.hexapod(), sol.T).T, sol.T), 0.0, atol=1e-15
     )
+
+
+def list_robots_with_few_freedoms():
+    """Shipped robots whose controlled coordinates do not state each freedom of the platform."""
+    return [name for name in list_shipped_robots() if not controls_all(load_robot(name))]
+
+
+def make_far_poses(robot, far, n):
+    """Draw poses `far` sizes and `far` rad away from home, in random directions."""
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=(n, 2, 3))
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    twist = np.concatenate([direction[:, 0], robot.size * direction[:, 1]], axis=1) * far
+    return geometry.apply_twist(np.broadcast_to(robot.home_state.T[0, 0], (n, 4, 4)), twist)
+
+
+@pytest.mark.parametrize("name", list_robots_with_few_freedoms())
+def test_projection_is_converged_only_where_the_distance_is_stationary(name):
+    """The gradient by central differences of inverse solutions vanishes where a row is converged,
+    for targets up to two sizes and 2 rad away from home.
+    """
+    robot, n = load_robot(name), 20
+    target = np.concatenate([make_far_poses(robot, far, n // 2) for far in (0.05, 2.0)])
+    sol = inverse(robot, target)
+    done = sol.converged
+    assert done[: n // 2].sum() >= 0.9 * (n // 2)  # the near ones are not merely given up
+    assert not np.isin(sol.status, Status.NOT_FINITE).any()
+    end, target = sol.take(done), target[done]
+    at = read_coordinates(end.T, robot.controlled)
+    distance, h = squared_distance(robot, end.T, target), 1e-5  # [rad] or a share of the size
+    for i, coordinate in enumerate(robot.controlled):
+        step = np.zeros(len(at[0]))
+        step[i] = h * (robot.size if coordinate in POSITION else 1.0)
+        ahead, behind = (inverse(robot, at + sign * step, end) for sign in (1, -1))
+        both = ahead.converged & behind.converged
+        slope = (
+            squared_distance(robot, ahead.T, target) - squared_distance(robot, behind.T, target)
+        ) / (2 * h)
+        # the share 1e-6 of the distance that the search allows, at a lever of at most 3 sizes,
+        # the error of differences, and what rounding of the distances leaves
+        limit = 1e-5 * robot.size * np.sqrt(distance) + 1e-8 * (robot.size**2 + distance)
+        assert (np.abs(slope) <= limit)[both].all()
+
+
+def test_projection_that_ends_at_the_limit_of_the_reach_says_so():
+    sol = inverse(load_robot("ru-pus-prs"), make_far_poses(load_robot("ru-pus-prs"), 2.0, 20))
+    codes = {
+        sol.explain(int(row)).code for row in np.flatnonzero(sol.status == Status.NOT_CONVERGED)
+    }
+    assert "kinematics.not-nearest" in codes

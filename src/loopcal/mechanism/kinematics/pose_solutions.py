@@ -93,12 +93,13 @@ class Solution(TableResult):
     def explain(self, row: int) -> Finding:
         """Return how a row ended."""
         status, gap = Status(int(self.status[row])), float(self.residual[row])
-        is_compromise = status == Status.CONVERGED and gap > COMPROMISE
+        code = status.code
+        if status == Status.CONVERGED and gap > COMPROMISE:
+            code = "kinematics.compromise"
+        elif status == Status.NOT_CONVERGED and gap <= COMPROMISE:
+            code = "kinematics.not-nearest"
         return report_finding(
-            "kinematics.compromise" if is_compromise else status.code,
-            row=row,
-            gap=Quantity(gap * 1e3, "mm"),
-            iterations=int(self.iterations[row]),
+            code, row=row, gap=Quantity(gap * 1e3, "mm"), iterations=int(self.iterations[row])
         )
 
 
