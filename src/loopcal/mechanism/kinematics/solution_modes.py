@@ -167,12 +167,12 @@ def judge_modes(
         return state, np.zeros(state.T.shape[1], bool)
     if robot.has_open_sums:
         return _judge_by_readings(robot, state, begin)
-    e, _ = robot.slots(robot.values[None])
     begin, n = clear_sign(robot, begin), state.T.shape[1]
     closed = state.status[0] == Status.CONVERGED
     if arrives is not None:
         sign, is_sure = state.closure_sign[0], arrives
     else:
+        e, _ = robot.slots(robot.values[None])
         sign = engine.certify(robot.program, e, begin, state)[0]
         is_sure = sign != 0
         if not is_sure.all():
