@@ -138,6 +138,17 @@ class Program:
         ]
 
     @cached_property
+    def shared_drives(self) -> int:
+        """Number of driven joints beyond one for each actuator."""
+        driven = sum(int((columns >= 0).sum()) for g in self.groups for columns in g.actuator)
+        return driven - self.n_joints
+
+    @cached_property
+    def has_square_limbs(self) -> bool:
+        """Whether each limb has as many unknown joints as equations, drives among them."""
+        return all(len(g.rows) == len(g.unknown_joints(free=True)) for g in self.groups)
+
+    @cached_property
     def with_fixed_platform(self) -> Program:
         """The same limbs with a platform that stays where the start has it."""
         return replace(self, freedoms=())

@@ -25,11 +25,7 @@ from loopcal.mechanism.compilation.mobility import (
 )
 from loopcal.mechanism.compilation.over_constraint import report_over_constraint
 from loopcal.mechanism.compilation.possible_values import check_nominal_values
-from loopcal.mechanism.kinematics.batch_kinematics import (
-    compute_closure_sign,
-    count_shared_drives,
-    inverse_trials,
-)
+from loopcal.mechanism.kinematics.batch_kinematics import compute_closure_sign, inverse_trials
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
@@ -374,7 +370,7 @@ def _find_home(robot: Mechanism) -> State:
         Too few controlled coordinates, or loops that cannot be closed.
     """
     program, values = robot.program, robot.values[None]
-    shared = count_shared_drives(program)
+    shared = program.shared_drives
     movable = len(program.freedoms) - program.count_equations(free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(

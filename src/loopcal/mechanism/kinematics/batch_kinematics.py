@@ -227,7 +227,7 @@ def determine_platform(robot: Mechanism) -> bool:
     They are all freedoms of the platform, of which the others keep their values at home, and each
     limb has as many unknown joints as equations.
     """
-    if any(len(g.rows) != len(g.unknown_joints(free=True)) for g in robot.program.groups):
+    if not robot.program.has_square_limbs:
         return False
     if len(robot.controlled) == 6:
         return True
@@ -272,13 +272,7 @@ def needs_readings(program: Program) -> bool:
     """Return whether the inverse solution is one for readings: joints with a shared drive would
     part, and where loops may stay open, a free actuator would take a part of the gap.
     """
-    return program.may_stay_open or count_shared_drives(program) > 0
-
-
-def count_shared_drives(program: Program) -> int:
-    """Return the number of driven joints beyond one for each actuator."""
-    driven = sum(int((columns >= 0).sum()) for g in program.groups for columns in g.actuator)
-    return driven - program.n_joints
+    return program.may_stay_open or program.shared_drives > 0
 
 
 def _inverse_by_readings(
@@ -313,7 +307,7 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
 
     With shared drives, coordinates that are not controlled are those of the start.
     """
-    if not count_shared_drives(robot.program):
+    if not robot.program.shared_drives:
         shaped = target.reshape(*start.T.shape[:2], -1)
         return _close_with_free_actuators(robot, values, shaped, start, start)
     e, _ = robot.slots(values)

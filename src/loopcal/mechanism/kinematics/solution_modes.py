@@ -65,9 +65,11 @@ def solve_in_mode(
     begin = start or robot.home_state
     state, arrives = solve(target, start)
     state, is_other = judge_modes(robot, state, begin, arrives)
-    state = _mark_other(state, is_other)
     rows = np.flatnonzero(is_other)
-    if not len(rows) or has_one_solution(robot):
+    if not len(rows):
+        return state
+    state = _mark_other(state, is_other)
+    if has_one_solution(robot):
         return state
     first = select_poses(repeat_poses(begin, len(is_other)), rows)
     near, arrived = _follow_poses(robot, first, state.T[0, rows])
