@@ -130,6 +130,16 @@ INLINE void write_platforms(const Lanes *from, const int64_t *row, int used, dou
     write_rows(whole, 16, used, to);
 }
 
+// Write a number of each of the first `used` lanes to rows that follow each other, as a byte.
+INLINE void write_bytes(Mask from, int used, void *to) {
+    typedef int8_t Bytes __attribute__((vector_size(LANES)));
+    Bytes bytes = __builtin_convertvector(from, Bytes);
+    if (used == W)
+        std::memcpy(to, &bytes, W);
+    else
+        for (int lane = 0; lane < used; lane++) static_cast<int8_t *>(to)[lane] = bytes[lane];
+}
+
 // Rotation (9) and position (3) of one T (4, 4).
 inline void read_platform(const double *T, double *out) {
     for (int i = 0; i < 3; i++) {

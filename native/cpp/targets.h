@@ -66,12 +66,12 @@ class TargetCloser {
             target_.place(trials, pose, T);
             Mask proven = reaches(begin, program_.size, T, distance);
             write(trial * n_ + first, used, placed, T, distance);
-            for (int lane = 0; lane < used; lane++) {
-                int64_t row = trial * n_ + first + lane;
-                out_.arrives[row] = proven[lane] != 0;
-                out_.sign[row] = proven[lane] ? (int8_t)begin.sign : 0;
-                if (!proven[lane]) pending[open++] = first + lane;
-            }
+            write_bytes(proven & 1, used, out_.arrives + trial * n_ + first);
+            Lanes sign_there = select(proven, splat(begin.sign), Lanes{});
+            write_bytes(__builtin_convertvector(sign_there, Mask), used, out_.sign + trial * n_ + first);
+            if (any(~proven))
+                for (int lane = 0; lane < used; lane++)
+                    if (!proven[lane]) pending[open++] = first + lane;
             bool is_last = first + W >= n_;
             while (open >= W || (is_last && open)) {
                 int count = open < W ? open : W;
@@ -96,10 +96,11 @@ class TargetCloser {
         double *to[W];
         for (int lane = 0; lane < W; lane++) rows[lane] = row + lane;
         write_platforms(T, rows, used, out_.T);
-        for (int lane = 0; lane < used; lane++) {
-            out_.residual[row + lane] = residual[lane];
-            out_.status[row + lane] = (int8_t)status[lane];
-        }
+        write_bytes(__builtin_convertvector(status, Mask), used, out_.status + row);
+        if (used == W)
+            store(out_.residual + row, residual);
+        else
+            for (int lane = 0; lane < used; lane++) out_.residual[row + lane] = residual[lane];
         const Lanes *value = theta;
         for (int g = 0; g < program_.groups; g++) {
             int limbs = program_.group[g].limbs;

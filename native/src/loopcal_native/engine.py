@@ -301,8 +301,12 @@ class NativeFunctions:
 
 def is_closed_at_once(program: Program) -> bool:
     """Return whether `reach` of the library takes it: driven rods alone, an actuator for each."""
-    driven = [column for group in program.groups for column in group.actuator.ravel().tolist()]
-    return has_driven_rods(program) and sorted(driven) == list(range(program.n_joints))
+    kept = vars(program).get("_native_rods")
+    if kept is None:
+        driven = [column for group in program.groups for column in group.actuator.ravel().tolist()]
+        kept = has_driven_rods(program) and sorted(driven) == list(range(program.n_joints))
+        vars(program)["_native_rods"] = kept
+    return kept
 
 
 def _require_start(program: Program, e: FloatArray, T: FloatArray, t: int) -> None:

@@ -112,18 +112,19 @@ def allocate(*parts: tuple[tuple[int, ...], type]) -> list[np.ndarray]:
     The C library keeps the memory of a freed array for the next one of its size. Several arrays
     would exceed what it keeps: new pages from the system cost as much as the kinematics.
     """
-    sizes = [math.prod(shape) * np.dtype(kind).itemsize for shape, kind in parts]
-    ends = np.cumsum([-(-size // LINE) * LINE for size in sizes])
-    memory = np.empty(int(ends[-1]) // 8)
-    offsets = [0, *ends[:-1].tolist()]
+    at, offsets = 0, []
+    for shape, kind in parts:
+        offsets.append(at)
+        at += -(-math.prod(shape) * np.dtype(kind).itemsize // LINE) * LINE
+    memory = np.empty(at // 8)
     return [np.ndarray(*part, memory, at) for part, at in zip(parts, offsets, strict=True)]
 
 
 def describe(array: np.ndarray) -> Strided:
     """Return the address and the strides of an array of `as_reals`, which must be kept."""
-    size = array[0, 0].size if array.ndim > 2 else array.shape[-1]
+    address = array.ctypes.data
     if array.ndim == 2:  # (t | 1, numbers)
-        return Strided(array.ctypes.data, size if len(array) > 1 else 0, 0)
-    poses = array.shape[1]
-    trial = size * poses if len(array) > 1 else 0
-    return Strided(array.ctypes.data, trial, size if poses > 1 else 0)
+        return Strided(address, array.shape[1] if len(array) > 1 else 0, 0)
+    trials, poses = array.shape[:2]
+    size = math.prod(array.shape[2:])
+    return Strided(address, size * poses if trials > 1 else 0, size if poses > 1 else 0)
