@@ -426,7 +426,17 @@ def test_data_of_another_robot_give_a_note(tmp_path, capsys, stated, noted) -> N
         ("simulate r.yaml", "Missing option '-o' / '--output'.", "see loopcal simulate --help"),
         (
             "calibrate r.yaml d.csv -o run --hold-out 1.5",
-            "'--hold-out': 1.5 is not in the range",
+            "'--hold-out': it is 1.5, which is not a share of the poses, from 0 to below 1;",
+            "see loopcal calibrate --help",
+        ),
+        (
+            "calibrate r.yaml d.csv -o run --hold-out 10",
+            "write 0.1 for 10 %, or the number of poses to hold out divided by that of all poses.",
+            "see loopcal calibrate --help",
+        ),
+        (
+            "calibrate r.yaml d.csv -o run --hold-out=-0.1",
+            "-0.1, which is not a share of the poses, from 0 to below 1; write 0.25 for a quarter",
             "see loopcal calibrate --help",
         ),
         (

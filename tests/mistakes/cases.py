@@ -123,7 +123,7 @@ THREE_RRR = {
     "a share is given in percent": Mistake(
         keep_files,
         1,
-        ("'--hold-out': 25.* not in the range",),
+        ("'--hold-out': it is 25, .* share .* write 0.25 for 25 %",),
         command=CALIBRATE.replace("0.25", "25"),
     ),
     "one reading is missing": Mistake(

@@ -132,6 +132,11 @@ class Measurements(TableResult):
         return sum(rows.n_residuals for rows in self.observations)
 
     @property
+    def n_base_rows(self) -> int:
+        """Number of scalar residuals of targets on the base that count."""
+        return sum(rows.n_residuals for rows in self.base_observations)
+
+    @property
     def repeats(self) -> IntArray:
         """(n,) number of the pose that each pose repeats: equal ones have the same readings."""
         rounded = np.round(self.readings / SAME_READING)

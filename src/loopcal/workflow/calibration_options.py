@@ -18,6 +18,22 @@ from loopcal.measure.array_checks import check_number, check_type
 from loopcal.mechanism import Mechanism
 
 
+def describe_wrong_share(share: float) -> str:
+    """Return what is wrong with a share of held-out poses; empty where nothing is.
+
+    A number from 1 to below 100 was probably meant in percent, or as a number of poses.
+    """
+    if 0.0 <= share < 1.0:
+        return ""
+    fault = f"{share:g}, which is not a share of the poses, from 0 to below 1"
+    if not 1.0 <= share < 100.0:
+        return f"{fault}; write 0.25 for a quarter"
+    return (
+        f"{fault}; write {share / 100:g} for {share:g} %, or the number of poses to hold out "
+        "divided by that of all poses"
+    )
+
+
 @dataclass(frozen=True)
 class CalibrationOptions:
     """Options of `calibrate`. Every field has a default.
@@ -64,10 +80,8 @@ class CalibrationOptions:
         check_type(self.fit, FitOptions, "fit", "such as FitOptions(method=MAP())")
         check_number(self.hold_out, "hold_out", "a share of the poses, from 0 to below 1")
         check_seed(self.seed)
-        if not 0.0 <= self.hold_out < 1.0:
-            raise DataError(
-                f"hold_out is {self.hold_out}; it is a share of the poses, from 0 to below 1"
-            )
+        if fault := describe_wrong_share(self.hold_out):
+            raise DataError(f"hold_out is {fault}")
         object.__setattr__(self, "held_out", check_labels("held_out", self.held_out))
         if self.hold_out and self.held_out:
             raise DataError(

@@ -17,6 +17,7 @@ from loopcal.cli.options.fit_options import fit_options, make_fit_options
 from loopcal.cli.options.shared_options import (
     FILE,
     Count,
+    PoseShare,
     data_argument,
     data_options,
     file_option,
@@ -56,7 +57,7 @@ TAKEN_OPTIONS = (
 @file_option("-o", "--output", help="Run folder to make.", required=True)
 @click.option(
     "--hold-out",
-    type=click.FloatRange(0, 1, max_open=True),
+    type=PoseShare(),
     default=0.0,
     metavar="SHARE",
     help="Share of the poses to keep out of the fit for validation, such as 0.25. The poses are "

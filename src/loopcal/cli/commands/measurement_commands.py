@@ -266,6 +266,9 @@ def simulate(
     Without --poses, the poses are drawn evenly from the workspace of ROBOT. The true machine has
     the identified values of ROBOT, or drawn ones with --draw-errors.
 
+    Targets that are fixed to the base (`of: base` in the settings of a file) are measured with
+    --fill only: name the sheet that `loopcal plan --like` wrote from such a file.
+
     \b
     Examples:
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
@@ -305,20 +308,37 @@ def simulate(
     if draw_errors and not any(p.free and p.tolerance for p in machine.parameters.entries):
         finding = report_finding("data.no-errors-drawn", robot=machine.name)
         terminal.print_note(str(finding))
-    counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
     if as_json:
-        terminal.print_json({"output": output, "truth": truth, **counts, "skipped": result.skipped})
-        return
-    n_poses, n_rows = counts["n_poses"], counts["n_rows"]
-    summary = f"{n_poses} poses of {machine.name}, {n_rows} measured values, seed {seed}"
-    page = [f"{output}: {summary}"]
+        terminal.print_json({"output": output, "truth": truth, **_count(result, seed)})
+    else:
+        terminal.print_page(_summarize(result, machine.name, f"{output}", seed))
+
+
+def _count(result: SimulatedMeasurements, seed: int) -> dict[str, Any]:
+    """Return what was simulated, for JSON."""
+    data = result.data
+    return {
+        "n_poses": data.n_poses,
+        "n_rows": data.n_rows,
+        "n_base_rows": data.n_base_rows,
+        "seed": seed,
+        "skipped": result.skipped,
+    }
+
+
+def _summarize(result: SimulatedMeasurements, robot: str, output: str, seed: int) -> list[str]:
+    """Return the lines that say what was simulated."""
+    n_poses, values = result.data.n_poses, f"{result.data.n_rows} measured values"
+    if result.data.n_base_rows:
+        values += f" and {result.data.n_base_rows} of targets on the base"
+    page = [f"{output}: {n_poses} poses of {robot}, {values}, seed {seed}"]
     if result.skipped:
         count, names = len(result.skipped), ", ".join(result.skipped)
         page.append(
             f"{count} of {count + n_poses} poses are outside its reach or strokes and are skipped: "
             f"{names}"
         )
-    terminal.print_page(page)
+    return page
 
 
 def _fill_in(

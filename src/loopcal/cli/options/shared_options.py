@@ -116,6 +116,21 @@ class Count(click.IntRange):
         return int(number)
 
 
+class PoseShare(click.types.FloatParamType):
+    """A share of the poses on the command line, from 0 to below 1."""
+
+    name = "share"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the share, or fail with what is allowed and what was probably meant."""
+        from loopcal.workflow.calibration_options import describe_wrong_share
+
+        share = super().convert(value, param, ctx)
+        if fault := describe_wrong_share(share):
+            self.fail(f"it is {fault}.", param, ctx)
+        return share
+
+
 LENGTH = Quantity(Dimension.LENGTH)
 ANGLE = Quantity(Dimension.ANGLE)
 POSITIVE_LENGTH = Quantity(Dimension.LENGTH, is_positive=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from loopcal.errors import DataError, FileError
+from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import report_finding
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_writer import save_measurements
@@ -46,7 +46,11 @@ def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
     try:
         return build_robot(parse_yaml(imported.robot_text, path, "robot file"))
     except FileError as error:
-        raise FileError(error.sentence, path) from error
+        raise FileError(imported.doubt or error.sentence, path) from error
+    except MechanismError as error:
+        if imported.doubt is None:
+            raise
+        raise FileError(imported.doubt, path) from error
 
 
 def save_imported(path: Path, imported: Imported, output: Path, data: Path | None) -> Mechanism:

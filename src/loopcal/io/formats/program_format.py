@@ -87,11 +87,13 @@ class Imported:
     ----------
     robot_text : text of the robot file. measurements : of the file; None where it has none.
     findings : assumptions, and content that a robot file cannot express.
+    doubt : what is probably wrong with the file where the robot cannot be built.
     """
 
     robot_text: str
     measurements: Measurements | None = None
     findings: tuple[Finding, ...] = ()
+    doubt: Finding | None = None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.errors import LoopcalError
+from loopcal.errors import FileError, LoopcalError
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.io.formats.urdf import urdf_format as urdf
@@ -330,3 +330,19 @@ def test_urdf_in_millimeters_is_noticed(tmp_path) -> None:
     pin = PIN.replace('"0.3 0 0"', '"300 0 0"')
     imported = read(tmp_path, large.replace("</robot>", f"{pin}{MOTORS}</robot>"))[0]
     assert "files.urdf-large" in list_codes(imported)
+
+
+@pytest.mark.parametrize("platform", ["arm1", "rod1", "rod2"])
+def test_rigid_closure_at_a_pin_is_named_with_what_to_write_instead(tmp_path, platform) -> None:
+    end = '<link name="end2"/>' + make_joint("end", "rod2", "end2", "0.3 0 0", 1.9, "fixed")
+    text = BARE.replace("</robot>", end + "</robot>")
+    closures = "closed_loop: [[tip_frame, end]]\ntype: [6d]\nname_mot: [mot1, mot2]\n"
+    with pytest.raises(FileError) as refused:
+        read(tmp_path, text, closures, platform)
+    assert refused.value.finding is not None
+    assert refused.value.finding.code == "files.closure-rigid"
+    assert refused.value.finding.data["closures"] == ("tip_frame, end",)
+    if platform != "arm1":  # both motors move it, and the sentence promises this for planar loops
+        robot = read(tmp_path, text, closures.replace("6d", "3d"), platform)[1]
+        q = inverse(robot, robot.home[None]).q
+        assert forward(robot, q + 0.05).converged.all()

@@ -76,12 +76,14 @@ class UrdfMechanism:
     ----------
     urdf : with the joints that the closure file fixes. graph : bodies and joints.
     bodies : rigid bodies that closures make of links. frames : links that close loops only.
+    rigid_closures : frames of the closures of type 6d at whose ends no joint moves.
     """
 
     urdf: Urdf
     graph: JointGraph
     bodies: Bodies
     frames: frozenset[str]
+    rigid_closures: tuple[str, ...] = ()
 
     def locate(self, link: str) -> tuple[str, FloatArray]:
         """Return the rigid body of a link, and T_body_link (4, 4)."""
@@ -145,7 +147,7 @@ def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
         graph = assemble_graph(urdf.root, [bodies.move(joint) for joint in joints], motors)
     except MechanismError as error:
         raise _locate_error(error, urdf, closures) from None
-    return UrdfMechanism(urdf, graph, bodies, ends)
+    return UrdfMechanism(urdf, graph, bodies, ends, _list_rigid_closures(urdf, closures))
 
 
 def _read_closures(path: Path, urdf: Urdf) -> Closures:
@@ -259,6 +261,20 @@ def _build_closure(
         return Weld(pair[0], a, b, T_a, T_b)
     name = pair[0] + BALL_NAME if pair[0] in urdf.joints else pair[0]
     return GraphJoint(name, "S", a, b, T_a, T_b, np.array([0.0, 0.0, 1.0]), near, far)
+
+
+def _list_rigid_closures(urdf: Urdf, closures: Closures) -> tuple[str, ...]:
+    """Return the closures of type 6d both frames of which are fixed to their links.
+
+    A pin is a closure of type 6d only where a revolute joint carries one of its frames.
+    """
+    rigid = []
+    for pair, kind in zip(closures.pairs, closures.kinds, strict=True):
+        links = (_find_link(urdf, name) for name in pair)
+        carriers = [urdf.carrier.get(link) for link in links if link is not None]
+        if kind == WELD and not any(joint is not None and joint.kind for joint in carriers):
+            rigid.append(f"{pair[0]}, {pair[1]}")
+    return tuple(rigid)
 
 
 def _build_constraint(urdf: Urdf, constraint: UrdfConstraint) -> tuple[Weld | GraphJoint, ...]:

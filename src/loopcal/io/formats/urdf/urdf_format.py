@@ -92,7 +92,18 @@ def read(path: Path, options: ImportOptions) -> Imported:
     remark = REMARKS[family]
     head = format_head(path, what, family, options.name, ("m", "rad"), remark)
     text = head + format_robot(mechanism, paths, frame)
-    return Imported(text, None, tuple(_report_structure(mechanism, paths, frame)))
+    findings = tuple(_report_structure(mechanism, paths, frame))
+    return Imported(text, None, findings, _doubt_closures(mechanism, paths))
+
+
+def _doubt_closures(mechanism: UrdfMechanism, paths: StagePaths) -> Finding | None:
+    """Return that rigid closures probably stand for pins, where motors exceed the mobility."""
+    motors, mobility = len(paths.graph.motors), paths.motions.mobility
+    if not mechanism.rigid_closures or motors <= mobility:
+        return None
+    return report_finding(
+        "files.closure-rigid", closures=mechanism.rigid_closures, motors=motors, mobility=mobility
+    )
 
 
 def _find_platform(mechanism: UrdfMechanism, name: str | None) -> tuple[str, str]:
