@@ -20,12 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import engine, geometry
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.geometry.alignment import FLATNESS, align_point_sets
 from loopcal.measure import Measurements, Observations, Position
 from loopcal.numerics.chi_square import compute_chi_square_tail
-from loopcal.numerics.decomposition import are_nonzero
+from loopcal.numerics.decomposition import decompose, empty_factor
 from loopcal.numerics.multiple_tests import compute_any_probability
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import find_unit
@@ -331,15 +331,17 @@ def _spread_motions(rows: FloatArray) -> FloatArray:
 
 
 def _solve(A: FloatArray, b: FloatArray) -> _Solution:
-    """Return the least-squares solution of whitened rows A x = b, of smallest length."""
+    """Return the least-squares solution of whitened rows A x = b, shortest in scaled columns."""
+    rows = np.concatenate([A, b[:, None]], axis=1)
+    factor = engine.fold(empty_factor(1, A.shape[1]), rows[None])
     length = np.linalg.norm(A, axis=0)
-    scale = np.where(length > 0.0, length, 1.0)
-    u, s, vt = np.linalg.svd(A / scale, full_matrices=False)
-    used = are_nonzero(s, RANK)
-    root = (vt[used].T / s[used]) / scale[:, None]
-    part = u[:, used].T @ b
-    rest = b - u[:, used] @ part
-    return _Solution(root @ part, root, float(rest @ rest))
+    scale = 1.0 / np.where(length > 0.0, length, 1.0)
+    decomposition = decompose(factor, np.array([len(A)]), scale=scale, tolerance=RANK)
+    used = decomposition.used
+    penalty = np.where(used, 0.0, np.inf)
+    values = decomposition.deviation(decomposition.solution(penalty))[0]
+    root = scale[:, None] * decomposition.noise_roots(penalty)[0][:, used[0]]
+    return _Solution(values, root, float(decomposition.remaining(penalty)[0]))
 
 
 def _estimate_drift(repeats: _Repeats) -> FrameDrift:

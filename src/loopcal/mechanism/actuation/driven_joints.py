@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.transmission.terms import joints_from_readings
+from loopcal.mechanism.transmission.terms import evaluate_sums, joints_from_readings, select_weights
 from loopcal.typing import FloatArray
 
 
@@ -30,3 +30,24 @@ def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJ
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
         return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.frequency))
+
+
+class DrivenSums(NamedTuple):
+    """What values and readings make of a robot whose readings are fewer sums than its joints.
+
+    e : (t | 1, n_displacements) [m, rad]. sums : (t | 1, n, a) of joint values [m, rad].
+    weights : (t | 1, a, n_joints) of the joints in the sums.
+    """
+
+    e: FloatArray
+    sums: FloatArray
+    weights: FloatArray
+
+
+def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSums:
+    """Return displacements and sums for values (t | 1, p) and readings q (t | 1, n, a)."""
+    e, tau = robot.slots(values)
+    weights = select_weights(tau)
+    assert weights is not None
+    with np.errstate(invalid="ignore"):  # as in `drive_joints`
+        return DrivenSums(e, evaluate_sums(q, tau, robot.slots.frequency), weights)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import Program, State
-from loopcal.mechanism.actuation.driven_joints import DrivenJoints, drive_joints
+from loopcal.mechanism.actuation.driven_joints import DrivenJoints, drive_joints, drive_sums
 from loopcal.mechanism.actuation.summed_drives import solve_open_sums
 from loopcal.mechanism.kinematics.reading_paths import (
     Loops,
@@ -41,9 +41,7 @@ from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import Status, driven_values, without_poses
 from loopcal.mechanism.transmission.sums import apply_weights
 from loopcal.mechanism.transmission.terms import (
-    evaluate_sums,
     find_triangles,
-    joints_from_readings,
     measure_excess,
     readings_from_joints,
     select_weights,
@@ -80,10 +78,8 @@ def forward_trials(
     if robot.stages:
         return solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
     if robot.has_open_sums:
-        e, tau = robot.slots(values)
-        with np.errstate(invalid="ignore"):  # as in drive_joints
-            sums = evaluate_sums(q, tau, robot.slots.frequency)
-        return close_at_joints(robot, e, sums, start, follow, weights=select_weights(tau))
+        e, sums, weights = drive_sums(robot, values, q)
+        return close_at_joints(robot, e, sums, start, follow, weights=weights)
     e, tau, joints = driven or drive_joints(robot, values, q)
     state = close_at_joints(robot, e, joints, start, follow, goal)
     return _mark_out_of_reach(robot, state, q, tau) if len(find_triangles(tau)) else state
@@ -135,13 +131,10 @@ def step_towards_closure(
 
     For robots without stages.
     """
-    e, tau = robot.slots(values)
     if robot.has_open_sums:
-        weights = select_weights(tau)
-        assert weights is not None
-        sums = evaluate_sums(q, tau, robot.slots.frequency)
+        e, sums, weights = drive_sums(robot, values, q)
         return solve_open_sums(robot.program, e, weights, sums, begin, 1)
-    joints = joints_from_readings(q, tau, robot.slots.frequency)
+    e, _, joints = drive_joints(robot, values, q)
     return engine.solve(robot.program, e, joints, begin, max_iterations=1)
 
 
