@@ -44,6 +44,11 @@ def pytest_report_header() -> str:
     return f"engine: {get_current_engine()}"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the tests that fork first: copying a process takes longer the more it holds."""
+    items.sort(key=lambda item: item.get_closest_marker("forks") is None)
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     """Return the folder of the repository."""

@@ -271,7 +271,7 @@ def test_each_session_has_its_own_frame_and_elimination_cluster():
 
 @pytest.mark.slow
 def test_memory_hardly_grows_with_the_number_of_sessions(monkeypatch):
-    monkeypatch.setattr(problem_module, "BLOCK", 512)  # poses, those of 64 sessions
+    monkeypatch.setattr(problem_module, "BLOCK", 256)  # poses, those of 32 sessions
 
     def peak(sessions):
         day = np.repeat([f"day{i}" for i in range(sessions)], 8)
@@ -285,9 +285,9 @@ def test_memory_hardly_grows_with_the_number_of_sessions(monkeypatch):
         finally:
             tracemalloc.stop()
 
-    # blocks of 512 poses either way; per session there is a factor of 49 columns and little else
+    # blocks of 256 poses either way; per session there is a factor of 49 columns and little else
     peak(8)  # modules that are imported at the first fit count for none
-    assert peak(128) < 1.5 * peak(64) + 128 * 49**2 * 8
+    assert peak(64) < 1.5 * peak(32) + 64 * 49**2 * 8
 
 
 def test_priors_and_fixed_setup_parameters_are_respected():

@@ -16,6 +16,8 @@ from loopcal.errors import FileError
 from loopcal.io.core.text_file import write_text
 from tests.io.folder_writing import RUN, run_in_copy, write
 
+pytestmark = pytest.mark.forks
+
 NOBODY = 65534
 
 

@@ -19,6 +19,8 @@ from loopcal.io.core import replacement
 from loopcal.io.core.result_folder import FolderKind, describe_leftover, write_result_folder
 from tests.io.folder_writing import RUN, run_in_copy, write
 
+pytestmark = pytest.mark.forks
+
 STUDY = FolderKind("study", "result.json", ("made_by", "paper"), ("page.md", "tables/*.csv"))
 
 

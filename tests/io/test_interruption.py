@@ -11,6 +11,8 @@ import pytest
 from evidence.interruption import CASES, FIVE_BAR, INTERRUPT, KILL, examine, prepare_inputs
 from evidence.interruption import list_failures as list_wrong_outcomes
 
+pytestmark = pytest.mark.forks
+
 RESULT = Path(__file__).parents[2] / "docs" / "evidence" / "interruption.json"
 
 

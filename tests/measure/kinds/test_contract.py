@@ -150,12 +150,25 @@ def check_derivatives(kind, error, *, with_jax):
     shape = (6,) if kind.poses_per_row == 1 else (kind.poses_per_row, 6)
 
     def residual(x):
-        moved = (
-            geometry.apply_twist(T, x[:n].reshape(shape)) if n else T
-        )  # the same small motion in every row and trial
-        return kind.evaluate(
-            moved, measured, None if values is None else values + x[n:], joints
-        ).residual
+        """Return residuals at x (k,), with the same small motion in every row and trial."""
+        moved = geometry.apply_twist(T, x[:n].reshape(shape)) if n else T
+        unknown = None if values is None else values + x[n:]
+        return kind.evaluate(moved, measured, unknown, joints).residual
+
+    def residuals(points):
+        """Return residuals at points (m, k), each in trials of its own."""
+
+        def repeat(rows):
+            """Return rows (t, r, c) once for each point, (m t, r, c)."""
+            return None if rows is None else np.tile(rows, (len(points), 1, 1))
+
+        twist = points[:, :n].reshape(-1, 1, 1, *shape) if n else np.zeros((len(points), 1, 1, 6))
+        moved = geometry.apply_twist(T, twist).reshape(-1, *T.shape[1:])
+        unknown = None
+        if values is not None:
+            unknown = np.repeat(values[0] + points[:, None, n:], len(T), axis=0)
+        result = kind.evaluate(moved, repeat(measured), unknown, repeat(joints))
+        return result.residual.reshape(len(points), *found.residual.shape)
 
     if found.nuisance is not None:
         parts.append(found.nuisance)
@@ -165,13 +178,14 @@ def check_derivatives(kind, error, *, with_jax):
         automatic = residual if with_jax else None
         zero = np.zeros(jacobian.shape[-1])
         check_jacobian(
-            residual,
+            residuals,
             jacobian,
             zero,
             scale=0.05,
             automatic=automatic,
             atol=1e-13,
             atol_reason=reason,
+            is_batched=True,
         )
 
 
