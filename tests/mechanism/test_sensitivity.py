@@ -14,7 +14,7 @@ from loopcal.mechanism import Address, LinearMap, build, differentiate_pose, for
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
-from tests.jacobians import check_jacobian
+from tests.jacobians import check_jacobian, compile_quickly
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
 
 RANK = 1e-10  # relative; the smallest true singular values are above 1e-6, null ones below 1e-13
@@ -71,15 +71,15 @@ def test_pose_derivatives_of_families_agree_with_differences_and_jax(name, legs,
         atol=1e-8, atol_reason="closure to 1e-13, condition 30, step 1e-4",
     )  # fmt: skip
     x = np.concatenate([values[0], np.zeros(q.shape[2])])
-    jnp = jax.numpy
+    jnp, n = jax.numpy, values.size
+    by_pose = compile_quickly(jax.jacfwd(lambda y, r, T: legs(jnp, values[0], r, T, y)))
+    by_values = compile_quickly(
+        jax.jacfwd(lambda v, r, T: legs(jnp, v[:n], r + v[n:], T, np.zeros(6)))
+    )
     for row in range(4):
         at = q[0, row], state.T[0, row]
-        F = jax.jacfwd(lambda y, at=at: legs(jnp, values[0], *at, y))(np.zeros(6))[:, free]
-        G = jax.jacfwd(
-            lambda v, at=at: legs(
-                jnp, v[: values.size], at[0] + v[values.size :], at[1], np.zeros(6)
-            )
-        )(x)
+        F = by_pose(np.zeros(6), *at)[:, free]
+        G = by_values(x, *at)
         assert_allclose(both[row][free], -np.linalg.solve(F, G), atol=1e-11)
 
 
