@@ -38,7 +38,7 @@ def linearize(
                 *(chain.rows_of_slot(s) for s in group.slots),
                 *(chain.rows_of_joint(j) for j in range(chain.last)),
             )
-            rows = triangularize(columns, len(unknown))[0] if unknown else columns
+            rows = triangularize(columns, len(unknown)) if unknown else columns
         rows = rows.transpose(3, 2, 0, 1).reshape(t, n, len(group.limbs), *rows.shape[:2])
         u = len(unknown)
         cuts = np.cumsum([u, len(program.freedoms), len(group.slots)])
@@ -52,10 +52,11 @@ def linearize(
 class PlacedLinks:
     """The J + 2 displaced links of a group: placed = nominal . translation(d) . rotation(exp(w)).
 
-    Shapes end in (k, t). nominal : rotations without displacement (J + 2, 3, 3, ..). rotation : the
-    displaced ones. slope : rotation of a link per unit of w, nominal . left_jacobian(w). origin :
-    displaced origins (J + 2, 3, ..) [m]. pitch : (J, ..). length : (k, t) of the rods. rotates :
-    for each link, whether its rotation can differ from the identity.
+    Shapes end in (k, t), or in (k, 1) where all trials are the same. nominal : rotations without
+    displacement (J + 2, 3, 3, ..). rotation : the displaced ones. slope : rotation of a link per
+    unit of w, nominal . left_jacobian(w). origin : displaced origins (J + 2, 3, ..) [m]. pitch :
+    (J, ..). length : (k, ..) of the rods. rotates : for each link, whether its rotation can differ
+    from the identity.
     """
 
     nominal: FloatArray
@@ -68,10 +69,11 @@ class PlacedLinks:
 
     def select(self, trial: np.ndarray) -> PlacedLinks:
         """Return the links of each row's trial; a single trial serves all rows."""
-        if self.length.shape[1] == 1:
+        if self.origin.shape[-1] == 1:
             return self
         arrays = (self.nominal, self.rotation, self.slope, self.origin, self.pitch, self.length)
-        return PlacedLinks(*(a[..., trial] for a in arrays), rotates=self.rotates)
+        own = (a if a.shape[-1] == 1 else a.take(trial, axis=-1) for a in arrays)
+        return PlacedLinks(*own, rotates=self.rotates)
 
 
 def place_links(group: Group, e: FloatArray) -> PlacedLinks:
@@ -79,19 +81,22 @@ def place_links(group: Group, e: FloatArray) -> PlacedLinks:
     t, k, links = len(e), len(group.limbs), len(group.joints) + 2
     displacements = e[:, group.columns].reshape(t, k, len(group.slots)).transpose(2, 1, 0)
     move = np.zeros((links, 6, k, t))
-    pitch, length = (np.repeat(a.T[..., None], t, axis=-1) for a in (group.pitch, group.length))
+    pitch, length = group.pitch.T[..., None], group.length[:, None]
+    if any(slot.axis == PITCH for slot in group.slots):
+        pitch = np.repeat(pitch, t, axis=-1)
     for slot, value in zip(group.slots, displacements, strict=True):
         if slot.axis == PITCH:
             pitch[slot.element] += value
         elif slot.axis == LENGTH:
-            length += value
+            length = length + value
         else:
             move[slot.element, slot.axis] += value
     transforms = group.links.transpose(1, 2, 3, 0)[..., None]
-    nominal = np.broadcast_to(transforms[:, :3, :3], (links, 3, 3, k, t))
+    nominal = rotation = slope = transforms[:, :3, :3]
     shift = sum(nominal[:, :, i] * move[:, None, 3 + i] for i in range(3))
-    rotation, slope = np.array(nominal), np.zeros_like(nominal)
     displaced = {slot.element for slot in group.slots if slot.axis < 3}
+    if displaced:
+        rotation, slope = (np.repeat(nominal, t, axis=-1) for _ in range(2))
     for j in displaced:
         rotation[j] = matmul(nominal[j], exponential(move[j, :3]))
         slope[j] = matmul(nominal[j], left_jacobian(move[j, :3]))
@@ -222,12 +227,43 @@ class Chain:
         rows = self.rows_of_shift(direction) if axis >= 3 else self.rows_of_turn(direction, arm)
         return rows if j == self.last else -rows
 
-    def stack(self, *columns: FloatArray) -> FloatArray:
-        """Return columns side by side, (r, c, k, N)."""
-        out = np.empty((len(self.group.rows), len(columns), *self.gap.shape[1:]))
+    def stack(self, *columns: FloatArray, right: int = 0) -> FloatArray:
+        """Return columns side by side, (r, c, k, N), and room for more on the right."""
+        k, N = self.gap.shape[1:]
+        # limb by limb in memory: the rows of all limbs are one matrix without a copy
+        out = np.empty((k, len(self.group.rows), len(columns) + right, N)).transpose(1, 2, 0, 3)
         for c, column in enumerate(columns):
             out[:, c] = column
         return out
+
+
+def list_coordinates(
+    program: Program, q: FloatArray, start: State, shape: tuple[int, int]
+) -> FloatArray:
+    """Return the coordinates (12 + joint values, t n) of a start, the actuated joints set to q."""
+    count = sum(joints.shape[2] * joints.shape[3] for joints in start.joints)
+    out = np.empty((12 + count, *shape))
+    out[:12].reshape(3, 4, *shape)[:] = start.T[:, :, :3].transpose(2, 3, 0, 1)
+    flat = out.reshape(len(out), shape[0] * shape[1])
+    limbs = split_joints(program, flat)
+    for group, joints, theta in zip(program.groups, start.joints, limbs, strict=True):
+        values = theta.reshape(*theta.shape[:2], *shape)
+        values[:] = joints.transpose(3, 2, 0, 1)
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0:
+                values[j] = q[:, :, columns].transpose(2, 0, 1)
+    return flat
+
+
+def split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
+    """Return the joint values (J + 1, k, N) of each group as views into coordinates."""
+    out, first = [], 12
+    for group in program.groups:  # the rod counts as a joint
+        values, limbs = len(group.joints) + 1, len(group.limbs)
+        last = first + values * limbs
+        out.append(coordinates[first:last].reshape(values, limbs, coordinates.shape[1]))
+        first = last
+    return out
 
 
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -247,8 +283,11 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the cross product of (3, ..) and (3, ..)."""
-    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return stack((x, y, z))
+    out = np.empty((3, *np.broadcast(a[0], b[0]).shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[j], b[k], out=out[i])
+        out[i] -= a[k] * b[j]
+    return out
 
 
 def stack(parts: Sequence[FloatArray]) -> FloatArray:

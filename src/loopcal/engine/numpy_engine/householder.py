@@ -18,26 +18,29 @@ PART = 8
 """Rows of a part of many rows that are folded, over their columns."""
 
 
-def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
-    """Return Q' matrix (r, c, batch), upper triangular in its first columns, and det Q' (batch,).
+def triangularize(matrix: FloatArray, columns: int) -> FloatArray:
+    """Return Q' matrix (r, c, batch), upper triangular in its first columns, by reflections.
 
-    The determinant is +1 or -1.
+    Each reflects a column x to alpha e0 by v = x - alpha e0, and another one y to
+    y + v (x'y - alpha y0) / (alpha v0).
     """
     m = matrix.copy()
-    reflections = np.zeros((min(columns, max(len(m) - 1, 0)), *m.shape[2:]))
-    for j in range(len(reflections)):
-        v, alpha = m[j:, j].copy(), reflections[j]
-        np.sqrt(np.add.reduce(v * v, axis=0), out=alpha)
-        np.copysign(alpha, -v[0], out=alpha)
+    for j in range(count_reflections(len(m), columns)):
+        v, right = m[j:, j], m[j:, j + 1 :]
+        products = np.einsum("i...,ij...->j...", v, m[j:, j:])
+        alpha = np.copysign(np.sqrt(products[0]), -v[0])
         v[0] -= alpha
-        # v'v = 2 |alpha| (|alpha| + |v0|); a zero column has v = 0 and stays as it is
-        beta = 1.0 / np.maximum(-alpha * v[0], SMALLEST)
-        right = m[j:, j + 1 :]
-        right -= v[:, None] * (beta * np.einsum("i...,ij...->j...", v, right))
-        m[j, j] = alpha
-        m[j + 1 :, j] = 0.0
-    odd = np.add.reduce(reflections != 0.0, axis=0) % 2
-    return m, 1.0 - 2.0 * odd
+        share = products[1:]
+        share -= alpha * right[0]
+        share /= np.minimum(alpha * v[0], -SMALLEST)  # a zero column has v = 0 and stays as it is
+        right += v[:, None] * share
+        v[0], v[1:] = alpha, 0.0
+    return m
+
+
+def count_reflections(rows: int, columns: int) -> int:
+    """Return how many reflections triangularize a matrix; each turns the determinant's sign."""
+    return min(columns, max(rows - 1, 0))
 
 
 def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:
@@ -45,10 +48,10 @@ def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:
 
     A pivot of zero gives infinities or NaN.
     """
-    x = np.empty_like(right)
+    x = right.copy()
     for i in range(len(upper) - 1, -1, -1):
-        known = np.add.reduce(upper[i, i + 1 :, None] * x[i + 1 :], axis=0)
-        x[i] = (right[i] - known) / upper[i, i]
+        x[i] /= upper[i, i]
+        x[:i] -= upper[:i, i, None] * x[i]
     return x
 
 
@@ -58,15 +61,16 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     The stack is triangularized by QR, many rows in parts that fit the cache.
     """
     t, p = factor.shape[:2]
-    # a factor of no rows would be most of the stack where rows are few
-    begin = factor if rows.shape[1] >= p or factor.any() else factor[:, :0]
-    stack = [begin, np.broadcast_to(rows, (t, *rows.shape[1:]))]
+    stack = [np.broadcast_to(rows, (t, *rows.shape[1:]))]
+    if factor.any():
+        stack.insert(0, factor)
     height = PART * p
     count = rows.shape[1] // height
     if count > 1:
-        parts = stack[1][:, : count * height].reshape(t, count, height, p)
+        parts = stack[-1][:, : count * height].reshape(t, count, height, p)
         factors = np.asarray(np.linalg.qr(parts, mode="r"))
-        stack[1:] = factors.reshape(t, count * p, p), stack[1][:, count * height :]
-    R = np.asarray(np.linalg.qr(np.concatenate(stack, axis=1), mode="r"))
+        stack[-1:] = factors.reshape(t, count * p, p), stack[-1][:, count * height :]
+    whole = stack[0] if len(stack) == 1 else np.concatenate(stack, axis=1)
+    R = np.asarray(np.linalg.qr(whole, mode="r"))
     missing = p - R.shape[1]
     return np.concatenate([R, np.zeros((t, missing, p))], axis=1) if missing else R

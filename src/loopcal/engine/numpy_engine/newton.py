@@ -15,15 +15,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from loopcal.engine.numpy_engine.certificate import has_driven_rods
 from loopcal.engine.numpy_engine.closure import (
     Chain,
     PlacedLinks,
     dot,
     exponential,
+    list_coordinates,
     matmul,
     place_links,
+    split_joints,
 )
-from loopcal.engine.numpy_engine.householder import back_substitute, triangularize
+from loopcal.engine.numpy_engine.householder import (
+    back_substitute,
+    count_reflections,
+    triangularize,
+)
 from loopcal.engine.numpy_engine.limbs import close_limbs, have_closed_form
 from loopcal.engine.program import (
     CONVERGED,
@@ -71,13 +78,39 @@ class Iterate(NamedTuple):
 
     def select(self, keep: np.ndarray) -> Iterate:
         """Return these rows."""
-        return Iterate(*(a[..., keep] for a in self))
+        return Iterate(*(a.take(keep, axis=-1) for a in self))
 
     def replace_where(self, better: np.ndarray, trial: Iterate) -> Iterate:
         """Return the rows of `trial` where it is better, the others as they are."""
         if better.all():
             return trial
         return Iterate(*(np.where(better, b, a) for a, b in zip(self, trial, strict=True)))
+
+
+class Reduced(NamedTuple):
+    """Closure of N rows at coordinates (.., N), the joints of the limbs eliminated.
+
+    tops : for each group the rows (u, u + m + 1, k, N) that determine its joints. low : (r, m + 1,
+        N) the other rows, or (r, m + N, 1) where all rows have one Jacobian. inner : (N,) square of
+        the residual in `tops`. norm : (N,) of the whole residual [m]. sign, pivot : (N,) as in
+        `Iterate`, of the limbs.
+    """
+
+    coordinates: FloatArray
+    tops: list[FloatArray]
+    low: FloatArray
+    inner: FloatArray
+    norm: FloatArray
+    sign: FloatArray
+    pivot: FloatArray
+
+    def select(self, keep: np.ndarray) -> Reduced:
+        """Return these rows."""
+        tops = [top.take(keep, axis=-1) for top in self.tops]
+        taken = {
+            name: getattr(self, name).take(keep, axis=-1) for name in self._fields if name != "tops"
+        }
+        return Reduced(tops=tops, **taken)
 
 
 class Solved(NamedTuple):
@@ -107,78 +140,97 @@ def solve(
     links = [place_links(g, e) for g in program.groups]
     unknown = [g.unknown_joints(free) for g in program.groups]
     redundant = program.sigma is not None and not free
-    joints = [
-        g.insert_driven(np.broadcast_to(a, (t, n, *a.shape[2:])), q).swapaxes(2, 3)
-        for g, a in zip(program.groups, start.joints, strict=True)
-    ]
-    T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
-    begin = np.concatenate([a.reshape(t * n, -1) for a in (T, *joints)], axis=1).T
+    begin = list_coordinates(program, q, start, (t, n))
+    has_one_start = len(e) == 1 and start.T.shape[:2] == (1, 1)
+    together = has_one_start and has_driven_rods(program) and not free and task is None
     goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
-    for rows in np.split(np.arange(t * n), range(CHUNK, t * n, CHUNK)):
+    for first in range(0, max(t * n, 1), CHUNK):
+        part = slice(first, first + CHUNK)
+        rows = np.arange(t * n)[part]
         placed = [p.select(rows // n) for p in links]
         equations = _Equations(program, unknown, redundant, placed, task, rows)
-        goal_rows = None if goals is None else goals[..., rows]
-        chunks.append(_iterate(equations, begin[:, rows], max_iterations, goal_rows))
+        goal_rows = None if goals is None else goals[..., part]
+        chunks.append(_iterate(equations, begin[:, part], max_iterations, goal_rows, together))
     whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
     return _pack(program, whole, (t, n))
 
 
 def _iterate(
-    equations: _Equations, coordinates: FloatArray, max_iterations: int, goal: FloatArray | None
+    equations: _Equations,
+    coordinates: FloatArray,
+    max_iterations: int,
+    goal: FloatArray | None,
+    together: bool,
 ) -> Solved:
-    """Iterate one chunk until every row has converged, is near its goal (3, 4, N), or failed."""
+    """Iterate one chunk until every row has converged, is near its goal (3, 4, N), or failed.
+
+    together : whether all rows begin with one Jacobian.
+    """
     size, N = equations.program.size, coordinates.shape[1]
     program = equations.program
+    closed, small = RESIDUAL * size, STEP * size
     may_stay_open = program.may_stay_open or program.sigma is not None
-    status, steps, alive = np.full(N, EXHAUSTED, np.int8), np.zeros(N, np.int64), np.arange(N)
+    status, steps = np.full(N, EXHAUSTED, np.int8), np.full(N, max_iterations)
+    done = Solved(np.empty_like(coordinates), np.empty(N), np.empty(N), status, steps)
     # share of the full step, length of the last applied step, steps in a row at rounding level
     share, applied, at_rounding = np.ones(N), np.full(N, np.inf), np.zeros(N)
+    alive = np.arange(N)
     with np.errstate(all="ignore"):
-        now = equations.evaluate(coordinates)
-        done = Solved(now.coordinates.copy(), now.residual.copy(), now.sign.copy(), status, steps)
-        for _ in range(max_iterations):
-            settled = (now.reducible <= RESIDUAL * size) & (
-                (applied <= STEP * size) | (at_rounding > 2)
-            )
-            finite = np.isfinite(now.reducible) & np.isfinite(now.length)
-            finite &= np.isfinite(now.coordinates[:12]).all(axis=0)  # some are in no equation
-            broken = ~(finite & (now.pivot > SINGULAR))
-            end = settled | broken | (share < 1e-5)
-            is_near = np.zeros_like(end)
-            if goal is not None:
-                is_near = equations.lead_to(now, goal[..., alive]) & ~end
-                end |= is_near
+        now = equations.evaluate(coordinates, together)
+        # some coordinates are in no equation
+        now = now._replace(pivot=now.pivot * np.isfinite(np.add.reduce(coordinates[:12], axis=0)))
+        for step in range(max_iterations):
+            settled = (now.reducible <= closed) & ((applied <= small) | (at_rounding > 2))
+            sound = np.isfinite(now.reducible + now.length) & (now.pivot > SINGULAR)
+            end = settled | ~sound | (share < 1e-5)
+            is_near = False if goal is None else equations.lead_to(now, goal[..., alive]) & ~end
+            end |= is_near
             if end.any():
-                closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
-                reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
-                reason[is_near] = NEAR_GOAL
-                keep, status[alive[end]] = ~end, reason[end]
-                _store(done, alive[end], now.select(end) if keep.any() else now)
-                if not keep.any():
+                shut = settled & ((now.residual <= 1e4 * closed) | may_stay_open)
+                reason = np.where(sound, np.where(shut, CONVERGED, STALLED), NOT_FINITE)
+                reason = np.where(is_near, NEAR_GOAL, reason)
+                last = now if end.all() else now.select(np.flatnonzero(end))
+                _store(done, alive[end], last, reason[end], step)
+                if end.all():
                     return done
+                keep = np.flatnonzero(~end)
                 equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
                 share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
             fraction = share * np.minimum(1.0, 0.5 * size / np.maximum(now.length, 1e-300))
             length = fraction * now.length
-            tiny = bool((length <= STEP * size).all())
-            trial = equations.evaluate(equations.move(now, fraction), now if tiny else None)
-            low = trial.reducible <= RESIDUAL * size
+            reduced = equations.reduce(equations.move(now, fraction))
+            # the next step of such rows would be below rounding
+            end = (length <= small) & (reduced.norm <= closed)
+            if end.any() and step + 1 < max_iterations:
+                last = now._replace(coordinates=reduced.coordinates, residual=reduced.norm)
+                last = last if end.all() else last.select(np.flatnonzero(end))
+                _store(done, alive[end], last, CONVERGED, step + 1)
+                if end.all():
+                    return done
+                keep = np.flatnonzero(~end)
+                equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
+                share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
+                fraction, length, reduced = fraction[keep], length[keep], reduced.select(keep)
+            trial = equations.complete(reduced)
+            low = trial.reducible <= closed
             better = low | (trial.residual <= (1 - 1e-4 * fraction) * now.residual)
             better |= trial.reducible <= 0.5 * now.reducible
+            at_rounding = (at_rounding + 1) * low
             applied = np.where(better, length, applied)
-            at_rounding = np.where(better & low, at_rounding + 1, 0)
             share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
-            steps[alive] += 1
             now = now.replace_where(better, trial)
-        _store(done, alive, now)
+        _store(done, alive, now, EXHAUSTED, max_iterations)
     return done
 
 
-def _store(done: Solved, rows: np.ndarray, last: Iterate) -> None:
+def _store(
+    done: Solved, rows: np.ndarray, last: Iterate, status: np.ndarray | int, steps: int
+) -> None:
     """Write the last iterates of these rows into a result under construction."""
     done.coordinates[:, rows] = last.coordinates
     done.residual[rows], done.sign[rows] = last.residual, last.sign
+    done.status[rows], done.steps[rows] = status, steps
 
 
 @dataclass(frozen=True)
@@ -200,15 +252,20 @@ class _Equations:
         """Return the equations of these rows."""
         return replace(self, links=[p.select(keep) for p in self.links], rows=self.rows[keep])
 
-    def evaluate(self, coordinates: FloatArray, previous: Iterate | None = None) -> Iterate:
+    def evaluate(self, coordinates: FloatArray, together: bool = False) -> Iterate:
         """Return the Newton step at these coordinates and its measures.
 
-        previous : an iterate that is a rounding error away; its step is not computed anew where all
-        rows close.
+        together : all rows have the Jacobian of the first one.
         """
+        return self.complete(self.reduce(coordinates, together))
+
+    def reduce(self, coordinates: FloatArray, together: bool = False) -> Reduced:
+        """Return closure at these coordinates, the joints of each limb eliminated."""
         program, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
-        T, limbs = coordinates[:12].reshape(3, 4, N), _split_joints(program, coordinates)
-        eliminated = [self._eliminate(i, T, theta) for i, theta in enumerate(limbs)]
+        T, limbs = coordinates[:12].reshape(3, 4, N), split_joints(program, coordinates)
+        if together:
+            T = T[..., :1]
+        eliminated = [self._eliminate(i, T, theta, together) for i, theta in enumerate(limbs)]
         tops, lows, signs, pivots = map(list, zip(*eliminated, strict=True))
         if self.task is not None:
             residual, slopes = self.task(T.transpose(2, 0, 1), self.rows)
@@ -217,35 +274,43 @@ class _Equations:
         if (missing := m - sum(map(len, lows))) > 0:
             lows.append(np.zeros((missing, m + 1, N)))
         low = np.concatenate(lows) if len(lows) > 1 else lows[0]
-        used = (np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops if len(top))
-        inner = sum(used, np.zeros(N))
-        norm = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0))
-        if previous is not None and (norm <= RESIDUAL * program.size).all():
-            still = previous._replace(step=0 * previous.step, length=0 * norm)
-            return still._replace(coordinates=coordinates, residual=norm, reducible=norm)
-        low, reflected = triangularize(low, m)
-        signs += [reflected, np.multiply.reduce(np.sign(np.diagonal(low[:m, :m])), axis=-1)]
-        y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
-        reducible = np.sqrt(inner + np.add.reduce(low[:m, m] ** 2, axis=0))
+        inner = np.zeros(N)
+        for top in tops:
+            if len(top):
+                inner += np.add.reduce(top[:, -1] ** 2, axis=(0, 1))
+        norm = np.sqrt(inner + np.add.reduce(low[:, m:] ** 2, axis=0).reshape(N))
+        sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
+        return Reduced(coordinates, tops, low, inner, norm, sign, pivot)
+
+    def complete(self, reduced: Reduced) -> Iterate:
+        """Return the Newton step of reduced closure and its measures."""
+        coordinates, tops, low, inner, norm, sign, pivot = reduced
+        m, N = len(self.program.freedoms), len(norm)
+        count = count_reflections(len(low), m)
+        low = triangularize(low, m)
+        diagonal = np.diagonal(low[:m, :m])
+        sign = sign * (-1.0) ** count * np.multiply.reduce(np.sign(diagonal), axis=-1)
+        y = back_substitute(low[:m, :m], -low[:m, m:]).reshape(m, N)
+        reducible = np.sqrt(inner + np.add.reduce(low[:m, m:] ** 2, axis=0).reshape(N))
         twist = np.zeros((6, N))
-        twist[list(program.freedoms)] = y
+        twist[list(self.program.freedoms)] = y
         turns = []
         for top in tops:
             u = len(top)
             rest = top[:, -1] + np.add.reduce(top[:, u : u + m] * y[:, None], axis=1)
             turns.append(back_substitute(top[:, :u], -rest[:, None])[:, 0])
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
-        sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
         length = self._length(twist, turns)
         return Iterate(coordinates, step, norm, reducible, length, sign, pivot)
 
     def _eliminate(
-        self, i: int, T: FloatArray, theta: FloatArray
+        self, i: int, T: FloatArray, theta: FloatArray, together: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Eliminate the joints of the limbs in group i.
 
         Returns the rows (u, columns, k, N) that determine these joints, the rows (.., m + 1, N)
-        without them, and the sign of the determinant and the smallest relative pivot (N,).
+        without them, and the sign of the determinant and the smallest relative pivot (N,). Rows
+        `together` are one matrix (.., m + N, 1) with N right sides.
         """
         program, group, unknown = self.program, self.program.groups[i], self.unknown[i]
         chain, u, m = Chain(group, self.links[i], T, theta, program.size), len(unknown), 0
@@ -255,12 +320,16 @@ class _Equations:
             j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
             sigma = np.array(program.sigma)[group.actuator[j], None]
             columns.append(chain.rows_of_joint(j) * sigma)
-        rows = chain.stack(*columns, chain.residual())
-        sign = pivot = np.ones(T.shape[-1])
+        residual = chain.residual()
+        sides = residual.shape[-1] if together else 1
+        rows = chain.stack(*columns, right=sides)
+        rows[:, -sides:] = residual.swapaxes(1, 2)[..., None] if together else residual[:, None]
+        sign = pivot = np.ones(residual.shape[-1])
         if u:
-            rows, reflected = triangularize(rows, u)
+            count = count_reflections(len(rows), u) * len(group.limbs)
+            rows = triangularize(rows, u)
             diagonal = np.diagonal(rows[:u, :u])
-            sign = np.prod(reflected * np.prod(np.sign(diagonal), axis=-1), axis=0)
+            sign = (-1.0) ** count * np.prod(np.sign(diagonal), axis=(0, 2))
             largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
             pivot = (np.abs(diagonal).min(axis=-1) / largest).min(axis=0)
         low = rows[u:, u:].transpose(2, 0, 1, 3).reshape(-1, rows.shape[1] - u, T.shape[-1])
@@ -297,7 +366,7 @@ class _Equations:
         new[:, :3] = matmul(exponential(twist[:3]), T.reshape(3, 4, N)[:, :3])
         new[:, 3] += twist[3:]
         first = 6
-        for theta, unknown in zip(_split_joints(self.program, out), self.unknown, strict=True):
+        for theta, unknown in zip(split_joints(self.program, out), self.unknown, strict=True):
             last = first + len(unknown) * theta.shape[1]
             if unknown:
                 theta[unknown] += fraction * now.step[first:last].reshape(-1, *theta.shape[1:])
@@ -305,22 +374,11 @@ class _Equations:
         return out
 
 
-def _split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
-    """Return the joint values (J + 1, k, N) of each group as views into coordinates."""
-    out, first = [], 12
-    for group in program.groups:  # the rod counts as a joint
-        values, limbs = len(group.joints) + 1, len(group.limbs)
-        last = first + values * limbs
-        out.append(coordinates[first:last].reshape(values, limbs, coordinates.shape[1]))
-        first = last
-    return out
-
-
 def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:
     """Return solved rows as a state with the axes (t, n)."""
     T = np.zeros((solved.coordinates.shape[1], 4, 4))
     T[:, :3], T[:, 3, 3] = solved.coordinates[:12].T.reshape(-1, 3, 4), 1.0
-    limbs = _split_joints(program, solved.coordinates)
+    limbs = split_joints(program, solved.coordinates)
     joints = tuple(a.transpose(2, 1, 0).reshape(*shape, *a.shape[1::-1]) for a in limbs)
     return State(
         T.reshape(*shape, 4, 4),

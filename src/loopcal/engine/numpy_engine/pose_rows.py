@@ -41,7 +41,8 @@ def fold_poses(
             D, ok = shared
         is_finite[part] = ok
         rows = [_make_rows(twists, D, ok, part) for twists in observed]
-        folded[part] = fold(factor[part], np.concatenate(rows, axis=1))
+        whole = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
+        folded[part] = fold(factor[part], whole)
     return folded, is_finite
 
 

@@ -187,7 +187,7 @@ def _eliminate(chain: Chain) -> FloatArray:
     if not unknown:
         return np.broadcast_to(identity, (rows, rows, *chain.gap.shape[1:]))
     columns = chain.stack(*(chain.rows_of_joint(j) for j in unknown), *identity.swapaxes(0, 1))
-    return triangularize(columns, len(unknown))[0][len(unknown) :, len(unknown) :]
+    return triangularize(columns, len(unknown))[len(unknown) :, len(unknown) :]
 
 
 def _list_wrenches(chain: Chain, shares: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -232,5 +232,5 @@ def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
     unit = np.broadcast_to(np.eye(c)[..., None], (c, c, N))
     if weights is not None:
         A, unit = A * weights[:, None], unit * weights[:, None]
-    rows = triangularize(np.concatenate([A, unit], axis=1), m)[0]
+    rows = triangularize(np.concatenate([A, unit], axis=1), m)
     return back_substitute(rows[:m, :m], rows[:m, m:])
