@@ -21,6 +21,7 @@ CONTRACTION = 0.6
 """Largest product of the distance from the goal and the change of the Jacobian; proven: 2/3."""
 ANGLE = 0.75
 """An angle is below 0.75 times the norm of the difference of the rotations, if this is below 1."""
+SQRT2 = float(np.sqrt(2.0))
 DECREASE = 0.99
 """Share of the first residual that may be left after the first step; step control allows 0.9999."""
 
@@ -86,7 +87,7 @@ class Begin(NamedTuple):
         square = dot(attachment, attachment)
         unit = np.sqrt(2 * np.mean(square, axis=0))
         rows, distance = _measure_rods(T, tip, attachment, unit)
-        jacobian = rows.transpose(2, 0, 1)
+        jacobian = rows.transpose(2, 1, 0)
         good = np.asarray(np.isfinite(jacobian).all(axis=(1, 2)))
         sign = np.linalg.slogdet(np.where(good[:, None, None], jacobian, 0.0))[0]
         is_regular = np.abs(sign) > 0.0
@@ -113,7 +114,8 @@ class Begin(NamedTuple):
         size, unit = self.size, self.unit
         rows, distance = _measure_rods(goal, self.tip, self.attachment, unit)
         stretch = distance - self.distance
-        step = np.einsum("ij,jn->in", self.inverse[..., 0], stretch)
+        inverse = self.inverse[..., 0]
+        step = inverse @ stretch
         turn, shift = step[:3] / unit, step[3:]
         length = np.maximum(np.abs(turn).max(axis=0) * size, np.abs(shift).max(axis=0))
         turned = matmul(exponential(turn), self.T[:, :3]) - goal[:, :3]
@@ -125,11 +127,15 @@ class Begin(NamedTuple):
         shortest = np.minimum.reduce(distance - self.swing * error, axis=0)
         h = 1 / shortest
         bend = self.bend[0] + (self.bend[1] + self.bend[2] * h) * h
-        off = np.einsum("ij,jfn->ifn", self.inverse[..., 0], rows)
+        off = inverse @ rows
         off[range(6), range(6)] -= 1.0
-        square = np.einsum("ifn,ign->fgn", off, off)
         # the spectral norm of `off` is the root of that of its square, which this norm exceeds
-        deviation = np.sqrt(np.sqrt(np.einsum("fgn,fgn->n", square, square)))
+        square = np.zeros(len(error))
+        for f, column in enumerate(off):
+            products = np.einsum("in,gin->gn", column, off[f:])
+            products[1:] *= SQRT2  # they stand for their mirror images, too
+            square += np.add.reduce(products**2, axis=0)
+        deviation = np.sqrt(np.sqrt(square))
         contracts = np.sqrt(bend) * error <= CONTRACTION * (1 - deviation)
         return (shortest > 0) & (apart <= 1) & (length <= size / 2) & falls & contracts
 
@@ -137,11 +143,13 @@ class Begin(NamedTuple):
 def _measure_rods(
     T: FloatArray, tip: FloatArray, attachment: FloatArray, unit: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the Jacobian (6, 6, N) of the distances (6, N) of rods at platforms (3, 4, N)."""
+    """Return the Jacobian of the distances (6, N) of rods at platforms (3, 4, N), transposed:
+    (6 components of a twist, 6 rods, N).
+    """
     arm = matvec(T[:, :3, None], attachment)
     gap = arm + T[:, 3, None] - tip
     distance = np.sqrt(dot(gap, gap))
     rows = np.empty((6, *distance.shape))
     np.divide(gap, distance, out=rows[3:])
     np.divide(cross(arm, rows[3:]), unit, out=rows[:3])
-    return rows.swapaxes(0, 1), distance
+    return rows, distance

@@ -294,11 +294,11 @@ class _Equations:
         reducible = np.sqrt(inner + np.add.reduce(low[:m, m:] ** 2, axis=0).reshape(N))
         twist = np.zeros((6, N))
         twist[list(self.program.freedoms)] = y
-        turns = []
-        for top in tops:
-            u = len(top)
-            rest = top[:, -1] + np.add.reduce(top[:, u : u + m] * y[:, None], axis=1)
-            turns.append(back_substitute(top[:, :u], -rest[:, None])[:, 0])
+        turns = [top[:, -1] for top in tops]
+        for i, top in enumerate(tops):
+            if u := len(top):
+                rest = turns[i] + np.add.reduce(top[:, u : u + m] * y[:, None], axis=1)
+                turns[i] = back_substitute(top[:, :u], -rest[:, None])[:, 0]
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
         length = self._length(twist, turns)
         return Iterate(coordinates, step, norm, reducible, length, sign, pivot)

@@ -37,13 +37,13 @@ def differentiate(
     by_parameter, by_reading = np.zeros((t * n, 6, p)), np.zeros((t * n, 6, a))
     freedoms = list(program.freedoms)
     for first in range(0, t * n, CHUNK):
-        rows = np.arange(first, min(first + CHUNK, t * n))
-        trial, pose = np.divmod(rows, n)
+        part = slice(first, first + CHUNK)
+        trial, pose = np.divmod(np.arange(t * n)[part], n)
         A, sigma, moving, driving = [], [], [], []
         with np.errstate(all="ignore"):
             for group, (links, values, entries) in zip(program.groups, limbs, strict=True):
-                theta = values.reshape(t * n, len(group.limbs), -1)[rows].transpose(2, 1, 0)
-                chain = Chain(group, links.select(trial), T[..., rows], theta, program.size)
+                theta = values.reshape(t * n, len(group.limbs), -1)[part].transpose(2, 1, 0).copy()
+                chain = Chain(group, links.select(trial), T[..., part].copy(), theta, program.size)
                 closed = _close(program, chain, entries.driven)
                 A.append(closed.freedoms)
                 columns = closed.columns.transpose(3, 0, 1, 2)
@@ -56,11 +56,10 @@ def differentiate(
             steps = np.ascontiguousarray(-inverse.transpose(2, 0, 1))
             for out, of_groups in ((by_parameter, moving), (by_reading, driving)):
                 right = of_groups[0] if len(of_groups) == 1 else np.concatenate(of_groups, axis=1)
-                part = out[first : first + len(rows)]
                 if m == 6:
-                    np.matmul(steps, right, out=part)
+                    np.matmul(steps, right, out=out[part])
                 else:
-                    part[:, freedoms] = np.matmul(steps, right)
+                    out[part, freedoms] = np.matmul(steps, right)
     return by_parameter.reshape(t, n, 6, p), by_reading.reshape(t, n, 6, a)
 
 
