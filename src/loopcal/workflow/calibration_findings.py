@@ -9,12 +9,13 @@ from dataclasses import replace
 from loopcal.apply import Validation
 from loopcal.apply.height_errors import measures_only_heights
 from loopcal.apply.validation_findings import FEW_ROWS
-from loopcal.diagnose import ConventionCheck, find_frame_motions
+from loopcal.diagnose import ConventionCheck
 from loopcal.estimate import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, check_instruments
 from loopcal.units import Dimension
 from loopcal.workflow.data_split import DataSplit
+from loopcal.workflow.open_freedoms import sort_open_freedoms
 from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 from loopcal.workflow.verdict import BASE_MOVED
 
@@ -118,23 +119,17 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     """Return whether open combinations only move frames, or change poses."""
     if not fit.converged or not fit.unidentifiable:
         return []
-    motions = find_frame_motions(fit.posterior)
-    count = len(fit.names) - fit.rank
-    findings = [report_readings_gauge(motions, count)] if is_readings_alone(data) else []
+    freedoms = sort_open_freedoms(fit.posterior, fit.unidentifiable, len(fit.names) - fit.rank)
+    motions, count = freedoms.motions, freedoms.changing_count
+    findings = [report_readings_gauge(motions, freedoms.count)] if is_readings_alone(data) else []
     if motions.count:
         findings.append(
             report_finding(
                 "workflow.frame-freedoms", count=motions.count, frames=tuple(motions.frames)
             )
         )
-    if count > motions.count:
-        changing = [c for c in fit.unidentifiable if not c.meaning] or fit.unidentifiable
-        names = dict.fromkeys(name for c in changing for name in c.names)
+    if count > 0:
         findings.append(
-            report_finding(
-                "workflow.undetermined-combinations",
-                count=count - motions.count,
-                names=tuple(names),
-            )
+            report_finding("workflow.undetermined-combinations", count=count, names=freedoms.names)
         )
     return findings

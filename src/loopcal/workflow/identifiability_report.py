@@ -14,7 +14,6 @@ from loopcal.diagnose import (
     MeasurementSuggestion,
     UsefulAccuracy,
     choose_identifiable_subset,
-    find_frame_motions,
     identifiability,
     judge_useful_accuracy,
     suggest_measurements,
@@ -24,6 +23,7 @@ from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.serialization import json_fields
+from loopcal.workflow.open_freedoms import sort_open_freedoms
 from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 
 FEW = 3
@@ -67,21 +67,22 @@ class IdentifiabilityReport:
         analysis = self.analysis
         if not analysis.unidentifiable:
             return []
-        motions = find_frame_motions(analysis.posterior)
+        freedoms = sort_open_freedoms(
+            analysis.posterior, analysis.unidentifiable, analysis.n_parameters - analysis.rank
+        )
+        motions, changing = freedoms.motions, freedoms.changing
         findings = []
         if self.is_readings_alone:
-            findings.append(report_readings_gauge(motions, analysis.n_parameters - analysis.rank))
+            findings.append(report_readings_gauge(motions, freedoms.count))
         if motions.count:
             findings.append(
                 report_finding(
                     "identifiability.frames-only", count=motions.count, frames=motions.frames
                 )
             )
-        if (count := analysis.n_parameters - analysis.rank - motions.count) > 0:
-            changing = [c for c in analysis.unidentifiable if not c.meaning]
-            names = dict.fromkeys(n for c in changing or analysis.unidentifiable for n in c.names)
+        if (count := freedoms.changing_count) > 0:
             findings.append(
-                report_finding("identifiability.changes-poses", count=count, names=tuple(names))
+                report_finding("identifiability.changes-poses", count=count, names=freedoms.names)
             )
             findings += [c.finding for c in changing] if len(changing) <= FEW else []
         return findings
