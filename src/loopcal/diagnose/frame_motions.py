@@ -93,19 +93,19 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
         return FrameMotions(null, (), 0, np.zeros((12, 0)))
     twists = D[usable][:, :, posterior.places] * posterior.unit
     motions, base, platform = _weigh_motions(robot, state.T[0, usable], twists)
-    every = float(np.linalg.norm(motions))
+    total = float(np.linalg.norm(motions))
     moved = motions @ null
     _, s, vt = np.linalg.svd(_without_span([base, platform], moved), full_matrices=False)
     # directions are those of the last linearization, motions those after the last step of the fit
-    gauge = vt[s <= SAME_MOTION * every].T
+    gauge = vt[s <= SAME_MOTION * total].T
     moving = moved @ gauge
     _, s, combine = np.linalg.svd(moving, full_matrices=False)
-    moving = moving @ combine[s > NO_MOTION * every].T
+    moving = moving @ combine[s > NO_MOTION * total].T
     count = moving.shape[1]
     frames: tuple[str, ...] = ("base", "platform") if count else ()
     for name, frame in (("base", base), ("platform", platform)):
         rest = float(np.linalg.norm(_without_span([frame], moving)))
-        if len(frames) == 2 and rest <= SAME_MOTION * every:
+        if len(frames) == 2 and rest <= SAME_MOTION * total:
             frames = (name,)  # only one where it suffices
     infinite = np.isinf(posterior.variance[~posterior.determined])
     kept = null @ _gauge_projector(gauge, infinite)
@@ -113,7 +113,7 @@ def find_frame_motions(posterior: Posterior) -> FrameMotions:
     growth = np.zeros((int(usable.sum()), 6, 1))
     growth[:, 3:, 0] = state.T[0, usable, :3, 3]
     rest = _without_span([base, platform, growth.reshape(-1, 1)], moved)
-    with_scale = np.linalg.svd(rest, compute_uv=False) <= SAME_MOTION * every
+    with_scale = np.linalg.svd(rest, compute_uv=False) <= SAME_MOTION * total
     return FrameMotions(kept, frames, count, explained, bool(with_scale.sum() > gauge.shape[1]))
 
 

@@ -279,12 +279,12 @@ def _find_move(
     )
     if split is None:
         return None, 0.0
-    whole, parts = measure(0, len(T)), measure(0, split) + measure(split, len(T))
+    unsplit, divided = measure(0, len(T)), measure(0, split) + measure(split, len(T))
     numbers = 3 * int(is_present.sum())
     share = (numbers - 2 * unknowns) / (numbers - unknowns)
-    if not (share > 0.0 and np.isfinite(whole) and parts * DOUBTED**2 < whole * share):
+    if not (share > 0.0 and np.isfinite(unsplit) and divided * DOUBTED**2 < unsplit * share):
         return None, 0.0
-    return split, float(np.sqrt(whole * share / parts)) if parts > 0.0 else np.inf
+    return split, float(np.sqrt(unsplit * share / divided)) if divided > 0.0 else np.inf
 
 
 def find_other_scale(

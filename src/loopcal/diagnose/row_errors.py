@@ -325,9 +325,9 @@ def summarize_kinds(totals: Mapping[str, FloatArray]) -> tuple[KindErrors, ...]:
 
     `totals` are the count and the sums of squares before, after and of the change, of each kind.
     """
-    every = {**totals, "all": np.sum([np.zeros(4), *totals.values()], axis=0)}
+    with_sum = {**totals, "all": np.sum([np.zeros(4), *totals.values()], axis=0)}
     kinds = []
-    for name, (n, *squares) in every.items():
+    for name, (n, *squares) in with_sum.items():
         roots = [float(np.sqrt(square / n)) if n else np.nan for square in squares]
         kinds.append(KindErrors(name, int(n), roots[0], roots[1], change=roots[2]))
     return tuple(kinds)

@@ -145,8 +145,8 @@ def judge_useful_accuracy(
     _, s, vt = np.linalg.svd(analysis.factor * (unit / free.tolerance))
     s = np.where(s > np.finfo(np.float64).eps * len(s) * s[0], s, 0.0)
     count = int((s >= 1.0).sum())
-    parts = np.where(np.abs(vt) > NULL_COMPONENT, vt, 0.0)
-    sd = np.sqrt((_divide(parts, s[:, None]) ** 2).sum(axis=0))
+    components = _without_rounding(vt)
+    sd = np.sqrt((_divide(components, s[:, None]) ** 2).sum(axis=0))
     return UsefulAccuracy(
         free_parameters=free,
         length=length,
@@ -181,12 +181,12 @@ def _name_combinations(
     return tuple(sorted(combinations, key=lambda combination: combination.sd))
 
 
-def _without_rounding(parts: FloatArray) -> FloatArray:
-    """Return parts of directions with zero for those that are rounding."""
-    return np.where(np.abs(parts) > NULL_COMPONENT, parts, 0.0)
+def _without_rounding(components: FloatArray) -> FloatArray:
+    """Return components of directions, with zero for those that are rounding."""
+    return np.where(np.abs(components) > NULL_COMPONENT, components, 0.0)
 
 
-def _divide(parts: FloatArray, s: FloatArray) -> FloatArray:
-    """Return parts / s; infinite where s is zero and the part is not, zero where the part is."""
+def _divide(components: FloatArray, s: FloatArray) -> FloatArray:
+    """Return components / s; infinite where only s is zero, zero where the component is."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(parts == 0.0, 0.0, parts / s)
+        return np.where(components == 0.0, 0.0, components / s)

@@ -267,7 +267,7 @@ def refuse_other_dimensions(
         )
     for machine in (robot, stored):
         known, q = machine.values[None], draw_readings(machine)
-        states = [forward_trials(one, known, q) for one in (robot, stored)]
+        states = [forward_trials(compared, known, q) for compared in (robot, stored)]
         is_reached = np.all([s.status[0] == Status.CONVERGED for s in states], axis=0)
         if is_reached.any():
             break

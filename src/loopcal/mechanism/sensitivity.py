@@ -209,12 +209,12 @@ def differentiate_sensed_values(
 ) -> PassiveSensitivity:
     """Differentiate passive joints and the numbers of platforms of stages, by name."""
     known: list[str] = []
-    parts: list[tuple[FloatArray, FloatArray]] = []
+    derivatives: list[tuple[FloatArray, FloatArray]] = []
     for stage in robot.stages:
         entries = name_platform_entries(stage.name)
         if not set(entries).isdisjoint(names):
             known += entries
-            parts.append(
+            derivatives.append(
                 differentiate_platform_entries(
                     robot, values, q, state, differentiate_pose, stage.name
                 )
@@ -222,7 +222,9 @@ def differentiate_sensed_values(
     if not set(names) <= set(known):
         joints = differentiate_passive_joints(robot, values, q, state)
         known += joints.names
-        parts.append((joints.parameters, joints.readings))
+        derivatives.append((joints.parameters, joints.readings))
     places = [known.index(name) for name in names]
-    whole = (np.concatenate(arrays, axis=2)[:, :, places] for arrays in zip(*parts, strict=True))
-    return PassiveSensitivity(tuple(names), *whole)
+    selected = (
+        np.concatenate(arrays, axis=2)[:, :, places] for arrays in zip(*derivatives, strict=True)
+    )
+    return PassiveSensitivity(tuple(names), *selected)

@@ -284,7 +284,7 @@ def _count_equations(stated: Comparison | None, search: Search) -> int:
     """
     chosen = None if search.selection is None else search.selection.comparison
     compared = [c.linearization for c in (stated, chosen) if c is not None]
-    counts = [int(one.equations[0]) for one in compared if one is not None]
+    counts = [int(linear.equations[0]) for linear in compared if linear is not None]
     return min(counts, default=FEWEST_TO_REFUSE)
 
 

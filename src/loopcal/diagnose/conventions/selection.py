@@ -212,11 +212,11 @@ def _test_pairs(
             changed = base.interpretation.apply(data)
             if of_readings:
                 reach = select_reached(free, changed)
-                there = reach.data if reach.is_enough else None
+                changed_reached = reach.data if reach.is_enough else None
             else:
-                there = None if reached is None else base.interpretation.apply(reached)
+                changed_reached = None if reached is None else base.interpretation.apply(reached)
             bound = min(misfit, base.quick)
-            for test in _test_all(free, changed, there, bound, NEAREST_IN_PAIRS):
+            for test in _test_all(free, changed, changed_reached, bound, NEAREST_IN_PAIRS):
                 yield test._replace(
                     interpretation=combine(base.interpretation, test.interpretation)
                 )

@@ -38,7 +38,11 @@ def explain_outside_strokes(
     if check.misfit <= ALLOWED:
         return report_finding("conventions.strokes-contradicted", **described)
     candidates = () if check.interpretation is None else (check.interpretation, *check.alternatives)
-    inside = [one for one in candidates if describe_outside_strokes(one.apply(data), robot) is None]
+    inside = [
+        candidate
+        for candidate in candidates
+        if describe_outside_strokes(candidate.apply(data), robot) is None
+    ]
     if not inside or not check.other_misfit <= ALLOWED:
         return None
     comparison = judge_data(
@@ -50,6 +54,6 @@ def explain_outside_strokes(
         "conventions.strokes-explained",
         **described,
         interpretation=inside[0].describe(),
-        alternatives=tuple(one.describe() for one in inside[1:]),
+        alternatives=tuple(interpretation.describe() for interpretation in inside[1:]),
         other_residuals=list_rms_residuals(comparison),
     )

@@ -144,11 +144,11 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     ----------
     first, second : with `information`, of the same parameters.
     """
-    one, two = first.information, second.information
-    assert one is not None
-    assert two is not None
+    before, after = first.information, second.information
+    assert before is not None
+    assert after is not None
     unit = first.unit
-    rows, values = zip(*(_divide_by_noise(i) for i in (one, two)), strict=True)
+    rows, values = zip(*(_divide_by_noise(i) for i in (before, after)), strict=True)
     # both deviations from the nominal values of the first
     offset = second.robot.nominal.values[second.places] - first.robot.nominal.values[first.places]
     values = (values[0], values[1] + rows[1] @ offset)
@@ -160,7 +160,7 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     count = len(scaled[0])
     slope, value = left[:, count:] @ scaled[1] / unit, left @ np.concatenate(values)
     parts = (left[:, :count], left[:, count:])
-    return _whiten(first, second, slope, value, parts, (one, two))
+    return _whiten(first, second, slope, value, parts, (before, after))
 
 
 def _divide_by_noise(information: DataInformation) -> tuple[FloatArray, FloatArray]:

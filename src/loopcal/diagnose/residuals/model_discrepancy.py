@@ -118,8 +118,8 @@ def find_slow_errors(
         describe_smooth_errors(T, tool, fit.robot.size, length, by_rotation=by_rotation)
         for length, by_rotation in KERNELS
     )
-    every = (project_slow_errors(fit, data, linear, errors) for errors in kernels)
-    tested = [rows for rows in every if rows is not None]
+    projected = (project_slow_errors(fit, data, linear, errors) for errors in kernels)
+    tested = [rows for rows in projected if rows is not None]
     level = compute_single_level(LEVEL, len(tested))
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     slow = [SlowErrors(rows, detect_slow_errors(rows, known, level)) for rows in tested]

@@ -118,8 +118,8 @@ class Singularity(HtmlResult):
         return report_finding(code, **self._describe(row))
 
     def _describe(self, row: int) -> dict[str, Any]:
-        """Return the data of a row for its findings."""
-        data: dict[str, Any] = {
+        """Return the numbers and names of a row that its findings state."""
+        described: dict[str, Any] = {
             "row": row,
             "margin": float(self.margin[row]),
             "ratio": float(self.ratio[row]),
@@ -127,10 +127,10 @@ class Singularity(HtmlResult):
             "actuator": None,
         }
         if self.drive_ratio[row] < NEAR_SHARE:
-            data["actuator"] = self.actuators[self.drive[row]]
-            data["drive_margin"] = float(self.drive_margin[row])
-            data["drive_ratio"] = float(self.drive_ratio[row])
-        return data
+            described["actuator"] = self.actuators[self.drive[row]]
+            described["drive_margin"] = float(self.drive_margin[row])
+            described["drive_ratio"] = float(self.drive_ratio[row])
+        return described
 
     def list_path_warnings(self) -> Iterator[tuple[int, Finding]]:
         """Yield steps not reached, sign changes and stretches close to a singularity."""
@@ -147,9 +147,9 @@ class Singularity(HtmlResult):
                 beyond = np.flatnonzero(~near[i:])
                 stretch = np.arange(i, i + int(beyond[0]) if beyond.size else len(sign))
                 ratio = np.fmin(self.ratio, self.drive_ratio)[stretch]
-                data = self._describe(int(stretch[np.argmin(ratio)]))
+                nearest = self._describe(int(stretch[np.argmin(ratio)]))
                 last = int(stretch[-1])
-                yield i, report_finding("singularity.path-near", first=i, last=last, **data)
+                yield i, report_finding("singularity.path-near", first=i, last=last, **nearest)
 
 
 def analyze_singularity(

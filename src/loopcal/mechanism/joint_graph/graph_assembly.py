@@ -122,26 +122,30 @@ def _refuse_repeated(joints: Sequence[GraphJoint]) -> None:
 def _merge_pins(
     base: str, joints: list[GraphJoint], motors: tuple[str, ...]
 ) -> tuple[GraphJoint, ...]:
-    """Return the joints with each two about one axis of a body with nothing else as one pin."""
+    """Return the joints, in which two about one axis that hold a body without other joints are one
+    pin.
+    """
     for body in dict.fromkeys(name for j in joints for name in (j.body_a, j.body_b)):
         ends = [joint for joint in joints if body in (joint.body_a, joint.body_b)]
         if body == base or len(ends) != 2 or not _are_coaxial(body, *ends):
             continue
-        one, other = ends
-        if {one.name, other.name} & {*motors} or not (one.origin_a and other.origin_a):
+        first, second = ends
+        if {first.name, second.name} & {*motors} or not (first.origin_a and second.origin_a):
             continue
-        pin = replace(one, body_b=other.body_a, T_b=other.T_a, origin_b=other.origin_a, limits=None)
+        pin = replace(
+            first, body_b=second.body_a, T_b=second.T_a, origin_b=second.origin_a, limits=None
+        )
         joints = [joint for joint in joints if joint not in ends]
         joints.append(pin)
     return tuple(joints)
 
 
-def _are_coaxial(body: str, one: GraphJoint, other: GraphJoint) -> bool:
+def _are_coaxial(body: str, first: GraphJoint, second: GraphJoint) -> bool:
     """Return whether two rotary joints carry a body at the same frame and axis."""
-    if one.kind != "R" or other.kind != "R" or not one.body_b == other.body_b == body:
+    if first.kind != "R" or second.kind != "R" or not first.body_b == second.body_b == body:
         return False
-    same_frame = np.abs(one.T_b - other.T_b).max() < COAXIAL
-    return bool(same_frame and np.abs(one.axis - other.axis).max() < COAXIAL)
+    same_frame = np.abs(first.T_b - second.T_b).max() < COAXIAL
+    return bool(same_frame and np.abs(first.axis - second.axis).max() < COAXIAL)
 
 
 def _span_tree(

@@ -90,11 +90,11 @@ def find_perpendicular(axis: FloatArray, near: FloatArray) -> FloatArray:
     return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
 
 
-def turn_between(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return a rotation (3, 3) that turns one unit vector into another."""
-    across = np.cross(one, other)
-    sine, cosine = float(np.linalg.norm(across)), float(one @ other)
+def turn_between(vector: FloatArray, target: FloatArray) -> FloatArray:
+    """Return a rotation (3, 3) that turns a unit vector into another."""
+    across = np.cross(vector, target)
+    sine, cosine = float(np.linalg.norm(across)), float(vector @ target)
     if sine < 1e-12:
-        across, sine = find_perpendicular(one, one), 1.0
+        across, sine = find_perpendicular(vector, vector), 1.0
         return geometry.exp_so3(across * (0.0 if cosine > 0 else np.pi))
     return geometry.exp_so3(across / sine * np.arctan2(sine, cosine))

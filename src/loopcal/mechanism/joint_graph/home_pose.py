@@ -104,9 +104,9 @@ def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
     idle = rates @ V[mobility:].T
     moved = np.abs(idle).max(axis=1, initial=0.0) > IDLE
     rows = graph.linearize(q[None])[1][0][:, passive]
-    held = int(passive.sum()) - idle.shape[1]
+    n_held = int(passive.sum()) - idle.shape[1]
     hold = np.linalg.svd(rows, compute_uv=False) if rows.size else np.ones(0)
-    firmness = 1.0 if held == 0 else 0.0 if held > len(hold) else float(hold[held - 1])
+    firmness = 1.0 if n_held == 0 else 0.0 if n_held > len(hold) else float(hold[n_held - 1])
     moves = np.linalg.svd(twists @ rates @ V[:mobility].T, compute_uv=False)
     firmness *= float(moves[-1]) if len(moves) else 0.0
     names = tuple(name for name, is_moved in zip(graph.names, moved, strict=True) if is_moved)

@@ -247,18 +247,18 @@ def solve_readings(
     joints = driven_values(robot.program, first)
     q = readings_from_joints(joints, tau, robot.slots.frequency).reshape(t * n, -1)
     start = rows.evaluate(q, first)
-    found = _solve_within_reach(rows, start, first, propose, follow)
-    status = found.state.status.ravel()
+    last = _solve_within_reach(rows, start, first, propose, follow)
+    status = last.state.status.ravel()
     status = np.where(
-        (status == CONVERGED) & _is_in_other_mode(found, start.sign),
+        (status == CONVERGED) & _is_in_other_mode(last, start.sign),
         np.int8(Status.OTHER_MODE),
         status,
     )
     status = np.where(np.isfinite(wanted).all(axis=1), status, np.int8(NOT_FINITE))
-    T = found.state.T.reshape(-1, 4, 4)
+    T = last.state.T.reshape(-1, 4, 4)
     left = np.linalg.norm(compare_coordinates(T, wanted, robot.controlled, robot.size)[0], axis=1)
     state = replace(
-        found.state,
+        last.state,
         status=status.reshape(shape),
         residual=np.where(status == CONVERGED, 0.0, left).reshape(shape),
     )
@@ -273,17 +273,17 @@ def _solve_within_reach(
     Rows whose target is farther away than the links span stay at the start.
     """
     is_near = measure_target_excess(rows.robot, rows.values, rows.target) <= 0.0
-    found = replace(start, state=_mark_stalled(start.state))
+    solved = replace(start, state=_mark_stalled(start.state))
     near = np.flatnonzero(is_near)
     if not len(near):
-        return found
+        return solved
     own, begin = rows.select(near), rows.take(replace(start, state=first), near)
     direct = own.iterate(*_begin_near_targets(own, begin.q, begin.state, propose))
-    found = rows.put(found, near, direct)
-    wrong = near[_is_wrong(rows.take(found, near), start.sign[near])]
+    solved = rows.put(solved, near, direct)
+    wrong = near[_is_wrong(rows.take(solved, near), start.sign[near])]
     if not (follow and len(wrong)):
-        return found
-    return rows.put(found, wrong, _follow_path(rows.select(wrong), rows.take(start, wrong)))
+        return solved
+    return rows.put(solved, wrong, _follow_path(rows.select(wrong), rows.take(start, wrong)))
 
 
 def _mark_stalled(state: State) -> State:
@@ -313,14 +313,14 @@ def _begin_near_targets(
     return np.where(good[:, None], own, q), map_arrays(choose, near, first)
 
 
-def _is_wrong(found: _Iterate, sign: FloatArray) -> BoolArray:
+def _is_wrong(solved: _Iterate, sign: FloatArray) -> BoolArray:
     """Return the rows (R,) that failed, or are in another mode than the start with this sign."""
-    return (found.state.status.ravel() != CONVERGED) | _is_in_other_mode(found, sign)
+    return (solved.state.status.ravel() != CONVERGED) | _is_in_other_mode(solved, sign)
 
 
-def _is_in_other_mode(found: _Iterate, sign: FloatArray) -> BoolArray:
+def _is_in_other_mode(solved: _Iterate, sign: FloatArray) -> BoolArray:
     """Return the rows (R,) whose sign is not that of the start; a start that is open has none."""
-    return (found.sign != sign) & (sign != 0.0)
+    return (solved.sign != sign) & (sign != 0.0)
 
 
 def _follow_path(rows: _Rows, start: _Iterate) -> _Iterate:

@@ -144,11 +144,11 @@ def list_carrying_stages(robot: Mechanism, end: int = -1) -> list[int]:
 
 def find_carrying_actuators(robot: Mechanism) -> IntArray:
     """Return the places of the actuators that move the end platform."""
-    every = np.arange(len(robot.actuators))
+    places = np.arange(len(robot.actuators))
     if not robot.stages:
-        return every
+        return places
     stages = [robot.stages[i] for i in list_carrying_stages(robot)]
-    return np.concatenate([every[stage.actuators] for stage in stages])
+    return np.concatenate([places[stage.actuators] for stage in stages])
 
 
 def transport_to_end(robot: Mechanism, state: State, end: int) -> list[tuple[int, FloatArray]]:

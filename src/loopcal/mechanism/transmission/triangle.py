@@ -93,9 +93,8 @@ def differentiate_length(angle: FloatArray, triangle: FloatArray) -> tuple[Float
     slope = np.swapaxes(geometry.left_jacobian_so3(skew), -1, -2)
     by_skew = np.einsum("...ij,...j->...i", slope, tilt)[..., :2]
     shape = np.broadcast_shapes(n.shape, (*by_skew.shape[:-1], 1))[:-1]
-    parts = (n, -back, by_skew)
-    every = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts]
-    return arm, np.concatenate(every, axis=-1)
+    slopes = [np.broadcast_to(d, (*shape, d.shape[-1])) for d in (n, -back, by_skew)]
+    return arm, np.concatenate(slopes, axis=-1)
 
 
 def _describe(triangle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
