@@ -21,6 +21,8 @@ from typing import Any
 INFINITE = "infinite: these data do not determine it, or it is divided by zero"
 UNDEFINED = "undefined: there is nothing to compute it from"
 
+_PLAIN = frozenset({type(None), bool, int, str})
+
 
 def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ...] = ()) -> Any:
     """Return a value as dictionaries, lists, strings, numbers, booleans and None.
@@ -42,6 +44,8 @@ def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ..
     >>> to_json({"sd": float("inf"), "names": ("a", "b")})
     {'sd': None, 'names': ['a', 'b']}
     """
+    if type(value) in _PLAIN:  # most values: no other question is asked about them
+        return value
     if isinstance(value, Enum):
         return value.name.lower()
     if value is None or isinstance(value, bool | str):

@@ -65,12 +65,20 @@ UNUSED = {
         "pydantic",
         "unittest",
         "numpy.f2py",
+        "numpy.ma",
         "numpy.testing",
     ),
     *("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.sparse", "scipy.linalg"),
     *("loopcal.planning", "loopcal.sampling", "loopcal.studies", "loopcal.documents"),
     *("loopcal.report.figures", "loopcal.mechanism.families.limbs", "loopcal.apply.compensation"),
     *("loopcal.diagnose.model_choice", "loopcal.apply.run_comparison.comparison"),
+    *("loopcal.mechanism.stages.chain_state", "loopcal.mechanism.actuation.summed_drives"),
+    *("loopcal.mechanism.closure.open_closure", "loopcal.mechanism.compilation.chain_compilation"),
+    *("loopcal.estimate.poses.uncertain", "loopcal.estimate.poses.estimate"),
+    *("loopcal.estimate.poses.components", "loopcal.estimate.poses.initialization"),
+    *("loopcal.measure.instrument", "loopcal.measure.simulation", "loopcal.measure.initial_values"),
+    *("loopcal.measure.kinds.points.position", "loopcal.measure.kinds.surfaces.plane"),
+    "loopcal.geometry.alignment",
 }
 """Packages that an ordinary calibration does not need, each of which takes time to import."""
 

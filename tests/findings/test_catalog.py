@@ -16,7 +16,7 @@ import pytest
 import loopcal
 from loopcal.errors import EstimationError
 from loopcal.findings import Quantity, Severity, report_finding
-from loopcal.findings.catalog import FILES, load_catalog, phrases, read_document
+from loopcal.findings.catalog import FILES, find_entry, load_catalog, phrases, read_document
 from loopcal.serialization import to_json
 from tools import findings_reference
 
@@ -88,6 +88,16 @@ def test_refusals_and_failures_state_an_action():
 def test_each_catalog_file_contains_its_listed_subjects():
     for file, subjects in FILES.items():
         assert read_document(file).keys() == {"title", *subjects}
+
+
+def test_an_entry_that_is_parsed_alone_is_that_of_its_file() -> None:
+    assert {code: find_entry(code) for code in CATALOG} == CATALOG
+
+
+@pytest.mark.parametrize("code", ["fit.no-such-code", "nothing.no-descent", "fit", ""])
+def test_a_code_that_is_not_in_the_catalog_is_a_key_error(code) -> None:
+    with pytest.raises(KeyError):
+        find_entry(code)
 
 
 def test_every_phrase_is_used():

@@ -36,6 +36,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Observations
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 from loopcal.units import Unit
@@ -332,7 +333,7 @@ def _group_similar(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
         return moments, np.ones(e)
     single = e - MOST // 2
     starts = np.linspace(0, single, MOST // 2, endpoint=False).astype(np.intp)
-    starts = np.concatenate([np.unique(starts), np.arange(single, e)])
+    starts = np.concatenate([find_distinct(starts), np.arange(single, e)])
     count = np.diff(starts, append=e).astype(np.float64)
     order = np.argsort(moments[0, 0], kind="stable")
     return np.add.reduceat(moments[:, :, order], starts, axis=2) / count, count

@@ -25,8 +25,7 @@ from loopcal.diagnose.row_errors import Statistics, compute_statistics
 from loopcal.errors import DataError
 from loopcal.estimate.result import Identification
 from loopcal.findings.wording import round_to_digits
-from loopcal.measure import Measurements, Observations
-from loopcal.measure.kinds import Component, Plane
+from loopcal.measure import Measurements, Observations, kinds
 from loopcal.mechanism.assembly import AXES
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray
@@ -185,9 +184,11 @@ def measures_only_heights(data: Measurements) -> bool:
 def _measures_height(rows: Observations) -> bool:
     """Return whether each row measures one height: z of the tool, or the gap of one target."""
     kind = rows.kind
-    if isinstance(kind, Component):
+    if rows.measured.shape[1] != 1:
+        return False
+    if isinstance(kind, kinds.Component):
         return kind.components == ("z",) and bool(kind.T_base_frame[2, 2] > UPRIGHT)
-    return isinstance(kind, Plane) and len(kind.targets) == 1
+    return isinstance(kind, kinds.Plane) and len(kind.targets) == 1
 
 
 def _list_heights(
@@ -201,7 +202,7 @@ def _list_heights(
             continue
         points = _locate_points(compared.after.T[0, o.rows.reshape(len(o))], o, robot)
         extent = np.ptp(points, axis=0)
-        if isinstance(o.kind, Plane) and extent[2] > LEVEL * extent[:2].max():
+        if isinstance(o.kind, kinds.Plane) and extent[2] > LEVEL * extent[:2].max():
             continue  # a wall
         labels = tuple(compared.data.labels[k] for k in o.rows.reshape(len(o)))
         yield labels, points[:, :2], before[i][:, 0], after[i][:, 0]
@@ -211,8 +212,8 @@ def _locate_points(T: FloatArray, rows: Observations, robot: Mechanism) -> Float
     """Return the touching points (r, 3) [m] in the base, with the tool or target as stated."""
     kind = rows.kind
     place = robot.tool[:3, 3]
-    if isinstance(kind, Component) and kind.T_platform_tool is not None:
+    if isinstance(kind, kinds.Component) and kind.T_platform_tool is not None:
         place = kind.T_platform_tool[:3, 3]
-    if isinstance(kind, Plane) and kind.places is not None:
+    if isinstance(kind, kinds.Plane) and kind.places is not None:
         place = kind.places[0]
     return T[:, :3, :3] @ place + T[:, :3, 3]

@@ -23,6 +23,7 @@ from loopcal.measure import Measurements
 from loopcal.measure.array_checks import check_number
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_chi_square_quantile
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.units import Unit
 
 FEW_ROWS = 5
@@ -122,7 +123,7 @@ def report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]
 
 def report_few_rows(after: PoseErrors) -> list[Finding]:
     """Report quantities that too few rows measure."""
-    counts = {name: len(np.unique(errors.rows)) for name, errors in after.quantities.items()}
+    counts = {name: len(find_distinct(errors.rows)) for name, errors in after.quantities.items()}
     return [
         report_finding("validation.few-rows", quantity=quantity, count=count)
         for quantity, count in counts.items()

@@ -20,10 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine, geometry
+from loopcal import engine, geometry, measure
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.geometry.alignment import FLATNESS, align_point_sets
-from loopcal.measure import Measurements, Observations, Position
+from loopcal.measure import Measurements, Observations
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import decompose, empty_factor
 from loopcal.numerics.multiple_tests import compute_any_probability
@@ -99,7 +98,7 @@ class _Repeats(NamedTuple):
     (E, 3 k, 3 k) of their rows, and sessions (E,).
     """
 
-    kind: Position
+    kind: measure.Position
     points: FloatArray
     whitener: FloatArray
     session: list[str]
@@ -184,7 +183,7 @@ def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements
     for rows in data.base_observations:
         kind, measured = rows.kind, np.array(rows.measured)
         for shape in changed:
-            if isinstance(kind, Position) and (kind.frame, kind.targets) == (
+            if isinstance(kind, measure.Position) and (kind.frame, kind.targets) == (
                 shape.frame,
                 shape.targets,
             ):
@@ -236,7 +235,7 @@ def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
     return tuple(tests)
 
 
-def _states_places(kind: Position) -> bool:
+def _states_places(kind: measure.Position) -> bool:
     """Return whether the places of targets are known."""
     return "targets" not in kind.unknown
 
@@ -248,11 +247,11 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
     """
     groups: dict[tuple[str, tuple[str, ...]], list[Observations]] = {}
     for rows in data.base_observations:
-        if isinstance(rows.kind, Position):
+        if isinstance(rows.kind, measure.Position):
             groups.setdefault((rows.kind.frame, rows.kind.targets), []).append(rows)
     for alike in groups.values():
         kind = alike[0].kind
-        assert isinstance(kind, Position)
+        assert isinstance(kind, measure.Position)
         order = [_order_rows(rows) for rows in alike]
         pairs = list(zip(alike, order, strict=True))
         measured = np.concatenate([rows.measured[i] for rows, i in pairs])
@@ -282,12 +281,16 @@ def _spans_plane(points: FloatArray) -> bool:
     measured = points[np.isfinite(points).all(axis=1)]
     if len(measured) < 3:
         return False
+    from loopcal.geometry.alignment import FLATNESS
+
     extent = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
     return bool(extent[1] > FLATNESS * extent[0])
 
 
 def _align_each(repeats: _Repeats) -> _Repeats:
     """Return the measurements, each moved to the first one with which it shares enough targets."""
+    from loopcal.geometry.alignment import align_point_sets
+
     points, whitener = repeats.points.copy(), repeats.whitener.copy()
     for i in range(1, len(points)):
         for first in points[:i]:

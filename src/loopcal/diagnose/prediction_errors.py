@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal import measure
 from loopcal.diagnose.row_errors import READINGS, KindErrors, compute_kind_errors, summarize_kinds
 from loopcal.errors import DataError
 from loopcal.estimate.poses.prediction import PoseFit, fit_poses, predict_from_readings
@@ -23,7 +24,6 @@ from loopcal.measure import (
     Measurements,
     NuisanceParameters,
     Observations,
-    guess_nuisance_values,
     list_sensed_joints,
     select_joint_values,
 )
@@ -289,7 +289,7 @@ def predict_poses(
     values, kept = unknowns.values(), ()
     if setup is not None and len(unknowns):
         kept = tuple(name for name in unknowns.table.names if name in setup)
-        values = guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
+        values = measure.guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 

@@ -14,6 +14,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Solution, differentiate_pose, forward
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 MOST_POSES = 1000
@@ -80,4 +81,4 @@ def locate_measured_poses(
 
 def choose_evenly(count: int, most: int) -> IntArray:
     """Return at most so many of the numbers below `count`, evenly chosen."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
+    return find_distinct(np.linspace(0, count - 1, min(most, count)).astype(np.int64))

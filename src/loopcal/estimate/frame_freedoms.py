@@ -36,6 +36,7 @@ from loopcal.estimate.problem import Problem
 from loopcal.measure import Evaluation, Measurements, NuisanceParameters
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.numerics.decomposition import empty_factor
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray
 
@@ -233,7 +234,7 @@ def list_instrument_frames(data: Measurements) -> Iterable[tuple[str, FloatArray
         if len(rows.kind.possible_setup["frame"].parameters) != 6:
             continue
         is_unknown = "frame" in rows.kind.unknown
-        for session in np.unique(rows.session).tolist():
+        for session in find_distinct(rows.session).tolist():
             full = f"{session}.{name}" if session else name
             listed[full] = (cast(FloatArray, stated), is_unknown)
     return [(name, *parts) for name, parts in listed.items()]

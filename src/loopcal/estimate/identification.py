@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,12 +57,6 @@ from loopcal.estimate.nuisance.estimate import (
 )
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.poses.estimate import (
-    EstimatedPoses,
-    estimate_poses,
-    report_doubtful_readings,
-    report_uneven_sigmas,
-)
 from loopcal.estimate.poses.open_poses import find_open_poses
 from loopcal.estimate.poses.states import PoseEstimates
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
@@ -73,6 +69,9 @@ from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism, find_impossible_values
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, Progress, report_no_progress
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.estimate import EstimatedPoses
 
 
 def identify(
@@ -199,7 +198,7 @@ def _assemble(
     null_space = plain.null_space()
     unidentifiable = add_followers(describe_null_space(free, null_space), null_space, nuisance)
     excluded = tuple(options.excluded_poses)
-    poses = None if estimate.poses is None else estimate_poses(estimate.poses, data, excluded)
+    poses = _estimate_poses(estimate.poses, data, excluded)
     history = _record_history(free, fit)
     regularization = describe_regularization(method, d, penalty)
     findings = [
@@ -289,11 +288,24 @@ def _report_closure(problem: Problem, options: FitOptions, fit: Descent) -> list
     return [] if unused is None else [unused]
 
 
+def _estimate_poses(
+    estimates: PoseEstimates | None, data: Measurements, excluded: Sequence[str]
+) -> EstimatedPoses | None:
+    """Return the poses that were estimated; None where the readings are exact."""
+    if estimates is None:
+        return None
+    from loopcal.estimate.poses.estimate import estimate_poses
+
+    return estimate_poses(estimates, data, excluded)
+
+
 def _report_poses(
     problem: Problem, robot: Mechanism, poses: EstimatedPoses | None
 ) -> list[Finding]:
     """Return findings on poses and readings that were estimated."""
     if poses is None:
         return []
+    from loopcal.estimate.poses.estimate import report_doubtful_readings, report_uneven_sigmas
+
     doubtful = report_doubtful_readings(robot, poses)
     return [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]

@@ -14,18 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, measure
 from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_at_readings
 from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import (
-    Measurements,
-    NuisanceParameters,
-    evaluate_measurements,
-    resolve_reading_sigma,
-    whiten_rows,
-)
+from loopcal.measure import Measurements, NuisanceParameters, resolve_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.column_elimination import eliminate_from_factor
 from loopcal.numerics.decomposition import empty_factor
@@ -93,10 +87,10 @@ def observe_rows(
     those of `poses.linearized`.
     """
     linearized = poses.linearized
-    evaluated = evaluate_measurements(
+    evaluated = measure.evaluate_measurements(
         measured, linearized.T, values[None], nuisance, linearized.joints
     )
-    rows = whiten_rows(evaluated, linearized.by_parameters, linearized.joints_by_parameters)
+    rows = measure.whiten_rows(evaluated, linearized.by_parameters, linearized.joints_by_parameters)
     p, u = linearized.by_parameters.shape[-1], len(nuisance)
     return np.concatenate([rows[..., p : p + u], rows[..., :p], rows[..., p + u :]], axis=-1)
 

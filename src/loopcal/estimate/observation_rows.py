@@ -18,6 +18,7 @@ import numpy as np
 from loopcal.measure import Kind, Measurements
 from loopcal.measure.kinds.rows import MeasuredColumns
 from loopcal.numerics.elimination_tree import find_connected_groups
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BLOCK = 2048
@@ -210,7 +211,7 @@ def divide_poses(
     nothing = np.zeros(0, dtype=np.int64)
     for i, run in enumerate(inside):
         for linking in _chunks(np.flatnonzero(run < 0), size // 2):
-            poses = np.unique(rows[i].poses[linking])
+            poses = find_distinct(rows[i].poses[linking])
             chosen = tuple(linking if j == i else nothing for j in range(len(rows)))
             blocks.append(make_block(poses, readings, rows, chosen, is_needed))
     return tuple(blocks)

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,19 +35,21 @@ from loopcal.estimate.observation_rows import (
     count_by_component,
 )
 from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
-from loopcal.estimate.poses.coordinates import PoseCoordinates
-from loopcal.estimate.poses.division import divide_exact_poses, divide_uncertain_poses
+from loopcal.estimate.poses.division import divide_exact_poses
 from loopcal.estimate.poses.exact import ExactPoses
-from loopcal.estimate.poses.initialization import first_poses
 from loopcal.estimate.poses.leverage import spread_rows
 from loopcal.estimate.poses.linearization import LinearizedPoses, evaluate_rows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
-from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.measure import Evaluation, Measurements
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
+from loopcal.numerics.trial_batch import select_counts
 from loopcal.typing import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.coordinates import PoseCoordinates
+    from loopcal.estimate.poses.uncertain import UncertainPoses
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +91,13 @@ class Problem:
     @cached_property
     def poses(self) -> ExactPoses | UncertainPoses:
         """Rows at the poses, which readings determine or which are estimated."""
-        free, rows, nuisance = self.free, self.rows, self.nuisance
+        observed = self.free, self.readings[0], self.rows, self.nuisance
         if self.coordinates is None:
-            return divide_exact_poses(free, self.readings[0], rows, nuisance, self.located, BLOCK)
+            return divide_exact_poses(*observed, self.located, BLOCK)
+        from loopcal.estimate.poses.uncertain_division import divide_uncertain_poses
+
         assert self.member is not None
-        moved = self.coordinates, self.member, BLOCK
-        return divide_uncertain_poses(free, self.readings[0], rows, nuisance, *moved)
+        return divide_uncertain_poses(*observed, self.coordinates, self.member, BLOCK)
 
     @cached_property
     def component_count(self) -> IntArray:
@@ -118,7 +122,7 @@ class Problem:
     @property
     def residual_count(self) -> IntArray:
         """(t,) residuals that are present."""
-        return _of_trials(self.component_count.sum(axis=1), self.trials)
+        return select_counts(self.component_count.sum(axis=1), self.trials)
 
     @property
     def equations(self) -> IntArray:
@@ -131,7 +135,7 @@ class Problem:
             free = self.coordinates.is_free(np.arange(len(self.member))).sum(axis=1)
             used = np.bincount(self.member, free, count.shape[1]).astype(np.int64)
             count = np.maximum(count - used, 0)
-        return _of_trials(count.sum(axis=1), self.trials)
+        return select_counts(count.sum(axis=1), self.trials)
 
     def take(self, trials: IntArray) -> Problem:
         """Return the problem of some trials; this object where these are all of them."""
@@ -304,7 +308,7 @@ class Problem:
         `member` (n,) is the block of each pose.
         """
         total = np.zeros(count, dtype=np.int64)
-        if isinstance(self.poses, UncertainPoses):
+        if not isinstance(self.poses, ExactPoses):
             k, first = self.poses.coordinates.freedoms, self.poses.first_pose
             for group in (group for groups in self.poses.groups for group in groups):
                 height = max(group.height, group.poses.shape[1] * k)
@@ -312,8 +316,7 @@ class Problem:
                 total += height * np.bincount(blocks, minlength=count)
             return total
         for r in (r for r in self.rows if not r.kind.is_of_base):
-            blocks = member[r.first_poses]
-            total += np.bincount(blocks, minlength=count) * r.whitener.shape[-1]
+            total += np.bincount(member[r.first_poses], minlength=count) * r.whitener.shape[-1]
         return total
 
     def count_pose_directions(
@@ -323,7 +326,7 @@ class Problem:
 
         `member` (n,) is the block of each pose. Poses of exact readings take up none.
         """
-        if solution.estimates is None or not isinstance(self.poses, UncertainPoses):
+        if solution.estimates is None or isinstance(self.poses, ExactPoses):
             return np.zeros(count, dtype=np.int64)
         blocks = member[self.poses.first_pose]
         return np.bincount(blocks, solution.estimates.rank[0], count).astype(np.int64)
@@ -353,7 +356,7 @@ class Problem:
             for parts, lost in self.poses.iterate_rows(solution, z, trials):
                 factor = fold_node_rows(factor, factors, parts)
                 is_lost |= lost
-        equations = _of_trials(self.component_count.sum(axis=1), trials)
+        equations = select_counts(self.component_count.sum(axis=1), trials)
         if solution.estimates is not None:
             equations = equations - solution.estimates.rank.sum(axis=1)
         states, is_near = self.poses.next_start(solution, start)
@@ -389,12 +392,9 @@ class Problem:
         """Return the states with which poses begin."""
         if isinstance(self.poses, ExactPoses):
             return self.poses.first_states(len(self))
+        from loopcal.estimate.poses.initialization import first_poses
+
         assert self.sigma is not None
         total = max(len(self.readings), int(self.trials.max(initial=0)) + 1)
         states = first_poses(self.free.robot, self.readings, self.sigma, self.rows[:-1], total)
         return states if len(self.trials) == total else states.take(self.trials)
-
-
-def _of_trials(count: IntArray, trials: IntArray) -> IntArray:
-    """Return counts (T | 1,) of some trials (t,)."""
-    return np.full(len(trials), count[0]) if len(count) == 1 else count[trials]

@@ -5,23 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import BLOCK, ObservationRows
-from loopcal.estimate.poses.components import find_components
 from loopcal.estimate.poses.consistent import LOOSE, ConsistentPoses, select_mixing_rows
-from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
-from loopcal.estimate.poses.uncertain import UncertainPoses
+from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.problem import Problem
 from loopcal.measure import (
     Kind,
     Measurements,
     NuisanceParameters,
-    Sensor,
-    Trials,
     collect_nuisance_parameters,
     list_sensed_joints,
     make_readings_kind,
@@ -33,6 +30,10 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.coordinates import PoseCoordinates
+    from loopcal.measure import Sensor, Trials
 
 POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
 """Control of the iteration to uncertain poses, which may lie at the end of their reach."""
@@ -153,6 +154,9 @@ def _make_uncertain(
     data: Callable[[int], Measurements],
 ) -> Problem:
     """Return the problem with uncertain readings, before nuisance parameters are eliminated."""
+    from loopcal.estimate.poses.components import find_components
+    from loopcal.estimate.poses.coordinates import ReadingCoordinates, TwistCoordinates
+
     all_rows, robot = (*rows, _reading_rows(free, recorded, sigma)), free.robot
     names = list_sensed_joints(r.kind for r in all_rows)
     if robot.program.sigma is None:
@@ -190,7 +194,7 @@ def _plan_consistent_poses(
     if sigma is not None:
         loose = np.where(np.isinf(sigma), np.inf, loose)
     problem = _make_uncertain(free, recorded, loose, mixing, numbers, data)
-    assert isinstance(problem.poses, UncertainPoses)
+    assert not isinstance(problem.poses, ExactPoses)
     return ConsistentPoses(problem.poses, recorded)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,13 +19,15 @@ from loopcal.estimate.methods.prior_conflict import PriorConflict
 from loopcal.estimate.methods.regularization import Regularization
 from loopcal.estimate.nuisance.estimate import NuisanceEstimate, format_half_width
 from loopcal.estimate.options import FitOptions
-from loopcal.estimate.poses.estimate import EstimatedPoses
 from loopcal.estimate.residuals import KindResiduals, store_residuals
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.presentation import FitFigures, TableResult
 from loopcal.typing import FloatArray
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.estimate import EstimatedPoses
 
 LAST_DIGITS = 3
 """Digits of the values at which an iteration ended that did not converge."""

@@ -19,6 +19,7 @@ from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, TextArray
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
@@ -200,7 +201,7 @@ def _find_equal_rows(content: FloatArray, texts: Sequence[TextArray]) -> tuple[i
     key = (content * np.random.default_rng(0).uniform(0.5, 1.0, content.shape[1])).sum(axis=1)
     order = np.argsort(key, kind="stable")
     equal = np.flatnonzero(np.diff(key[order]) == 0.0)
-    rows = np.unique(order[np.concatenate([equal, equal + 1])])
+    rows = find_distinct(order[np.concatenate([equal, equal + 1])])
     owners = [np.unique(text[rows], return_inverse=True)[1].reshape(-1, 1) for text in texts]
     _, first, member = np.unique(
         np.hstack([content[rows], *owners]), axis=0, return_index=True, return_inverse=True
@@ -354,7 +355,7 @@ def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
         noise = (
             sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
         )
-        for session in np.unique(rows.session):
+        for session in find_distinct(rows.session):
             for target, indices in _list_columns(kind).items():
                 columns = list(indices)
                 present = (rows.session == session) & ~np.any(

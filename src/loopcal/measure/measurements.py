@@ -17,6 +17,7 @@ from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nu
 from loopcal.measure.observations import Observations
 from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
 from loopcal.numerics.elimination_tree import find_connected_groups
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -209,7 +210,7 @@ class Measurements(TableResult):
             )
         chosen = np.flatnonzero(given) if is_mask else given.astype(np.intp)
         outside = (chosen < 0) | (chosen >= self.n_poses)
-        if np.any(outside) or len(np.unique(chosen)) < len(chosen) or not len(chosen):
+        if np.any(outside) or len(find_distinct(chosen)) < len(chosen) or not len(chosen):
             raise DataError(
                 f"cannot take poses {chosen.tolist()}; give at least one of 0 to "
                 f"{self.n_poses - 1}, each once"

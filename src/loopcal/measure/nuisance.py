@@ -6,21 +6,25 @@ set of its own. A parameter is called `tracker.x`, or `monday.tracker.x` in the 
 Kinds that use the same name share the parameter.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from loopcal.argument_types import check_fields
 from loopcal.errors import DataError, suggest_names
-from loopcal.measure.instrument import Sensor
 from loopcal.measure.kinds import Kind
 from loopcal.measure.observations import Observations
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
+
+if TYPE_CHECKING:
+    from loopcal.measure.instrument import Sensor
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.traceability import InstrumentRecord
 from loopcal.measure.whitening import compute_whitener
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
 
@@ -194,7 +195,7 @@ class Observations:
     def __repr__(self) -> str:
         counts = [f"{len(self)} rows", f"{self.n_residuals} residuals"]
         for name in ("session", "group"):
-            names = [text for text in np.unique(getattr(self, name)).tolist() if text]
+            names = [text for text in find_distinct(getattr(self, name)).tolist() if text]
             if names:
                 more = f" and {len(names) - 4} more" if len(names) > 4 else ""
                 counts.append(f"{name} {', '.join(names[:4])}{more}")

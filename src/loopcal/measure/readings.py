@@ -6,10 +6,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal import mechanism
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds import ActuatorReadings, Kind
-from loopcal.mechanism import Mechanism, Solution, inverse, select_platform_entries
+from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.typing import FloatArray
 
 # --- commanded poses
@@ -88,7 +89,7 @@ def select_joint_values(
     """
     actuators = [actuator.name for actuator in robot.actuators]
     passive = _index_passive_joints(robot)
-    entries = select_platform_entries(robot, state) if robot.stages else {}
+    entries = mechanism.select_platform_entries(robot, state) if robot.stages else {}
     values = {}
     for name in names:
         if name in actuators:

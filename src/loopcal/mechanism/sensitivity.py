@@ -19,32 +19,15 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
+from loopcal.mechanism import actuation, closure, stages
 from loopcal.mechanism.actuation.driven_joints import DrivenJoints, drive_joints
-from loopcal.mechanism.actuation.summed_drives import (
-    Motion,
-    differentiate_driven_joints,
-    differentiate_joints_by_readings,
-    differentiate_open_sums,
-)
 from loopcal.mechanism.closure.limb_rows import (
     linearize_limbs,
     name_passive_joints,
     solve_passive_motion,
 )
-from loopcal.mechanism.closure.open_closure import (
-    differentiate_open,
-    differentiate_unknowns,
-    fold_open_poses,
-    list_unknown_joints,
-)
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.parameter_units import ParameterUnits
-from loopcal.mechanism.stages.chain_kinematics import (
-    differentiate_end,
-    differentiate_joints,
-    differentiate_platform_entries,
-    name_platform_entries,
-)
 from loopcal.mechanism.states import is_closed
 from loopcal.mechanism.transmission.terms import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
@@ -80,21 +63,21 @@ def differentiate_pose(
     states have infinities or NaN.
     """
     if robot.stages:
-        whole = differentiate_end(robot, values, q, state, differentiate_pose, columns)
+        whole = stages.differentiate_end(robot, values, q, state, differentiate_pose, columns)
         return PoseSensitivity(*whole)
     if robot.has_open_sums:
-        derivatives = differentiate_open_sums(robot, values, q, state, columns)
+        derivatives = actuation.differentiate_open_sums(robot, values, q, state, columns)
     else:
         e, tau = robot.slots(values)
         joints = joints_from_readings(q, tau, robot.slots.frequency)
         chosen = robot.all_parameters if columns is None else columns
         inputs = chosen.linearize(values, tau, q)
         is_open = robot.program.may_stay_open
-        differentiate = differentiate_open if is_open else engine.differentiate
+        differentiate = closure.differentiate_open if is_open else engine.differentiate
         derivatives = differentiate(robot.program, e, joints, state, inputs)
         if robot.has_sums:
             by_parameters, by_joints = derivatives
-            turns = differentiate_joints_by_readings(robot, values, q)
+            turns = actuation.differentiate_joints_by_readings(robot, values, q)
             derivatives = by_parameters, np.matmul(by_joints, turns)
     lost = ~is_closed(state.status)
     if lost.any():
@@ -121,7 +104,7 @@ def fold_pose_rows(
     """
     e, tau, joints = driven or drive_joints(robot, values, q)
     inputs = columns.linearize(values, tau, q)
-    fold_poses = fold_open_poses if robot.program.may_stay_open else engine.fold_poses
+    fold_poses = closure.fold_open_poses if robot.program.may_stay_open else engine.fold_poses
     return fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 
@@ -150,15 +133,15 @@ def differentiate_passive_joints(
     """
     names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
     if robot.stages:
-        whole = differentiate_joints(robot, values, q, state, differentiate_passive_joints)
+        whole = stages.differentiate_joints(robot, values, q, state, differentiate_passive_joints)
         return PassiveSensitivity(names, *whole)
     parameters = np.zeros((t, n, len(names), len(robot.parameters)))
     readings = np.zeros((t, n, len(names), len(robot.actuators)))
     platform, freedoms = differentiate_pose(robot, values, q, state), list(robot.program.freedoms)
     summed = None
     if robot.has_sums:
-        twist = Motion(platform.parameters, platform.readings)
-        summed = differentiate_driven_joints(robot, values, q, state, twist)
+        twist = actuation.Motion(platform.parameters, platform.readings)
+        summed = actuation.differentiate_driven_joints(robot, values, q, state, twist)
     for rows, limbs in linearize_limbs(robot, values, q, state):
         by_parameter = platform.parameters[rows][:, :, freedoms]
         by_reading = platform.readings[rows][:, :, freedoms]
@@ -196,10 +179,10 @@ def _differentiate_open_joints(
     e, tau = robot.slots(values)
     joints = joints_from_readings(q, tau, robot.slots.frequency)
     inputs = robot.all_parameters.linearize(values, tau, q)
-    exact = differentiate_unknowns(program, e, joints, state, inputs)
+    exact = closure.differentiate_unknowns(program, e, joints, state, inputs)
     places = [
         names.index(f"{limbs[i].name}.{limbs[i].joints[j].name}")
-        for i, j in list_unknown_joints(program)
+        for i, j in closure.list_unknown_joints(program)
     ]
     return places, exact[:, :, len(program.freedoms) :]
 
@@ -211,11 +194,11 @@ def differentiate_sensed_values(
     known: list[str] = []
     derivatives: list[tuple[FloatArray, FloatArray]] = []
     for stage in robot.stages:
-        entries = name_platform_entries(stage.name)
+        entries = stages.name_platform_entries(stage.name)
         if not set(entries).isdisjoint(names):
             known += entries
             derivatives.append(
-                differentiate_platform_entries(
+                stages.differentiate_platform_entries(
                     robot, values, q, state, differentiate_pose, stage.name
                 )
             )

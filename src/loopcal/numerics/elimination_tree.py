@@ -25,6 +25,7 @@ from itertools import permutations
 
 import numpy as np
 
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import BoolArray, IntArray
 
 SCOPES = ("machine", "session", "group", "pose")
@@ -111,7 +112,7 @@ def build_tree(is_free: BoolArray, scopes: Sequence[str], sets: IntArray) -> Eli
     pairs = sets[is_free[sets[:, 1]]]
     candidates = [
         _assign_nodes(is_free, rank, order, pairs)
-        for order in permutations(np.unique(rank[is_free]).tolist())
+        for order in permutations(find_distinct(rank[is_free]).tolist())
     ]
     node, parent = min(candidates, key=_count_multiplications)
     return _sort_by_structure(node, parent, _components(is_free, pairs))

@@ -22,6 +22,7 @@ from loopcal import engine
 from loopcal.numerics.column_elimination import Elimination, eliminate_from_triangle
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination_tree import EliminationTree, Structure
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -298,7 +299,7 @@ def _carry_inwards(
             carried[:, own] = -change * length[:, own][..., None]
         if i in tree.parents:
             carried[:, own[:, :, None], slot[own][:, None, :]] += node.unobservable.swapaxes(-1, -2)
-    clusters = np.unique(tree.cluster[np.flatnonzero(carried.any(axis=(0, 2)))])
+    clusters = find_distinct(tree.cluster[np.flatnonzero(carried.any(axis=(0, 2)))])
     return carried, clusters
 
 
@@ -334,7 +335,7 @@ def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArra
     within = np.empty(len(places), dtype=np.int64)
     within[order] = np.arange(len(places)) - np.repeat(np.cumsum(count) - count, count)
     size = np.where(count > 0, np.ceil(np.log2(np.maximum(count, 1))), -1)
-    for alike in np.unique(size[size >= 0]):
+    for alike in find_distinct(size[size >= 0]):
         chosen = np.flatnonzero(size == alike)
         index = np.full(n, -1)
         index[chosen] = np.arange(len(chosen))

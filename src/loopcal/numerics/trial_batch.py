@@ -37,6 +37,11 @@ def map_arrays(function: Callable[..., np.ndarray], *values: Value) -> Value:
     return first
 
 
+def select_counts(count: IntArray, trials: IntArray) -> IntArray:
+    """Return counts (T | 1,) of some trials (t,)."""
+    return np.full(len(trials), count[0]) if len(count) == 1 else count[trials]
+
+
 @cache
 def _list_batched(kind: type[Any]) -> tuple[str, ...]:
     """Return the names of the fields of a dataclass that belong to trials."""

@@ -54,6 +54,7 @@ from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.wording import round_to_digits
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, fix_breaking_parameters, forward
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.presentation import HtmlResult
 
 IMPLAUSIBLE = 10.0
@@ -316,7 +317,7 @@ def _thin_out(data: Measurements) -> Measurements:
     if n <= MOST_POSES or shares_poses(data):
         return data
     first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
-    return data.take(np.unique(first[:, None] + np.arange(MOST_POSES // RUNS)))
+    return data.take(find_distinct(first[:, None] + np.arange(MOST_POSES // RUNS)))
 
 
 def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> ConventionCheck:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from loopcal import measure
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.diagnose.conventions.misfit import (
     QUICK,
@@ -20,7 +21,6 @@ from loopcal.diagnose.conventions.misfit import (
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Quantity
 from loopcal.measure import Measurements
-from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import forward_trials
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -77,7 +77,7 @@ def guess_frames(
     T[reached] = forward_trials(robot, robot.values[None], readings[reached][None]).T[0]
     measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
     most, steps = QUICK.candidates, QUICK.guess_steps
-    start = guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
+    start = measure.guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
     sizes = [np.zeros((h, 0))]
     for o, places in zip(data.observations, nuisance.indices, strict=True):
         if len(o) and not o.kind.sensed_joints:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, measure
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
@@ -26,9 +26,9 @@ from loopcal.estimate.observation_rows import ObservationRows, Residuals
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.problem_construction import make_problem, problem_of
 from loopcal.measure import Measurements, NuisanceParameters
-from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import Mechanism, find_directly_reachable, forward, forward_trials
 from loopcal.numerics.gauss_newton import Halving
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 FEWEST = 3
@@ -135,7 +135,7 @@ def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = F
     reached = find_directly_reachable(robot, robot.values[None], q[None])[0]
     if follow and reached.sum() < (1.0 - MOST_EXCLUDED) * len(q):
         hard = np.flatnonzero(~reached)
-        sampled = hard[np.unique(np.linspace(0, len(hard) - 1, FOLLOWED).astype(np.intp))]
+        sampled = hard[find_distinct(np.linspace(0, len(hard) - 1, FOLLOWED).astype(np.intp))]
         reached[sampled] = forward(robot, q[sampled]).converged
         rest = np.setdiff1d(hard, sampled)
         if len(rest) and reached[sampled].mean() >= 1.0 - MOST_EXCLUDED:
@@ -316,7 +316,7 @@ def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatA
         if t == 1:
             present = np.any(rows.whitener[0] != 0.0, axis=(1, 2))
             observations[i] = observations[i].with_weights(present * observations[i].weight)
-    return guess_nuisance_values_batch(
+    return measure.guess_nuisance_values_batch(
         replace(data, observations=tuple(observations)),
         measured,
         forward_trials(robot, robot.values[None], data.readings[None]).T,

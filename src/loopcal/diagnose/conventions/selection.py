@@ -40,6 +40,7 @@ from loopcal.diagnose.conventions.zero_interpretations import find_zero_interpre
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.measure import Measurements
 from loopcal.mechanism import compute_readings, find_directly_reachable
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 FAR_BETTER = 10.0
@@ -290,7 +291,7 @@ def _select_few(data: Measurements) -> IntArray:
     count = max(FEWEST_POSES, -(-FEW_ROWS * n // max(equations, 1)))
     if n <= count or shares_poses(data):
         return np.arange(n)
-    return np.unique(np.linspace(0, n - 1, count).astype(np.intp))
+    return find_distinct(np.linspace(0, n - 1, count).astype(np.intp))
 
 
 def _test_values(free: FreeParameters, data: Measurements, misfit: float) -> list[_Test]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.numerics.sorted_values import find_distinct
 
 STRONG = 0.9
 """Correlation above which the error of one parameter is mostly that of another (81 % of its
@@ -53,7 +54,7 @@ def find_correlated_groups(
     for i, j in np.argwhere(linked):
         group[group == group[j]] = group[i]
     groups = []
-    for number in np.unique(group[linked.any(axis=1)]):
+    for number in find_distinct(group[linked.any(axis=1)]):
         places = np.flatnonzero(group == number)
         inner = np.where(linked[np.ix_(places, places)], np.abs(rho[np.ix_(places, places)]), 0.0)
         a, b = (places[k] for k in np.unravel_index(int(np.argmax(inner)), inner.shape))

@@ -24,6 +24,7 @@ from loopcal.estimate.linearization import LeverageRows, Linearization
 from loopcal.estimate.poses.states import PoseSolution
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 TESTABLE = 1e-6
@@ -163,7 +164,7 @@ def iterate_blocks(
         block_of_row, stacked = block_of_row[order], stacked[order]
         numbers, first, sizes = np.unique(block_of_row, return_index=True, return_counts=True)
         complete = sizes == total[numbers]
-        for size in np.unique(sizes[complete]):
+        for size in find_distinct(sizes[complete]):
             chosen = complete & (sizes == size)
             places = first[chosen][:, None] + np.arange(size)
             yield numbers[chosen], stacked[places, :-1], stacked[places, -1]

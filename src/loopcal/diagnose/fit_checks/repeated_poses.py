@@ -26,6 +26,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import IntArray
 
 UNMEASURED = 1e-12
@@ -108,7 +109,7 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
     problem = problem_of(fit.free_parameters, data)
     groups = [_group_repeats(rows, member) for rows in problem.rows]
     total, degrees = 0.0, 0
-    if all(len(np.unique(of_rows)) == len(of_rows) for of_rows in groups):
+    if all(len(find_distinct(of_rows)) == len(of_rows) for of_rows in groups):
         return total, degrees
     z = fit.free_parameters.deviation(fit.robot.values[None])
     residuals = problem.residuals(z, problem.solve(z, problem.start(z)))

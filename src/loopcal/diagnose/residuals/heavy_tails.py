@@ -29,6 +29,7 @@ from loopcal.estimate.inference.residual_test import choose_severity
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.numerics.sorted_values import compute_median, find_distinct
 from loopcal.typing import BoolArray, FloatArray
 
 LEVEL = 0.01
@@ -132,7 +133,7 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
     kept, basis, left = kept[testable], basis[testable], left[testable]
     if left.sum() < FEWEST:
         return _untested(len(kept))
-    member = rows.series[kept][:, None] == np.unique(rows.series[kept])
+    member = rows.series[kept][:, None] == find_distinct(rows.series[kept])
     u = _standardize(rows.residual[kept, None], left, member)
     others = _take_root(np.eye(basis.shape[1]) - basis.T @ basis)
     rng, done, smaller = np.random.default_rng(0), 0, 0
@@ -148,7 +149,7 @@ def assess_tails(rows: ResidualRows) -> HeavyTails:
             break
     size = np.abs(u)
     p_value = (1 + smaller) / (1 + done)
-    return HeavyTails(len(kept), p_value, float(np.median(size)), median / done, float(size.max()))
+    return HeavyTails(len(kept), p_value, compute_median(size), median / done, float(size.max()))
 
 
 def _compute_medians(values: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from loopcal.diagnose.residuals.residual_rows import ResidualRows, order_rows
 from loopcal.measure import Measurements, Observations
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -75,7 +76,8 @@ def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tu
         ]
         effects.append(_build(total, shifts, functions, TEMPERATURE, name))
     functions = [
-        [(o.session == name).astype(float) for name in np.unique(o.session)] for o in observations
+        [(o.session == name).astype(float) for name in find_distinct(o.session)]
+        for o in observations
     ]
     effects.append(_build(total, shifts, functions, SESSION))
     for i, actuator in enumerate(robot.actuators):

@@ -21,6 +21,7 @@ from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.numerics.sorted_values import compute_median
 from loopcal.typing import FloatArray, IntArray
 
 ROUNDS = 50
@@ -111,7 +112,7 @@ def estimate_scale_of(distance: FloatArray, degrees: FloatArray) -> float:
     """
     is_tested = degrees > 0.0
     ratio = distance[is_tested] / np.sqrt(compute_chi_square_quantile(degrees[is_tested], 0.5))
-    middle = float(np.median(ratio)) if len(ratio) else 1.0
+    middle = compute_median(ratio) if len(ratio) else 1.0
     return middle if middle > 0.0 else 1.0
 
 

@@ -17,12 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, measure
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.linearization import KindRows
-from loopcal.measure import Measurements, NuisanceParameters, Observations, guess_nuisance_values
+from loopcal.measure import Measurements, NuisanceParameters, Observations
 from loopcal.numerics.elimination_tree import EliminationTree, build_tree
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.numerics.tree_elimination import NodeFactors, TreeElimination, eliminate_tree
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.parameters import ParameterTable
@@ -127,7 +128,7 @@ class NuisanceElimination:
         structure = np.full(len(node), -1)
         structure[node >= 0] = tree.structure[node[node >= 0]]
         groups = []
-        for s in np.unique(structure):
+        for s in find_distinct(structure):
             chosen = np.flatnonzero(structure == s)
             nodes, used = node[chosen], rows.nuisance[chosen]
             columns = np.zeros_like(used) if s < 0 else tree.columns(nodes, used)
@@ -171,7 +172,7 @@ class NuisanceElimination:
         """
         of_kinds = [self.local.indices[i][members] for _, i, members in chosen]
         parts = [(self.local.factor(i), members) for _, i, members in chosen]
-        used = np.unique(np.concatenate([places.ravel() for places in of_kinds]))
+        used = find_distinct(np.concatenate([places.ravel() for places in of_kinds]))
         setup = NuisanceParameters(
             ParameterTable(tuple(self.local.table.entries[i] for i in used)),
             tuple(np.searchsorted(used, places) for places in of_kinds),
@@ -182,7 +183,7 @@ class NuisanceElimination:
             observations=tuple(rows for rows, _, _ in chosen if not rows.kind.is_of_base),
             base_observations=tuple(rows for rows, _, _ in chosen if rows.kind.is_of_base),
         )
-        values[used] = guess_nuisance_values(part, T, setup, joints)
+        values[used] = measure.guess_nuisance_values(part, T, setup, joints)
 
     def keep_apart(
         self, parameters: int, nodes: IntArray

@@ -26,6 +26,7 @@ from loopcal.estimate.observation_rows import (
 from loopcal.estimate.poses.linearization import KindRows
 from loopcal.findings import report_finding
 from loopcal.numerics.elimination_tree import EliminationTree, find_connected_groups
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 LARGEST = 2000
@@ -86,7 +87,7 @@ def divide_components(
     counts = np.bincount(member)
     block = ((np.cumsum(counts) - counts) // size)[member]
     blocks = []
-    for k in np.unique(block):
+    for k in find_distinct(block):
         chosen = tuple(np.flatnonzero(block[r.first_poses] == k) for r in rows)
         poses = np.flatnonzero(block == k)
         blocks.append(make_block(poses, readings, rows, chosen, is_needed))

@@ -13,16 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_states
-from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.uncertain import UncertainPoses
 
 CONTROL = Halving(steps=10, attempts=10, relative=0.0, absolute=1e-9, stuck=1e-3)
 """Control of the iteration to consistent poses: until residuals are rounding, or out of reach."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Division of the poses of a problem into blocks, with the rows that observed them."""
+"""Division of the poses of a problem into blocks, with the rows that observed them.
+
+That of poses of uncertain readings is in `uncertain_division`, with what only they need.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,9 @@ from collections.abc import Sequence
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.nuisance.elimination import NuisanceElimination, list_members
 from loopcal.estimate.observation_rows import ObservationRows, divide_poses, find_needed_poses
-from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
-from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
-from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.measure import list_sensed_joints
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray
 
 
 def divide_exact_poses(
@@ -30,25 +30,3 @@ def divide_exact_poses(
     members = tuple(tuple(list_members(nuisance, own) for own in block.rows) for block in blocks)
     names = list_sensed_joints(r.kind for r in rows)
     return ExactPoses(free, len(readings), names, blocks, members, nuisance, located)
-
-
-def divide_uncertain_poses(
-    free: FreeParameters,
-    readings: FloatArray,
-    rows: Sequence[ObservationRows],
-    nuisance: NuisanceElimination | None,
-    coordinates: PoseCoordinates,
-    member: IntArray,
-    size: int,
-) -> UncertainPoses:
-    """Return the rows at poses of uncertain readings, in blocks of components.
-
-    member : (n,) component of each pose. size : of a block, in poses.
-    """
-    redundant = isinstance(coordinates, TwistCoordinates)
-    is_needed = find_needed_poses(rows if redundant else rows[:-1], len(member))
-    blocks = divide_components(readings, rows, member, is_needed, size)
-    nodes, structures = groups_of_nodes(rows, member, nuisance)
-    groups = tuple(group_components(block, member, nodes, structures) for block in blocks)
-    names = list_sensed_joints(r.kind for r in rows)
-    return UncertainPoses(free, names, coordinates, member, blocks, groups, nuisance, is_needed)

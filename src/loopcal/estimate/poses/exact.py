@@ -34,6 +34,7 @@ from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_state
 from loopcal.mechanism import drive_joints, fold_pose_rows, forward_trials
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -225,7 +226,7 @@ class ExactPoses:
             block.poses[~self._locate(block, z).is_reached[0] & block.is_needed]
             for block in self.blocks
         ]
-        return np.unique(np.concatenate(lost))
+        return find_distinct(np.concatenate(lost))
 
     def locate(
         self, z: FloatArray, start: Start, solution: PoseSolution | None = None

@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from loopcal.estimate.linearization import LeverageRows
 from loopcal.estimate.nuisance.elimination import NodeRows, NuisanceElimination
 from loopcal.estimate.poses.exact import ExactPoses
-from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.uncertain import UncertainPoses
 
 AtNodes = Callable[[IntArray], tuple[IntArray, FloatArray, FloatArray]]
 """From nodes (k,) of nuisance parameters to their paths (k, w), roots and slopes; see

@@ -12,6 +12,7 @@ which, stacked over all sources, are A projected onto the complement of the rang
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,15 +20,17 @@ from loopcal import engine
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance.elimination import NodeRows
 from loopcal.estimate.observation_rows import PoseBlock
-from loopcal.estimate.poses.components import ComponentGroup, spread_nuisance, stack_rows
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.leverage import spread_rows
 from loopcal.estimate.poses.linearization import KindRows, linearize_rows
 from loopcal.estimate.poses.states import PoseSolution
-from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.estimate.problem import Problem
 from loopcal.numerics.column_elimination import eliminate_columns
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from loopcal.estimate.poses.components import ComponentGroup
+    from loopcal.estimate.poses.uncertain import UncertainPoses
 
 
 def fold_sources(
@@ -115,6 +118,8 @@ def _stack(
     poses: UncertainPoses, block: PoseBlock, group: ComponentGroup, kinds: Sequence[KindRows | None]
 ) -> FloatArray:
     """Return the stacked rows of a group's components."""
+    from loopcal.estimate.poses.components import spread_nuisance, stack_rows
+
     width = 0
     if poses.nuisance is not None and group.structure >= 0:
         tree = poses.nuisance.tree

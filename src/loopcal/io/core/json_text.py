@@ -38,10 +38,18 @@ def to_json(document: Mapping[str, Any]) -> str:
     A number that is not finite becomes null. The key `nulls` then maps its place, such as
     `parameters/3/plus_minus`, to the reason.
     """
+    return format_content(convert_document(document))
+
+
+def convert_document(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of the JSON text of a document, see `to_json`."""
     nulls: dict[str, str] = {}
     content = serialization.to_json(document, nulls)
-    if nulls:
-        content["nulls"] = nulls
+    return {**content, "nulls": nulls} if nulls else content
+
+
+def format_content(content: Mapping[str, Any]) -> str:
+    """Return the JSON text of what `convert_document` returns."""
     return escape_json(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)) + "\n"
 
 

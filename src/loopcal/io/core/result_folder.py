@@ -16,11 +16,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from loopcal import serialization
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.descriptors import watch_folder
-from loopcal.io.core.json_text import read_json, to_json
+from loopcal.io.core.json_text import convert_document, format_content, read_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import FILES, replace_folder, resolve_folder
 from loopcal.io.core.read_back import require_same
@@ -117,14 +116,15 @@ def refuse_other_content(path: Path, kind: FolderKind) -> None:
     while True:
         with watch_folder(path.resolve()) as is_same:
             try:
-                return _check_content(path, kind)
+                _check_content(path, kind)
+                return
             except (FileError, OSError):
                 if is_same():
                     raise  # otherwise another command has replaced the folder meanwhile
 
 
-def _check_content(path: Path, kind: FolderKind) -> None:
-    """Raise FileError as `refuse_other_content`."""
+def _check_content(path: Path, kind: FolderKind) -> dict[str, Any]:
+    """Return the document of a folder; raise FileError as `refuse_other_content`."""
     document = _read_document(path / kind.document)
     if document is None or any(key not in document for key in kind.keys):
         raise FileError(report_finding("files.folder-of-others", content=kind.content), path)
@@ -137,6 +137,7 @@ def _check_content(path: Path, kind: FolderKind) -> None:
     if changed:
         code = "files.changed-files"
         raise FileError(report_finding(code, content=kind.content, files=changed), path)
+    return document
 
 
 def list_changed_files(path: Path, kind: FolderKind) -> tuple[str, ...]:
@@ -173,12 +174,13 @@ def write_result_folder(
     ------
     FileError : see `refuse_folder`; or the folder cannot be written.
     """
+    digests = dict.fromkeys((*sorted(files), kind.document), _BLANK)
+    computed = convert_document({**document, FILES: digests})
 
     def check(folder: Path) -> None:
-        _check_content(folder, kind)
-        read = read_json(folder / kind.document, "result", "repeat the command", TABLE_SIZE)
+        read = _check_content(folder, kind)
         for key in document.keys() - {FILES}:
-            is_same = key in read and read[key] == serialization.to_json(document[key])
+            is_same = key in read and read[key] == computed[key]
             require_same(f"{key!r} of {kind.document} is what was computed", True, is_same)
         read_back(folder)
 
@@ -188,8 +190,8 @@ def write_result_folder(
             file = folder / name
             file.parent.mkdir(exist_ok=True)
             file.write_bytes(content)
-        digests = {name: sha256(folder / name) for name in sorted(files)} | {kind.document: _BLANK}
-        text = to_json({**document, FILES: digests})
+        written = digests | {name: sha256(folder / name) for name in files}
+        text = format_content({**computed, FILES: written})
         digest = hashlib.sha256(text.encode()).hexdigest()
         text = text.replace(_quote(kind, _BLANK), _quote(kind, digest))
         (folder / kind.document).write_bytes(text.encode())

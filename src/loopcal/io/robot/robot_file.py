@@ -43,9 +43,9 @@ from loopcal.mechanism import (
     RobotRecord,
     build,
     match_parameter_names,
+    stages,
 )
 from loopcal.mechanism.families.summed_records import SumError
-from loopcal.mechanism.stages.joined_assembly import StageError
 from loopcal.typing import FloatArray
 
 FORMAT = 1
@@ -273,7 +273,7 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     """
     try:
         parameters = record.expand().parameters
-    except StageError as error:
+    except stages.StageError as error:
         raise file.error(str(error), (KEY, error.index)) from None
     except SumError as error:
         raise file.error(str(error), ("actuators", error.actuator)) from None

@@ -15,6 +15,7 @@ import numpy as np
 
 from loopcal.measure.kinds.error_groups import list_error_groups
 from loopcal.measure.kinds.setup_parameters import SetupItem
+from loopcal.numerics.sorted_values import find_distinct
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -112,7 +113,7 @@ def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray
     """
     known = time is not None and bool(np.isfinite(time).all())
     progress = np.zeros(len(session))
-    for name in np.unique(session):
+    for name in find_distinct(session):
         chosen = np.flatnonzero(session == name)
         values = time[chosen] if known and time is not None else np.arange(float(len(chosen)))
         low, high = values.min(), values.max()

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import geometry, mechanism
 from loopcal.errors import DataError
 from loopcal.measure.kinds.rows import Evaluation
-from loopcal.mechanism import name_platform_entries
 from loopcal.typing import FloatArray
 
 BASE = "base"
@@ -42,7 +41,7 @@ def list_sensed_numbers(of: str) -> tuple[str, ...]:
     """Return the names of the numbers of the platform of a stage; none without a stage, or of the
     base.
     """
-    return name_platform_entries(of) if of not in ("", BASE) else ()
+    return mechanism.name_platform_entries(of) if of not in ("", BASE) else ()
 
 
 def find_platform(of: str, T: FloatArray, joints: FloatArray) -> FloatArray:

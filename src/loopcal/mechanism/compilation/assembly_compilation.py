@@ -14,9 +14,9 @@ from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import name_count
+from loopcal.mechanism import stages
 from loopcal.mechanism.assembly import AXES, Address, Assembly, AttachedStage, Limb, select_rows
 from loopcal.mechanism.compilation.assembly_checks import check_assembly
-from loopcal.mechanism.compilation.chain_compilation import build_chain
 from loopcal.mechanism.compilation.mobility import (
     check_mobility,
     find_idle_joints,
@@ -29,7 +29,6 @@ from loopcal.mechanism.kinematics.batch_kinematics import compute_closure_sign, 
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import driven_values, make_start
 from loopcal.mechanism.transmission.terms import harmonic_frequencies, name_terms, nominal_terms
 from loopcal.parameters import ParameterTable
@@ -64,6 +63,8 @@ def build(
     """
     check_assembly(assembly)
     if assembly.stages:
+        from loopcal.mechanism.compilation.chain_compilation import build_chain
+
         return build_chain(assembly, units or {}, record, _build_stage, differentiate_pose)
     return _compile(assembly, units, record)
 
@@ -358,7 +359,7 @@ def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
 def _place_at_start(robot: Mechanism) -> State:
     """Return the state of a serial stage with every joint at its `start`."""
     e, _ = robot.slots(robot.values[None])
-    return solve_serial(robot, e, driven_values(robot.program, robot.home_state))
+    return stages.solve_serial(robot, e, driven_values(robot.program, robot.home_state))
 
 
 def _find_home(robot: Mechanism) -> State:

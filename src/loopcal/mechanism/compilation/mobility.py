@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loopcal import engine
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.mechanism.actuation.summed_drives import differentiate_lengths
+from loopcal.mechanism import actuation
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.closure.limb_rows import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.model import Mechanism
@@ -102,7 +102,7 @@ def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
     e, tau = robot.slots(robot.values[None])
     weights = select_weights(tau)
     assert weights is not None
-    slope = differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
+    slope = actuation.differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
     if count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
         raise MechanismError(
             f"{robot.name}: the sums of its readings do not hold the platform at home, where it "

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import Program, State
+from loopcal.mechanism import actuation, stages
 from loopcal.mechanism.actuation.driven_joints import DrivenJoints, drive_joints, drive_sums
-from loopcal.mechanism.actuation.summed_drives import solve_open_sums
 from loopcal.mechanism.kinematics.reading_paths import (
     Loops,
     clear_sign,
@@ -35,9 +35,6 @@ from loopcal.mechanism.platform_coordinates import (
     read_coordinates,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.stages.chain_inverse import solve_readings
-from loopcal.mechanism.stages.chain_kinematics import multiply_signs, solve_stages
-from loopcal.mechanism.stages.serial_limb import solve_serial
 from loopcal.mechanism.states import Status, driven_values, without_poses
 from loopcal.mechanism.transmission.sums import apply_weights
 from loopcal.mechanism.transmission.terms import (
@@ -76,7 +73,7 @@ def forward_trials(
     if not q.shape[1]:
         return without_poses(robot.home_state, max(len(values), len(q)))
     if robot.stages:
-        return solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
+        return stages.solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
     if robot.has_open_sums:
         e, sums, weights = drive_sums(robot, values, q)
         return close_at_joints(robot, e, sums, start, follow, weights=weights)
@@ -112,7 +109,7 @@ def close_at_joints(
     """
     begin = clear_sign(robot, start or robot.home_state)
     if robot.is_serial:
-        return solve_serial(robot, e, joints, begin.T.shape[:2])
+        return stages.solve_serial(robot, e, joints, begin.T.shape[:2])
     loops = Loops(robot, e, weights)
     state = loops.solve(joints, begin, goal)
     wrong = find_wrong_rows(robot, state, begin)
@@ -133,7 +130,7 @@ def step_towards_closure(
     """
     if robot.has_open_sums:
         e, sums, weights = drive_sums(robot, values, q)
-        return solve_open_sums(robot.program, e, weights, sums, begin, 1)
+        return actuation.solve_open_sums(robot.program, e, weights, sums, begin, 1)
     e, _, joints = drive_joints(robot, values, q)
     return engine.solve(robot.program, e, joints, begin, max_iterations=1)
 
@@ -177,7 +174,7 @@ def close_at_coordinates(
         return without_poses(robot.home_state, max(len(values), len(target)))
     if robot.stages:
         functions = forward_trials, differentiate_pose
-        return solve_readings(robot, values, target, begin, *functions, follow=follow)
+        return stages.solve_readings(robot, values, target, begin, *functions, follow=follow)
     if needs_readings(robot.program):
         return _inverse_by_readings(robot, values, target, begin, follow)
     return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
@@ -239,7 +236,7 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
     stages.
     """
     if robot.stages:
-        return multiply_signs(robot, values, state, compute_closure_sign)
+        return stages.multiply_signs(robot, values, state, compute_closure_sign)
     if robot.is_serial:
         return np.ones(state.status.shape, np.int8)
     if not is_square(robot):
@@ -250,7 +247,7 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
         weights = select_weights(tau)
         assert weights is not None
         sums = apply_weights(weights, joints)
-        return solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
+        return actuation.solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
     return engine.solve(robot.program, e, joints, state, max_iterations=0).closure_sign
 
 
@@ -283,7 +280,7 @@ def _inverse_by_readings(
         t, n = max(len(values), len(begin.T)), begin.T.shape[1]
         whole = map_arrays(lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])), begin)
         begin = replace(whole, closure_sign=compute_closure_sign(robot, values, whole))
-    return solve_readings(
+    return stages.solve_readings(
         robot,
         values,
         target,

@@ -4,9 +4,9 @@
 import numpy as np
 
 from loopcal.engine import State
+from loopcal.mechanism import stages
 from loopcal.mechanism.closure.limb_frames import follow_limb
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.stages.chain_state import compute_stage_limb_frames
 from loopcal.typing import FloatArray
 
 
@@ -25,7 +25,7 @@ def compute_limb_frames(
     each link 0..J (the last one is the tip), then the attachment.
     """
     if robot.stages:
-        return compute_stage_limb_frames(robot, values, state, compute_limb_frames)
+        return stages.compute_stage_limb_frames(robot, values, state, compute_limb_frames)
     e, _ = robot.slots(values)
     frames: dict[int, FloatArray] = {}
     for group, joints in zip(robot.program.groups, state.joints, strict=True):

@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
-from loopcal.mechanism.actuation.summed_drives import solve_open_sums
+from loopcal.mechanism import actuation
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import Status, driven_values, replace_rows, select_rows
 from loopcal.mechanism.transmission.sums import apply_weights
@@ -72,7 +72,7 @@ class Loops:
         """Return states (t, n) at joint values or sums (t | 1, n, a)."""
         program = self.robot.program
         if self.weights is not None:
-            return solve_open_sums(program, self.e, self.weights, values, begin)
+            return actuation.solve_open_sums(program, self.e, self.weights, values, begin)
         return clear_sign(self.robot, engine.solve(program, self.e, values, begin, goal=goal))
 
     def read(self, state: State) -> FloatArray:

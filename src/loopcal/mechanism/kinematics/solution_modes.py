@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import NEAR_GOAL, State
+from loopcal.mechanism import stages
 from loopcal.mechanism.kinematics.batch_kinematics import (
     close_at_coordinates,
     close_at_joints,
@@ -38,7 +39,6 @@ from loopcal.mechanism.kinematics.mode_paths import (
 from loopcal.mechanism.kinematics.reading_paths import clear_sign
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
-from loopcal.mechanism.stages.chain_kinematics import judge_stage_modes
 from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -164,7 +164,7 @@ def judge_modes(
     has one pose for its readings.
     """
     if robot.stages:
-        return judge_stage_modes(robot, state, begin, judge_modes)
+        return stages.judge_stage_modes(robot, state, begin, judge_modes)
     if robot.is_serial:
         return state, np.zeros(state.T.shape[1], bool)
     if robot.has_open_sums:
