@@ -27,6 +27,9 @@ int loopcal_certify(int, const int64_t *, const double *, const loopcal::Strided
                     int8_t *);
 int loopcal_reach(int, const int64_t *, const double *, const loopcal::Strided *, const int64_t *,
                   const double *, int64_t, int64_t, const loopcal::ReachOutput *);
+int loopcal_compare_poses(int, const loopcal::Strided *, double *, double *, int64_t, int64_t);
+int loopcal_solve_triangles(int, const double *, const double *, double *, double *, int64_t,
+                            int64_t);
 int loopcal_solve(int, const int64_t *, const double *, const loopcal::Strided *,
                   const loopcal::Strided *, int64_t, int64_t, int64_t, loopcal::Task, void *,
                   double *, double *const *, double *, int64_t *, int8_t *, int8_t *);
@@ -255,6 +258,30 @@ void add_factors(int set, int64_t t, int64_t m, int64_t p, Digest &digest) {
     loopcal_fold(set, factor.data(), rows.data(), factor.data(), t, m, p, m * p);
     loopcal_fold(set, factor.data(), rows.data(), factor.data(), t, m / 2, p, m * p);
     digest.add(factor);
+    Reals right = random.reals((size_t)(t * p), 1.0), x((size_t)(t * p)), growth((size_t)t);
+    loopcal_solve_triangles(set, factor.data(), right.data(), x.data(), growth.data(), t, p);
+    digest.add(x), digest.add(growth);
+}
+
+void add_comparisons(int set, int64_t n, Digest &digest) {
+    Random random;
+    Reals poses, references, residual((size_t)(6 * n)), by_twist((size_t)(36 * n));
+    for (int64_t i = 0; i < n; i++) {
+        Reals R;
+        add_rotation(random, R);
+        for (int row = 0; row < 3; row++) {
+            poses.insert(poses.end(), R.begin() + 3 * row, R.begin() + 3 * row + 3);
+            poses.push_back(random());
+        }
+        poses.insert(poses.end(), {0, 0, 0, 1});
+        if (i % 3) R.clear(), add_rotation(random, R);
+        for (int j = 3; j < 9 && i % 5 == 4; j++) R[(size_t)j] = -R[(size_t)j];  // far apart
+        references.insert(references.end(), R.begin(), R.end());
+        for (int axis = 0; axis < 3; axis++) references.push_back(random());
+    }
+    loopcal::Strided arrays[] = {{poses.data(), 0, 16}, {references.data(), 0, 12}};
+    loopcal_compare_poses(set, arrays, residual.data(), by_twist.data(), 1, n);
+    digest.add(residual), digest.add(by_twist);
 }
 
 }  // namespace
@@ -269,6 +296,7 @@ int main() {
         add_kinematics(set, false, 6, 1, 50, digest);
         for (const GroupShape *shapes : {SHAPES, RODS}) add_kinematics(set, true, 0, 5, 21, digest, shapes);
         for (bool torsion : {false, true}) add_targets(set, 5, 45, torsion, digest);
+        for (int64_t n : {1, 13, 50}) add_comparisons(set, n, digest);
         for (int64_t p : {1, 7, 43}) add_factors(set, 11, 50, p, digest);
         add_factors(set, 3, 1000, 7, digest);
         std::printf("%016llx %s\n", (unsigned long long)digest.value, name);

@@ -26,7 +26,7 @@ extern const loopcal::Kernels kernels;
 
 namespace {
 
-constexpr int ABI = 5;  // changes with every change of the C interface; library.py states it, too
+constexpr int ABI = 6;  // changes with every change of the C interface; library.py states it, too
 
 struct Set {
     const char *name;
@@ -99,6 +99,16 @@ EXPORT int loopcal_fold_poses(int set, const int64_t *structure, const double *n
                               int64_t n) {
     return list_sets()[set].kernels->fold_poses(structure, numbers, entries, arrays, joints, rows,
                                                 factor, out, is_finite, t, n);
+}
+
+EXPORT int loopcal_compare_poses(int set, const loopcal::Strided *arrays, double *residual,
+                                 double *by_twist, int64_t t, int64_t n) {
+    return list_sets()[set].kernels->compare_poses(arrays, residual, by_twist, t, n);
+}
+
+EXPORT int loopcal_solve_triangles(int set, const double *triangle, const double *right, double *x,
+                                   double *growth, int64_t t, int64_t p) {
+    return list_sets()[set].kernels->solve_triangles(triangle, right, x, growth, t, p);
 }
 
 EXPORT int loopcal_solve(int set, const int64_t *structure, const double *numbers,

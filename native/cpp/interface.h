@@ -62,6 +62,12 @@ struct Kernels {
     int (*fold_poses)(const int64_t *structure, const double *numbers, const int64_t *entries,
                       const Strided *arrays, const Strided *joints, const TwistRows *rows,
                       const double *factor, double *out, int8_t *is_finite, int64_t t, int64_t n);
+    // arrays : see compare.h
+    int (*compare_poses)(const Strided *arrays, double *residual, double *by_twist, int64_t t,
+                         int64_t n);
+    // see triangles.h
+    int (*solve_triangles)(const double *triangle, const double *right, double *x, double *growth,
+                           int64_t t, int64_t p);
     int (*solve)(const int64_t *structure, const double *numbers, const Strided *arrays,
                  const Strided *joints, int64_t t, int64_t n, int64_t max_iterations, Task task,
                  void *context, double *T, double *const *joints_out, double *residual,

@@ -2,6 +2,7 @@
 // The kernels of one instruction set. The build compiles this file once for each set, with
 // INSTRUCTION_SET (a namespace) and LANES (doubles of a vector).
 #include "certify.h"
+#include "compare.h"
 #include "fold.h"
 #include "fold_poses.h"
 #include "interface.h"
@@ -9,6 +10,7 @@
 #include "sensitivity.h"
 #include "solve.h"
 #include "targets.h"
+#include "triangles.h"
 
 namespace INSTRUCTION_SET {
 
@@ -32,7 +34,7 @@ static int call_solve(const int64_t *structure, const double *numbers,
 }
 
 extern const loopcal::Kernels kernels;
-const loopcal::Kernels kernels = {fold,          call_linearize, certify,   reach,
-                                   differentiate, fold_poses,     call_solve};
+const loopcal::Kernels kernels = {fold,          call_linearize, certify,         reach,     differentiate,
+                                   fold_poses,    compare_poses,  solve_triangles, call_solve};
 
 }  // namespace INSTRUCTION_SET

@@ -15,6 +15,7 @@ from loopcal.estimate import (
     LeastSquares,
     StepControl,
     TruncatedSVD,
+    frame_freedoms,
     identify,
     prior_from,
 )
@@ -30,6 +31,7 @@ from loopcal.measure import (
     Instrument,
     Kind,
     Measurements,
+    Pose,
     Position,
     Sensor,
     sample_truth,
@@ -172,6 +174,29 @@ def test_parts_are_only_of_many_poses_that_readings_determine(data):
     uncertain = problem_of(free, replace(data, reading_sigma=np.full_like(data.readings, 1e-6)))
     for problem in (few, frame, uncertain):
         assert select_part(problem) is None
+
+
+@pytest.mark.parametrize(
+    ("robot", "kind", "count"), [(DELTA, Position(), 6), (load_robot("hexapod-42"), Pose(), 0)]
+)
+def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot, kind, count):
+    poses = np.resize(sample_workspace(robot, 500, 1).coordinates, (3000, len(robot.controlled)))
+    noise = Gaussian(np.full(len(kind.noise_columns), SIGMA))
+    measured = simulate(robot, poses, Instrument((Sensor(kind, noise),)), 0)
+    folded: list[int] = []
+    fold = frame_freedoms.FrameRows.add_rows
+    monkeypatch.setattr(
+        frame_freedoms.FrameRows, "add_rows", lambda *parts: (folded.append(1), fold(*parts))
+    )
+    fit = identify(robot, measured, LeastSquares())
+    assert len(folded) == (2 if count else 1)  # where all motions are fixed, no more rows are
+    monkeypatch.setattr(frame_freedoms, "FIXED", np.inf)
+    plain = identify(robot, measured, LeastSquares())
+    assert fit.posterior.frames is not None
+    assert plain.posterior.frames is not None
+    unfixed, expected = fit.posterior.frames.unfixed, plain.posterior.frames.unfixed
+    assert expected.shape[1] == count
+    np.testing.assert_allclose(unfixed @ unfixed.T, expected @ expected.T, atol=1e-12)
 
 
 def test_a_start_out_of_reach_is_refused_as_without_a_part(data):

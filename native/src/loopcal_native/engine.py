@@ -24,20 +24,27 @@ from loopcal.engine import (
 )
 from loopcal.engine.numpy_engine.certificate import has_driven_rods
 from loopcal.engine.numpy_engine.targets import reach_by
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
+from loopcal_native.arguments import (
+    describe_all,
+    flatten_inputs,
+    list_addresses,
+    require_arrays,
+    require_joints,
+    require_rows,
+    require_start,
+)
 from loopcal_native.library import (
     TASK_FAILED,
     ReachOutput,
-    Strided,
     allocate,
     as_reals,
-    describe,
     list_instruction_sets,
     load_library,
     require_done,
 )
 from loopcal_native.pose_rows import flatten_rows
-from loopcal_native.programs import flatten_pattern, flatten_program, require
+from loopcal_native.programs import flatten_program, require
 from loopcal_native.tasks import NO_TASK, TaskCalls
 from loopcal_native.version import VERSION
 
@@ -55,7 +62,8 @@ def make_engine(variant: str = "") -> Engine:
         raise ValueError(f"this processor has the instruction sets {', '.join(sets)}")
     own = NativeFunctions(sets[name])
     functions = own.solve, own.certify, own.reach, own.linearize, own.fold
-    return Engine(f"native:{name}", VERSION, *functions, own.differentiate, own.fold_poses)
+    functions += own.differentiate, own.fold_poses, own.solve_triangles, own.compare_poses
+    return Engine(f"native:{name}", VERSION, *functions)
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,7 @@ class NativeFunctions:
         flat, shape = flatten_program(program, free), (t, n)
         arrays = [as_reals(e), as_reals(q), as_reals(start.T)]
         joints = [as_reals(a) for a in start.joints]
-        _require_arrays(program, arrays, joints, shape)
+        require_arrays(program, arrays, joints, shape)
         if goal is not None:
             arrays.append(as_reals(goal.T))
             require(arrays[-1].shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
@@ -98,15 +106,15 @@ class NativeFunctions:
                 self.instruction_set,
                 flat.structure.ctypes.data,
                 flat.numbers.ctypes.data,
-                _describe_all([*arrays, *[None] * (4 - len(arrays))]),
-                _describe_all(joints),
+                describe_all([*arrays, *[None] * (4 - len(arrays))]),
+                describe_all(joints),
                 t,
                 n,
                 max(max_iterations, 0),
                 calls.function if calls else NO_TASK,
                 None,
                 T.ctypes.data,
-                _list_addresses(out),
+                list_addresses(out),
                 *(a.ctypes.data for a in (residual, iterations, status, sign)),
             )
             if calls is not None and outcome == TASK_FAILED:
@@ -124,12 +132,12 @@ class NativeFunctions:
             return sign
         flat, arrays = flatten_program(program, False), [as_reals(a) for a in (e, start.T, goal.T)]
         require(goal.T.shape == (t, n, 4, 4), f"a goal ({t}, {n}, 4, 4)")
-        _require_start(program, arrays[0], arrays[1], t)
+        require_start(program, arrays[0], arrays[1], t)
         outcome = load_library().loopcal_certify(
             self.instruction_set,
             flat.structure.ctypes.data,
             flat.numbers.ctypes.data,
-            _describe_all(arrays),
+            describe_all(arrays),
             t,
             n,
             sign.ctypes.data,
@@ -147,9 +155,9 @@ class NativeFunctions:
         flat = flatten_program(program, False)
         sign = np.broadcast_to(start.closure_sign, (len(start.T), 1)).astype(np.float64)
         arrays = [as_reals(e), as_reals(start.T), values, sign[..., None]]
-        _require_start(program, arrays[0], arrays[1], t)
+        require_start(program, arrays[0], arrays[1], t)
         require(len(values) in (1, t), f"values ({t} | 1, {n}, c)")
-        _require_joints(program, start.joints, (t, 1))
+        require_joints(program, start.joints, (t, 1))
         columns = np.array([*target.columns, target.torsion], np.int64)
         base = as_reals(target.base)
         require(len(columns) == 7 and max(target.columns) < values.shape[2], "columns of values")
@@ -164,13 +172,13 @@ class NativeFunctions:
             *(((t, n, *a.shape[2:]), float) for a in start.joints),
         )
         iterations[:] = 0
-        listed = _list_addresses(out)
+        listed = list_addresses(out)
         addresses = [a.ctypes.data for a in (residual, status, closure_sign, arrives)]
         outcome = load_library().loopcal_reach(
             self.instruction_set,
             flat.structure.ctypes.data,
             flat.numbers.ctypes.data,
-            _describe_all(arrays),
+            describe_all(arrays),
             columns.ctypes.data,
             base.ctypes.data,
             t,
@@ -189,7 +197,7 @@ class NativeFunctions:
         flat = flatten_program(program, free)
         arrays, joints = [as_reals(e), as_reals(q), as_reals(state.T)], list(state.joints)
         joints = [as_reals(a) for a in joints]
-        _require_arrays(program, arrays, joints, shape)
+        require_arrays(program, arrays, joints, shape)
         m, out = len(program.freedoms), []
         for group, unknown in zip(program.groups, flat.unknown, strict=True):
             width = len(unknown) + m + len(group.slots) + len(group.joints) + 1
@@ -201,9 +209,9 @@ class NativeFunctions:
                     self.instruction_set,
                     flat.structure.ctypes.data,
                     flat.numbers.ctypes.data,
-                    _describe_all([arrays[0], None if free else arrays[1], arrays[2]]),
-                    _describe_all(joints),
-                    _list_addresses(out),
+                    describe_all([arrays[0], None if free else arrays[1], arrays[2]]),
+                    describe_all(joints),
+                    list_addresses(out),
                     t,
                     n,
                 )
@@ -222,7 +230,7 @@ class NativeFunctions:
         """Differentiate the platform in parameters and readings."""
         t, n = shape = state.T.shape[:2]
         flat = flatten_program(program, False)
-        entries, arrays, joints = _flatten_inputs(program, e, q, state, inputs, shape)
+        entries, arrays, joints = flatten_inputs(program, e, q, state, inputs, shape)
         p, a = inputs.pattern.parameters, program.n_joints
         by_parameter, by_reading = np.empty((t, n, 6, p)), np.empty((t, n, 6, a))
         if t * n:
@@ -233,8 +241,8 @@ class NativeFunctions:
                     flat.structure.ctypes.data,
                     flat.numbers.ctypes.data,
                     entries.ctypes.data,
-                    _describe_all(arrays),
-                    _describe_all(joints),
+                    describe_all(arrays),
+                    describe_all(joints),
                     by_parameter.ctypes.data,
                     by_reading.ctypes.data,
                     t,
@@ -273,7 +281,7 @@ class NativeFunctions:
         """Fold the rows of observed poses."""
         t, n = len(factor), state.T.shape[1]
         flat = flatten_program(program, False)
-        entries, arrays, joints = _flatten_inputs(program, e, q, state, inputs, (t, n))
+        entries, arrays, joints = flatten_inputs(program, e, q, state, inputs, (t, n))
         width = inputs.pattern.parameters + 1
         factor, rows = as_reals(factor), flatten_rows(observed, t, n)
         require(factor.shape == (t, width, width), f"a factor (t, {width}, {width})")
@@ -286,8 +294,8 @@ class NativeFunctions:
                     flat.structure.ctypes.data,
                     flat.numbers.ctypes.data,
                     entries.ctypes.data,
-                    _describe_all(arrays),
-                    _describe_all(joints),
+                    describe_all(arrays),
+                    describe_all(joints),
                     ctypes.byref(rows.describe()),
                     factor.ctypes.data,
                     out.ctypes.data,
@@ -298,6 +306,32 @@ class NativeFunctions:
             )
         return (out if t * n else factor), is_finite
 
+    def solve_triangles(
+        self, triangle: FloatArray, right: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Solve upper triangular systems, and bound the inverse of their matrices."""
+        triangle, right = as_reals(triangle), as_reals(right)
+        t, p = right.shape
+        require(triangle.shape == (t, p, p), f"triangles ({t}, {p}, {p}), not {triangle.shape}")
+        x, growth = np.empty_like(right), np.zeros(t)
+        addresses = (a.ctypes.data for a in (triangle, right, x, growth))
+        call = load_library().loopcal_solve_triangles
+        require_done(call(self.instruction_set, *addresses, t, p))
+        return x, growth
+
+    def compare_poses(self, T: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the differences of poses, and their derivatives by twists."""
+        arrays = [as_reals(T), as_reals(reference)]
+        t, n = shape = max(len(T), len(reference)), max(arrays[0].shape[1], arrays[1].shape[1])
+        require_rows("T", arrays[0], (4, 4), shape)
+        require_rows("references", arrays[1], (12,), shape)
+        residual, by_twist = np.empty((t, n, 6)), np.empty((t, n, 6, 6))
+        addresses = residual.ctypes.data, by_twist.ctypes.data
+        if t * n:
+            call = load_library().loopcal_compare_poses
+            require_done(call(self.instruction_set, describe_all(arrays), *addresses, t, n))
+        return residual, by_twist
+
 
 def is_closed_at_once(program: Program) -> bool:
     """Return whether `reach` of the library takes it: driven rods alone, an actuator for each."""
@@ -307,92 +341,3 @@ def is_closed_at_once(program: Program) -> bool:
         kept = has_driven_rods(program) and sorted(driven) == list(range(program.n_joints))
         vars(program)["_native_rods"] = kept
     return kept
-
-
-def _require_start(program: Program, e: FloatArray, T: FloatArray, t: int) -> None:
-    """Raise ValueError unless e and T are those of t trials that begin at one pose each."""
-    require(len(e) in (1, t) and e.shape[1:] == (program.n_displacements,), f"e ({t} | 1, ..)")
-    require(T.shape == (len(T), 1, 4, 4), "a start (t | 1, 1, 4, 4)")
-    require(len(T) in (1, len(e)), "a start for each trial, or one")
-
-
-def _require_arrays(
-    program: Program,
-    arrays: Sequence[FloatArray],
-    joints: Sequence[FloatArray],
-    shape: tuple[int, int],
-) -> None:
-    """Raise ValueError unless e, q, T and joints are arrays of t trials and n poses."""
-    t, e, q, T = shape[0], *arrays
-    expected = f"e ({t} | 1, {program.n_displacements}), not {e.shape}"
-    require(e.ndim == 2 and e.shape[1] == program.n_displacements, expected)
-    require(len(e) in (1, t), expected)
-    named = [("q", q, (program.n_joints,)), ("T", T, (4, 4))]
-    for name, array, end in named:
-        _require_rows(name, array, end, shape)
-    _require_joints(program, joints, shape)
-
-
-def _require_joints(program: Program, joints: Sequence[FloatArray], shape: tuple[int, int]) -> None:
-    """Raise ValueError unless joints are those of all groups for t trials and n poses."""
-    require(len(joints) == len(program.groups), f"joints of {len(program.groups)} groups")
-    for group, values in zip(program.groups, joints, strict=True):
-        _require_rows("joints", values, (len(group.limbs), len(group.joints) + 1), shape)
-
-
-def _require_rows(
-    name: str, array: FloatArray, end: tuple[int, ...], shape: tuple[int, int]
-) -> None:
-    """Raise ValueError unless an array is (t | 1, n | 1, ..) with this end."""
-    t, n = shape
-    is_right = array.ndim == 2 + len(end) and array.shape[2:] == end
-    is_right = is_right and array.shape[0] in (1, t) and array.shape[1] in (1, n)
-    require(is_right, f"{name} ({t} | 1, {n} | 1, {end}), not {array.shape}")
-
-
-def _flatten_inputs(
-    program: Program,
-    e: FloatArray,
-    q: FloatArray,
-    state: State,
-    inputs: ParameterMap,
-    shape: tuple[int, int],
-) -> tuple[IntArray, list[FloatArray], list[FloatArray]]:
-    """Return the entries of a map, e, q, T and the numbers of the map, and the joints of groups.
-
-    They must be kept while their addresses are in use.
-    """
-    arrays, joints = [as_reals(a) for a in (e, q, state.T)], [as_reals(a) for a in state.joints]
-    _require_arrays(program, arrays, joints, shape)
-    entries, numbers = _flatten_map(program, inputs, shape)
-    return entries, [*arrays, *numbers], joints
-
-
-def _flatten_map(
-    program: Program, inputs: ParameterMap, shape: tuple[int, int]
-) -> tuple[IntArray, list[FloatArray]]:
-    """Return the entries of a map and its four arrays of numbers."""
-    (t, n), a = shape, program.n_joints
-    pattern, basis = inputs.pattern, as_reals(inputs.basis)
-    require(basis.ndim == 4, "a basis (t | 1, n | 1, joints, functions)")
-    entries = flatten_pattern(program, pattern, basis.shape[3])
-    coefficients = [as_reals(inputs.displacements), as_reals(inputs.joints)]
-    for array, pairs in zip(coefficients, (pattern.displacements, pattern.joints), strict=True):
-        is_right = array.ndim == 2 and array.shape[1] == len(pairs) and len(array) in (1, t)
-        require(is_right, f"coefficients ({t} | 1, {len(pairs)}), not {array.shape}")
-    readings = as_reals(inputs.readings)
-    for array, end in ((basis, (a, basis.shape[3])), (readings, (a,))):
-        is_right = array.shape[2:] == end and array.shape[0] in (1, t) and array.shape[1] in (1, n)
-        require(is_right, f"derivatives ({t} | 1, {n} | 1, {end}), not {array.shape}")
-    return entries, [*coefficients, basis, readings]
-
-
-def _describe_all(arrays: Sequence[FloatArray | None]) -> ctypes.Array[Strided]:
-    """Return the addresses and strides of arrays; null for None."""
-    described = (Strided(None, 0, 0) if a is None else describe(a) for a in arrays)
-    return (Strided * len(arrays))(*described)
-
-
-def _list_addresses(arrays: Sequence[FloatArray]) -> ctypes.Array[ctypes.c_void_p]:
-    """Return the addresses of arrays."""
-    return (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-ABI = 5
+ABI = 6
 """The C interface that this package calls; dispatch.cpp states it, too."""
 NO_MEMORY, TASK_FAILED = 1, 2
 """What functions of the library return, beside 0."""
@@ -77,6 +77,8 @@ def load_library() -> ctypes.CDLL:
     library.loopcal_differentiate.argtypes = (INT, *(ADDRESS,) * 7, *(COUNT,) * 2)
     library.loopcal_fold_poses.argtypes = (INT, *(ADDRESS,) * 5, ctypes.POINTER(TwistRows))
     library.loopcal_fold_poses.argtypes += (*(ADDRESS,) * 3, *(COUNT,) * 2)
+    library.loopcal_compare_poses.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 2)
+    library.loopcal_solve_triangles.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 2)
     library.loopcal_solve.argtypes = (INT, *(ADDRESS,) * 4, *(COUNT,) * 3, TASK, *(ADDRESS,) * 7)
     return library
 

@@ -45,6 +45,8 @@ class Engine:
     """An implementation of the functions whose docstrings are below.
 
     name : as in LOOPCAL_ENGINE, with its variant. version : of the package that computes.
+    solve_triangles, compare_poses : None where the functions of `loopcal.numerics` and of
+        `loopcal.geometry` do it.
     """
 
     name: str
@@ -56,6 +58,8 @@ class Engine:
     fold: Callable[[FloatArray, FloatArray], FloatArray]
     differentiate: Callable[..., tuple[FloatArray, FloatArray]]
     fold_poses: Callable[..., tuple[FloatArray, BoolArray]]
+    solve_triangles: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
+    compare_poses: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -224,3 +228,35 @@ def fold_poses(
     """
     arguments = program, e, q, state, inputs, observed
     return get_current_engine().fold_poses(factor, *arguments)
+
+
+def solve_triangles(
+    triangle: FloatArray, right: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Solve R x = b for upper triangular matrices R (t, p, p) and b (t, p).
+
+    The entries of R^-1 are at most those of M^-1 in size, where M has |r_ii| on its diagonal and
+    -|r_ij| beside it.
+
+    Returns
+    -------
+    x : (t, p). growth : (t,) largest entry of M^-1 (1 .. 1)', so that |R^-1|_2 <= sqrt(p) growth.
+        A zero on the diagonal gives infinities or NaN. None where the engine leaves this to
+        `loopcal.numerics.triangular_systems`.
+    """
+    solve = get_current_engine().solve_triangles
+    return None if solve is None else solve(triangle, right)
+
+
+def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the differences of poses, and their derivatives by the twists of T.
+
+    T : (t | 1, n, 4, 4) [m]. reference : (t | 1, n, 12) rotations R_0 row by row, then positions.
+
+    Returns
+    -------
+    residual : (t, n, 6) log(R R_0') [rad] and the difference of positions [m]. by_twist : (t, n, 6,
+        6). None where the engine leaves this to the functions of `loopcal.geometry`.
+    """
+    compare = get_current_engine().compare_poses
+    return None if compare is None else compare(T, reference)

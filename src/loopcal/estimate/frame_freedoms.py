@@ -48,6 +48,10 @@ UNFIXED = 1e-8
 square root of double rounding.
 """
 
+FIXED = 1e-4
+"""Share of the largest effect above which a motion stays fixed, whatever rows follow: these would
+have to be ten thousand times as accurate as all before them."""
+
 MOST_READINGS = 200
 """Largest number of measured poses that are kept with a fit."""
 
@@ -75,7 +79,7 @@ class FrameRows:
         tree = None if problem.nuisance is None else problem.nuisance.tree
         self._factor = empty_factor(1, MOTIONS)
         self._factors = None if tree is None else NodeFactors(tree, 1, MOTIONS)
-        self._is_lost = False
+        self._is_lost = self._is_fixed = False
 
     def add(
         self, number: int, poses: LinearizedPoses, evaluations: Sequence[Evaluation | None]
@@ -83,7 +87,12 @@ class FrameRows:
         """Add the rows of a block, at its poses and evaluated there; see `Problem.residuals`."""
         block = self._problem.poses.blocks[number]
         self._is_lost |= bool(poses.is_lost(block.is_needed)[0])
+        if self._is_fixed:
+            return
         self.add_rows(block.rows, poses.T, poses.joints, evaluations)
+        if self._factors is None and len(self._problem.poses.blocks) > 1:
+            s = np.linalg.svd(self._factor[0, :MOTIONS, :MOTIONS], compute_uv=False)
+            self._is_fixed = bool(s[-1] > FIXED * self._effect)
 
     def add_rows(
         self,

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.typing import BoolArray, FloatArray
 
 PART = 12
@@ -63,7 +64,7 @@ def solve_regular(
     t, p = right.shape
     diagonal = np.abs(np.einsum("tii->ti", triangle))
     with np.errstate(over="ignore"):
-        norm = np.sqrt((triangle**2).sum(axis=(1, 2)))
+        norm = np.sqrt(np.einsum("tij,tij->t", triangle, triangle))
     is_usable = (diagonal > 0.0).all(axis=1) & np.isfinite(norm) & np.isfinite(right).all(axis=1)
     if not is_usable.all():
         x, is_regular = np.zeros((t, p)), np.zeros(t, dtype=bool)
@@ -72,16 +73,25 @@ def solve_regular(
             solved = solve_regular(triangle[usable], right[usable], tolerance)
             x[usable], is_regular[usable] = solved
         return x, is_regular
-    comparison = -np.abs(triangle)
-    np.einsum("tii->ti", comparison)[...] = diagonal
-    both = solve_triangles(
-        np.concatenate([triangle, comparison]), np.concatenate([right, np.ones((t, p))])
-    )
+    x, growth = engine.solve_triangles(triangle, right) or _solve_both(triangle, right, diagonal)
     needed = MARGIN * max(tolerance, ROUNDING) * norm
-    is_regular = needed * np.sqrt(p) * both[t:].max(axis=1, initial=0.0) < 1.0
+    is_regular = needed * np.sqrt(p) * growth < 1.0
     doubtful = np.flatnonzero(~is_regular)
     if doubtful.size:
         inverse = np.linalg.inv(triangle[doubtful])
         length = np.sqrt((inverse**2).sum(axis=(1, 2)))
         is_regular[doubtful] = needed[doubtful] * length < 1.0
-    return np.where(is_regular[:, None], both[:t], 0.0), is_regular
+    return np.where(is_regular[:, None], x, 0.0), is_regular
+
+
+def _solve_both(
+    triangle: FloatArray, right: FloatArray, diagonal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the result of `loopcal.engine.solve_triangles`; `diagonal` (t, p) is |r_ii|."""
+    t, p = right.shape
+    comparison = -np.abs(triangle)
+    np.einsum("tii->ti", comparison)[...] = diagonal
+    both = solve_triangles(
+        np.concatenate([triangle, comparison]), np.concatenate([right, np.ones((t, p))])
+    )
+    return both[:t], both[t:].max(axis=1, initial=0.0)

@@ -170,6 +170,30 @@ def test_factors_of_poses_of_wrong_shape_are_refused(shape):
         NATIVE.fold_poses(np.zeros(shape), *POSE_ROWS)
 
 
+@pytest.mark.parametrize(
+    ("triangle", "right"), [((2, 3, 3), (2, 4)), ((3, 3, 3), (2, 3)), ((2, 3, 4), (2, 3))]
+)
+def test_triangular_systems_of_wrong_shape_are_refused(triangle, right):
+    assert NATIVE.solve_triangles is not None
+    with pytest.raises(ValueError, match="the native engine expects"):
+        NATIVE.solve_triangles(np.ones(triangle), np.ones(right))
+
+
+@pytest.mark.parametrize(
+    ("T", "reference"),
+    [
+        ((2, 3, 4, 4), (2, 3, 11)),
+        ((2, 3, 4, 4), (3, 3, 12)),
+        ((2, 3, 4, 4), (2, 4, 12)),
+        ((2, 3, 3, 4), (2, 3, 12)),
+    ],
+)
+def test_compared_poses_of_wrong_shape_are_refused(T, reference):
+    assert NATIVE.compare_poses is not None
+    with pytest.raises((ValueError, IndexError)):
+        NATIVE.compare_poses(np.ones(T), np.ones(reference))
+
+
 def test_nothing_is_solved_for_no_trials_no_poses_and_no_rows():
     assert NATIVE.solve(
         PROGRAM, E, Q[:, :0], replace(HOME, T=HOME.T[:, :0], joints=(HOME.joints[0][:, :0],))

@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import engine, geometry
 from loopcal.geometry import OrientationForm
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.poses.component import SMALL_TILT
@@ -133,13 +133,10 @@ class Pose(ToolKind):
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
         tool, rows = self.locate_tool(T, values)
-        R_measured = measured[..., :9].reshape(*measured.shape[:-1], 3, 3)
-        rotation = geometry.log_so3(tool[..., :3, :3] @ np.swapaxes(R_measured, -1, -2))
-        residual = np.concatenate([rotation, tool[..., :3, 3] - measured[..., -3:]], axis=-1)
-        inverse = geometry.left_jacobian_inverse_so3(rotation)
+        residual, by_twist = compare_poses(tool, measured)
         if self.measures_platform:
-            return Evaluation(residual, setup.stack_diagonally(inverse, np.eye(3)))
-        by_rotation = inverse @ rows[..., :3, :]
+            return Evaluation(residual, by_twist)
+        by_rotation = by_twist[..., :3, :3] @ rows[..., :3, :]
         return self.split_columns(
             residual, np.concatenate([by_rotation, rows[..., 3:, :]], axis=-2)
         )
@@ -200,3 +197,19 @@ class Pose(ToolKind):
 def _is_singular(rates: FloatArray) -> BoolArray:
     """Return whether rates (..., 3, 3) of angles are close to a singularity, (..., 1, 1)."""
     return (np.abs(np.linalg.det(rates)) < SMALL_TILT)[..., None, None]
+
+
+def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (.., r, 6) of poses T (.., r, 4, 4), and their derivatives (.., r, 6, 6) by
+    the twists of T.
+
+    reference : (.., r, 12) rotations row by row, then positions.
+    """
+    compared = engine.compare_poses(T, reference)
+    if compared is not None:
+        return compared
+    R = reference[..., :9].reshape(*reference.shape[:-1], 3, 3)
+    rotation = geometry.log_so3(T[..., :3, :3] @ np.swapaxes(R, -1, -2))
+    residual = np.concatenate([rotation, T[..., :3, 3] - reference[..., -3:]], axis=-1)
+    inverse = geometry.left_jacobian_inverse_so3(rotation)
+    return residual, setup.stack_diagonally(inverse, np.eye(3))
