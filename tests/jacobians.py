@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -271,7 +271,7 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
         )
 
     replaced = {"stack_matrix": stack, "stack_blocks": join}
-    compare_poses = engine.compare_poses
+    functions, compare_poses = cast(dict[str, Any], vars(engine)), engine.compare_poses
 
     modules = [
         module
@@ -288,11 +288,11 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
         vars(module)["np"] = _Either(np, jax.numpy)
     for names, name, _ in stacking:
         names[name] = replaced[name]
-    vars(engine)["compare_poses"] = lambda *_: None
+    functions["compare_poses"] = lambda *_: None
     try:
         yield
     finally:
-        vars(engine)["compare_poses"] = compare_poses
+        functions["compare_poses"] = compare_poses
         for module in modules:
             vars(module)["np"] = np
         for names, name, own in stacking:
