@@ -103,6 +103,7 @@ def test_nothing_is_folded_without_rows_poses_and_trials(engine):
     start = np.triu(np.random.default_rng(1).normal(size=make_zeros(arguments, 2).shape))
     none = [replace(o, poses=o.poses[:0], by_twist=o.by_twist[:, :0], residual=o.residual[:, :0])
             for o in arguments[5]]  # fmt: skip
-    factor, is_finite = engine.fold_poses(start, *arguments[:5], none)
-    assert_allclose(np.abs(factor), np.abs(start), rtol=1e-13)
-    assert is_finite.all()
+    for observed in (none, []):
+        factor, is_finite = engine.fold_poses(start, *arguments[:5], observed)
+        assert_allclose(np.abs(factor), np.abs(start), rtol=1e-13)
+        assert is_finite.all()

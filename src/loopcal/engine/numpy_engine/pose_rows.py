@@ -28,6 +28,8 @@ def fold_poses(
 ) -> tuple[FloatArray, BoolArray]:
     """Fold the rows of observed poses; see `loopcal.engine.fold_poses`."""
     t, n = len(factor), state.T.shape[1]
+    if not observed:
+        return factor, np.ones((t, n), dtype=bool)
     folded, is_finite = np.empty_like(factor), np.empty((t, n), dtype=bool)
     step = max(1, PART // max(n, 1))
     shared = _differentiate(program, e, q, state, inputs) if len(state.T) < t else None
