@@ -78,7 +78,6 @@ UNUSED = {
     *("loopcal.estimate.poses.components", "loopcal.estimate.poses.initialization"),
     *("loopcal.measure.instrument", "loopcal.measure.simulation", "loopcal.measure.initial_values"),
     *("loopcal.measure.kinds.points.position", "loopcal.measure.kinds.surfaces.plane"),
-    "loopcal.geometry.alignment",
 }
 """Packages that an ordinary calibration does not need, each of which takes time to import."""
 

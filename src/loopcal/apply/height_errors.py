@@ -184,7 +184,7 @@ def measures_only_heights(data: Measurements) -> bool:
 def _measures_height(rows: Observations) -> bool:
     """Return whether each row measures one height: z of the tool, or the gap of one target."""
     kind = rows.kind
-    if rows.measured.shape[1] != 1:
+    if rows.measured.shape[1] != 1:  # asked first: most data need no import of these two kinds
         return False
     if isinstance(kind, kinds.Component):
         return kind.components == ("z",) and bool(kind.T_base_frame[2, 2] > UPRIGHT)

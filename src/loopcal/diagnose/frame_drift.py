@@ -22,6 +22,7 @@ import numpy as np
 
 from loopcal import engine, geometry, measure
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.geometry.alignment import FLATNESS, align_point_sets
 from loopcal.measure import Measurements, Observations
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import decompose, empty_factor
@@ -281,16 +282,12 @@ def _spans_plane(points: FloatArray) -> bool:
     measured = points[np.isfinite(points).all(axis=1)]
     if len(measured) < 3:
         return False
-    from loopcal.geometry.alignment import FLATNESS
-
     extent = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
     return bool(extent[1] > FLATNESS * extent[0])
 
 
 def _align_each(repeats: _Repeats) -> _Repeats:
     """Return the measurements, each moved to the first one with which it shares enough targets."""
-    from loopcal.geometry.alignment import align_point_sets
-
     points, whitener = repeats.points.copy(), repeats.whitener.copy()
     for i in range(1, len(points)):
         for first in points[:i]:

@@ -18,7 +18,8 @@ from loopcal.typing import FloatArray
 def find_distinct(values: NDArray[Any]) -> NDArray[Any]:
     """Return the distinct values of an array, of any shape and type, in ascending order.
 
-    They are those of `np.unique`, which does not ask where it counts.
+    They are those of `np.unique`. With `return_counts`, it does not ask whether the array is masked
+    (numpy 2.4).
     """
     return np.unique(values, return_counts=True)[0]
 

@@ -16,7 +16,7 @@ class OpenFreedoms:
     Attributes
     ----------
     motions : of frames by these combinations. count : of all. changing : combinations that may
-    change poses. names : of the parameters in these.
+        change poses. names : of the parameters in these.
     """
 
     motions: FrameMotions
@@ -33,7 +33,7 @@ class OpenFreedoms:
 def sort_open_freedoms(
     posterior: Posterior, unidentifiable: tuple[Combination, ...], count: int
 ) -> OpenFreedoms:
-    """Tell the combinations that only move frames from those that change poses.
+    """Separate the combinations that only move frames from those that change poses.
 
     A combination with a meaning, such as the place of a frame, changes no pose. Where all have one,
     but they are more than the motions of frames, the parameters of all are named.

@@ -60,8 +60,8 @@ TAKEN_OPTIONS = (
     type=PoseShare(),
     default=0.0,
     metavar="SHARE",
-    help="Share of the poses to keep out of the fit for validation, such as 0.25. The poses are "
-    "those of data.split(hold_out=SHARE, seed=SEED) in Python.",
+    help="Share of the poses, from 0 to below 1, to keep out of the fit for validation, such as "
+    "0.25. The poses are those of data.split(hold_out=SHARE, seed=SEED) in Python.",
 )
 @fit_options
 @flag_option(

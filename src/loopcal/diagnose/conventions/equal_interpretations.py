@@ -18,7 +18,6 @@ from loopcal.diagnose.conventions.selection import ALLOWED, FEWEST_POSES
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.measure import Measurements
 from loopcal.measure.kinds.rows import Column
-from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import IntArray
 from loopcal.units import Dimension
 
@@ -68,9 +67,8 @@ def compute_opposite_misfit(free: FreeParameters, data: Measurements) -> float:
 
 def select_measured(data: Measurements) -> IntArray:
     """Return the measured poses, and others spread over the data up to `FEWEST_POSES`."""
-    measured = find_distinct(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
+    measured = np.unique(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
     others = np.setdiff1d(np.arange(data.n_poses), measured)
     missing = max(FEWEST_POSES - len(measured), 0) if len(others) else 0
     spread = np.linspace(0, len(others) - 1, missing)
-    union = np.concatenate([measured, others[spread.astype(np.intp)]])
-    return find_distinct(union).astype(np.intp)
+    return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)

@@ -28,7 +28,6 @@ from loopcal.estimate.problem_construction import make_problem, problem_of
 from loopcal.measure import Measurements, NuisanceParameters
 from loopcal.mechanism import Mechanism, find_directly_reachable, forward, forward_trials
 from loopcal.numerics.gauss_newton import Halving
-from loopcal.numerics.sorted_values import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 FEWEST = 3
@@ -135,7 +134,7 @@ def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = F
     reached = find_directly_reachable(robot, robot.values[None], q[None])[0]
     if follow and reached.sum() < (1.0 - MOST_EXCLUDED) * len(q):
         hard = np.flatnonzero(~reached)
-        sampled = hard[find_distinct(np.linspace(0, len(hard) - 1, FOLLOWED).astype(np.intp))]
+        sampled = hard[np.unique(np.linspace(0, len(hard) - 1, FOLLOWED).astype(np.intp))]
         reached[sampled] = forward(robot, q[sampled]).converged
         rest = np.setdiff1d(hard, sampled)
         if len(rest) and reached[sampled].mean() >= 1.0 - MOST_EXCLUDED:

@@ -32,10 +32,11 @@ from loopcal.typing import FloatArray
 PROJECTION_STEPS, ITERATIONS = 20, 12
 """Gauss-Newton steps of a projection, and Newton steps of each: it begins close to its solution."""
 ATTEMPTS = 5
-"""Lengths that are tried for a step, the shortest 1/8 of it: a row ends where none of them lowers
+"""Lengths that are tried for a step, the shortest 1/16 of it: a row ends where none of them lowers
 its distance, as at the end of the reach."""
 LONGEST_STEP, SHORT_STEP = 0.5, 1e-12
-"""Longest of them, which is half a radian, and last one, relative to the robot's size."""
+"""The longest step, which is half a radian, and the one after which a row ends, relative to the
+robot's size."""
 SHORT_SHARE = 1e-9
 """The last step changes the distance from the target by this share to first order."""
 STATIONARY = 1e-6

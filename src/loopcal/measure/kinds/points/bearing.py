@@ -8,6 +8,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
+from loopcal.geometry.alignment import solve_resection
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.camera_angles import convert_camera_angles, predict_camera_angles
 from loopcal.measure.kinds.points.target_kind import Prediction, TargetKind
@@ -106,7 +107,5 @@ class Bearing(TargetKind):
         _, _, points, angles = self.collect_points(T, measured)
         if "frame" not in self.unknown or len(angles) < 4 or self.is_of_base:
             return self.nominal_values[None]
-        from loopcal.geometry.alignment import solve_resection
-
         frames = solve_resection(self.convert_to_rays(angles), points)
         return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frames)})

@@ -14,6 +14,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry import OrientationForm
+from loopcal.geometry.alignment import align_point_sets
 from loopcal.measure.array_checks import check_names, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.poses.tool_kind import ToolKind
@@ -203,8 +204,6 @@ class Component(ToolKind):
             or np.count_nonzero(complete) < 3
         ):
             return super().guess_values(T, measured)
-        from loopcal.geometry.alignment import align_point_sets
-
         points = (T @ self.stated_tool)[complete, :3, 3]
         positions = measured[complete][:, [self.components.index(name) for name in POSITION_AXES]]
         frame = align_point_sets(positions, points)

@@ -9,6 +9,7 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.geometry import OrientationForm
+from loopcal.geometry.alignment import solve_hand_eye
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.poses.component import SMALL_TILT
 from loopcal.measure.kinds.poses.tool_kind import ToolKind
@@ -163,8 +164,6 @@ class Pose(ToolKind):
         if not self.unknown or np.count_nonzero(complete) < 3:
             return super().guess_values(T, measured)
         columns = measured[complete]
-        from loopcal.geometry.alignment import solve_hand_eye
-
         frame, tool = solve_hand_eye(
             T[complete],
             geometry.make_pose(self.form.to_matrix(columns[:, :-3]), columns[:, -3:]),

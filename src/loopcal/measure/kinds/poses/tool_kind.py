@@ -10,6 +10,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
+from loopcal.geometry.alignment import OCTAHEDRAL_ROTATIONS
 from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
@@ -110,8 +111,6 @@ class ToolKind(Kind):
         """Return 24 evenly spread orientations of the frame, with its origin where it is stated."""
         if "frame" not in self.unknown:
             return self.nominal_values[None]
-        from loopcal.geometry.alignment import OCTAHEDRAL_ROTATIONS
-
         stated = self.T_base_frame
         frames = geometry.make_pose(OCTAHEDRAL_ROTATIONS @ stated[:3, :3], stated[:3, 3])
         return self.assemble_values({"frame": setup.encode_frame(stated, frames)})
