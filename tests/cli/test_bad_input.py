@@ -430,6 +430,11 @@ def test_data_of_another_robot_give_a_note(tmp_path, capsys, stated, noted) -> N
             "see loopcal calibrate --help",
         ),
         (
+            "calibrate r.yaml d.csv -o run --hold-out 25%",
+            "'25%' is no number; a share of the poses is a number from 0 to below 1, such as 0.25",
+            "see loopcal calibrate --help",
+        ),
+        (
             "calibrate r.yaml d.csv -o run --hold-out 10",
             "write 0.1 for 10 %, or the number of poses to hold out divided by that of all poses.",
             "see loopcal calibrate --help",

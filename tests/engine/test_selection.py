@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One engine computes in a process: the one that LOOPCAL_ENGINE names, and results state it."""
 
+import importlib.util
+import sys
 from importlib.metadata import EntryPoint, version
 
 import numpy as np
@@ -29,6 +31,10 @@ def make_counting_engine(variant: str) -> Engine:
     """Return the NumPy engine under another name, as an entry point would."""
     if variant == "old":
         return Engine("counting:old", "0.9", lambda: None)  # pyright: ignore
+    if variant == "none":
+        return None  # pyright: ignore
+    if variant == "failing":
+        return variant.no_such_attribute  # pyright: ignore
     if variant not in ("", "fast"):
         raise ValueError(f"no variant {variant!r}")
     own = numpy_engine
@@ -65,6 +71,14 @@ def test_numpy_computes_where_nothing_else_is_installed(monkeypatch):
     assert str(select_engine()) == f"numpy {np.__version__}"
 
 
+def test_a_folder_with_the_name_of_the_native_engine_is_no_engine(monkeypatch, tmp_path):
+    (tmp_path / "loopcal_native").mkdir()
+    monkeypatch.setattr("sys.path", [str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "loopcal_native", raising=False)
+    assert importlib.util.find_spec("loopcal_native") is not None
+    assert select_engine().name == "numpy"
+
+
 def test_the_environment_names_the_engine_of_all_callers(environment, installed):
     environment("counting:fast")
     assert str(engine.get_current_engine()) == "counting:fast 1.0"
@@ -82,6 +96,8 @@ def test_the_environment_names_the_engine_of_all_callers(environment, installed)
         ("broken", "engine.not-usable"),
         ("counting:slow", "engine.not-usable"),
         ("counting:old", "engine.not-usable"),
+        ("counting:none", "engine.not-usable"),
+        ("counting:failing", "engine.not-usable"),
     ],
 )
 def test_engines_that_cannot_compute_are_refused_in_a_sentence(installed, choice, code):
@@ -94,7 +110,7 @@ def test_engines_that_cannot_compute_are_refused_in_a_sentence(installed, choice
 def test_a_wrong_name_ends_a_command_with_a_sentence(environment, capsys):
     environment("nativ")
     assert main(["check", "five-bar"]) == 1
-    assert "LOOPCAL_ENGINE names the engine 'nativ'" in capsys.readouterr().err
+    assert "There is no engine 'nativ' here" in capsys.readouterr().err
 
 
 def test_version_states_the_engine(environment, capsys):

@@ -66,7 +66,7 @@ def load_library() -> ctypes.CDLL:
     library = ctypes.CDLL(str(file))
     library.loopcal_abi.restype = INT
     if library.loopcal_abi() != ABI:
-        raise OSError("its library belongs to another version of loopcal-native")
+        raise OSError("its library belongs to another version of it; install loopcal-native anew")
     library.loopcal_instruction_set.argtypes = (INT, ctypes.POINTER(INT))
     library.loopcal_instruction_set.restype = ctypes.c_char_p
     library.loopcal_fold.argtypes = (INT, *(ADDRESS,) * 3, *(COUNT,) * 4)

@@ -74,7 +74,7 @@ def select_engine(choice: str = "") -> Engine:
     ------
     MissingPackageError : there is no such engine, or it does not work here.
     """
-    choice = choice.strip() or (NATIVE if find_spec(NATIVE_MODULE) else NUMPY)
+    choice = choice.strip() or (NATIVE if _is_native_installed() else NUMPY)
     name, _, variant = choice.partition(":")
     if choice == NUMPY:
         own = numpy_engine
@@ -82,19 +82,28 @@ def select_engine(choice: str = "") -> Engine:
         return Engine(NUMPY, np.__version__, *functions, own.differentiate, own.fold_poses)
     load = _find_loader(choice, name)
     try:
-        return load()(variant)
-    except TypeError as cause:  # its record of functions is that of another version
-        reason = "it belongs to another version of loopcal; install both anew"
-        finding = report_finding("engine.not-usable", engine=choice, reason=reason)
-        raise MissingPackageError(finding) from cause
-    except (ImportError, OSError, ValueError) as cause:
+        engine = load()(variant)
+        if not isinstance(engine, Engine):
+            raise TypeError(f"{engine!r} is no engine")
+    except (ImportError, OSError, ValueError) as cause:  # their texts say what to do
         finding = report_finding("engine.not-usable", engine=choice, reason=str(cause))
         raise MissingPackageError(finding) from cause
+    except Exception as cause:  # the code of others, or a record of functions of another version
+        reason = "it belongs to another version of loopcal, or fails; install both anew"
+        finding = report_finding("engine.not-usable", engine=choice, reason=reason)
+        raise MissingPackageError(finding) from cause
+    return engine
+
+
+def _is_native_installed() -> bool:
+    """Return whether there is a package of the native engine; an empty folder is none."""
+    spec = find_spec(NATIVE_MODULE)
+    return spec is not None and spec.origin is not None
 
 
 def _find_loader(choice: str, name: str) -> Callable[[], Callable[[str], Engine]]:
     """Return what imports the function that makes an engine; raise MissingPackageError."""
-    if name == NATIVE and find_spec(NATIVE_MODULE):
+    if name == NATIVE and _is_native_installed():
         # known without a search through all installed packages, which takes 0.04 s
         return lambda: import_module(NATIVE_MODULE).make_engine
     from importlib.metadata import entry_points

@@ -70,13 +70,14 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
     """
     if not excluded:
         return data
+    known, unwanted = set(data.labels), set(excluded)
     for label in excluded:
-        if label not in data.labels:
+        if label not in known:
             raise DataError(
                 f"no pose {label!r} to exclude{suggest_names(label, data.labels)}; give labels of "
                 "poses in the data"
             )
-    kept = np.array([label not in excluded for label in data.labels])
+    kept = np.array([label not in unwanted for label in data.labels])
     observations = tuple(
         o.with_weights(o.weight * kept[o.rows].reshape(len(o), o.kind.poses_per_row).all(axis=1))
         for o in data.observations

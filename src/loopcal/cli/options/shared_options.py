@@ -125,7 +125,11 @@ class PoseShare(click.types.FloatParamType):
         """Return the share, or fail with what is allowed and what was probably meant."""
         from loopcal.workflow.calibration_options import describe_wrong_share
 
-        share = super().convert(value, param, ctx)
+        try:
+            share = float(value)
+        except ValueError:
+            allowed = "a share of the poses is a number from 0 to below 1, such as 0.25 for 25 %"
+            self.fail(f"{value!r} is no number; {allowed}.", param, ctx)
         if fault := describe_wrong_share(share):
             self.fail(f"it is {fault}.", param, ctx)
         return share

@@ -144,7 +144,8 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     target : (n, 4, 4) platform in base, or (n, c) controlled coordinates in the order of
         `robot.controlled` [m, rad]. A pose that the machine has too few freedoms for is projected
         to the reachable pose that minimizes |log(R R_target')|^2 size^2 + |t - t_target|^2, with
-        `robot.size`.
+        `robot.size`. The search begins at the controlled coordinates of the target; where no pose
+        has these, the row is `UNREACHABLE`.
     start : solution that selects the working mode (default: home).
 
     Returns
