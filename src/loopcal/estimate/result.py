@@ -58,8 +58,9 @@ class History:
     status : how it ended. iterations : steps taken.
     cost : (i + 1,) whitened sum of squares. With a loss, the first and those after the last change
         of weights use the final weights; those between use the weights of their time. A fit of very
-        many poses begins with a part of them, of which these are the sums times the ratio of the
-        numbers of equations.
+        many poses begins with the estimate of a part of them: the first sum is that of all poses,
+        those of the part's further steps are estimates, its sums times the ratio of the numbers of
+        equations.
     estimate : (i + 1, p) [SI].
     """
 
