@@ -23,7 +23,7 @@ from loopcal.estimate import (
 from loopcal.estimate import fit_descent as module
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.minimization import part_start
-from loopcal.estimate.minimization.part_start import SHARE, select_part, spread_poses
+from loopcal.estimate.minimization.part_start import FEWEST_POSES, SHARE, select_part, spread_poses
 from loopcal.estimate.observation_rows import BLOCK
 from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.io import load_robot
@@ -45,7 +45,8 @@ from loopcal.measure import (
 from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
 
 DELTA = load_robot("linear-delta")
-MANY = SHARE * BLOCK
+MANY = FEWEST_POSES
+PART = MANY // SHARE
 SIGMA = 1e-5  # [m]
 
 
@@ -128,7 +129,7 @@ def test_the_history_has_the_steps_of_the_part_with_comparable_sums_of_squares(m
     np.testing.assert_allclose(history.cost[0], plain.history.cost[0], rtol=1e-10)
     # 6144 residuals of the part: 10 standard deviations of their mean square, sqrt(2 / 6144)
     np.testing.assert_allclose(history.cost[-3:], plain.history.cost[-1], rtol=0.2)
-    assert any(f"({BLOCK} of {MANY} poses)" in text for text in said)
+    assert any(f"({PART} of {MANY} poses)" in text for text in said)
     assert "poses)" not in said[-1]
 
 
@@ -198,7 +199,7 @@ def test_a_fit_with_an_earlier_calibration_begins_with_all_poses(monkeypatch, da
 
 def test_a_part_that_does_not_determine_all_parameters_is_not_used(monkeypatch):
     poses = list_poses()
-    others = np.setdiff1d(np.arange(MANY), spread_poses(MANY, BLOCK))
+    others = np.setdiff1d(np.arange(MANY), spread_poses(MANY, PART))
     poses[np.setdiff1d(np.arange(MANY), others[:300])] = poses[0]  # 300 poses that are no part
     fit, plain = fit_both(monkeypatch, measure(poses), FitOptions(method=LeastSquares()))
     assert plain.spectrum.rank == len(plain.free_parameters)
@@ -209,8 +210,8 @@ def test_parts_are_only_of_many_poses_that_readings_determine(data):
     free = select_free_parameters(DELTA)
     part = select_part(problem_of(free, data))
     assert part is not None
-    assert part.readings.shape[1] == BLOCK
-    assert (part.equations == 3 * BLOCK).all()
+    assert part.readings.shape[1] == PART
+    assert (part.equations == 3 * PART).all()
     few = problem_of(free, measure(list_poses(MANY - 1)))
     position = make_sensor(Position(unknown=("frame",)))
     frame = problem_of(free, measure(list_poses(), (position,)))
@@ -221,6 +222,7 @@ def test_parts_are_only_of_many_poses_that_readings_determine(data):
 
 def test_parts_are_only_of_rows_that_each_pose_and_the_parameters_determine(monkeypatch):
     monkeypatch.setattr(part_start, "SHARE", 2)
+    monkeypatch.setattr(part_start, "FEWEST_POSES", 2 * BLOCK)
     poses, free = list_poses(2 * BLOCK), select_free_parameters(DELTA)
     linked = make_sensor(Separation(), np.array([[0, 1], [5, BLOCK]]))
     assert select_part(problem_of(free, measure(poses))) is not None
@@ -234,6 +236,7 @@ def test_parts_are_only_of_rows_that_each_pose_and_the_parameters_determine(monk
 
 def test_parts_are_not_of_measured_passive_joints(monkeypatch):
     monkeypatch.setattr(part_start, "SHARE", 2)
+    monkeypatch.setattr(part_start, "FEWEST_POSES", 2 * BLOCK)
     robot = load_robot("3-prs")
     poses = np.resize(
         sample_workspace(robot, 50, 1).coordinates, (2 * BLOCK, len(robot.controlled))
@@ -249,6 +252,7 @@ def test_parts_are_not_of_measured_passive_joints(monkeypatch):
 @pytest.mark.parametrize("name", ["arm-6r", "pulley-3"])
 def test_parts_are_not_of_chains_of_stages_or_open_sums(monkeypatch, name):
     monkeypatch.setattr(part_start, "SHARE", 2)
+    monkeypatch.setattr(part_start, "FEWEST_POSES", 2 * BLOCK)
     robot = load_robot(name)
     assert robot.stages or robot.has_open_sums
     poses = np.resize(
@@ -294,7 +298,7 @@ def test_poses_out_of_reach_that_are_not_in_the_part_are_refused_as_without_it(m
         values[lengths] *= 0.99
         reached = forward(DELTA.with_values(values), readings).converged
     assert reached.any()
-    others = np.setdiff1d(np.arange(MANY), spread_poses(MANY, BLOCK))[:5]
+    others = np.setdiff1d(np.arange(MANY), spread_poses(MANY, PART))[:5]
     mixed = np.resize(poses[reached], (MANY, 3))
     mixed[others] = np.resize(poses[~reached], (5, 3))
     measured, options = measure(mixed, truth=DELTA), FitOptions(LeastSquares(), start=values)

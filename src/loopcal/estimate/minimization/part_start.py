@@ -15,20 +15,20 @@ import numpy as np
 
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, Ridge
 from loopcal.estimate.minimization.descent import Descent, StepControl, descend
-from loopcal.estimate.observation_rows import BLOCK
 from loopcal.estimate.poses.linearization import LinearizedPoses
 from loopcal.estimate.problem import Problem
 from loopcal.measure import Evaluation
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
-SHARE = 32
-"""A part is used from this ratio of poses on: below, its descent costs more than the saved
-linearization of all poses, or hardly less. Processor time of fits of hexapod-42 with drawn errors
-and noise of 1e-6 m and rad, in seconds with a part | without: 16,384 poses 0.14 | 0.15, 32,768
-0.21 | 0.23, 65,536 0.38 | 0.46, 98,304 0.58 | 0.77. Nothing is saved, and up to a
-quarter lost, where all poses take three steps from the estimate of the part, as with noise of
-1e-5 m and rad, or two from the given start, as from the truth."""
+SHARE = 16
+"""A part has one of so many poses. Its estimate is about four standard deviations of all poses
+away: from there, one step of all poses is enough for noise of 1e-5 m and rad, too."""
+FEWEST_POSES = 65_536
+"""A part is used from so many poses on. Processor time of fits of hexapod-42 with drawn errors, in
+seconds with a part | without: noise of 1e-6 m and rad, 66,000 poses 0.49 | 0.49, 100,000 0.69 |
+0.84; noise of 1e-5, 33,000 0.28 | 0.23, 66,000 0.44 | 0.73, 100,000 0.77 | 0.97. A fit that begins
+at the truth needs no part and loses its time."""
 EQUATIONS = 50
 """Equations of a part for each parameter, at least: its estimate is near enough then."""
 METHODS = (LeastSquares, Ridge, MAP)
@@ -100,8 +100,7 @@ def sum_squares(problem: Problem, deviation: FloatArray) -> float:
 def select_part(problem: Problem) -> Problem | None:
     """Return the problem of a spread part of the poses.
 
-    The part has `BLOCK` poses: poses of a single block are kept, and each step begins where the one
-    before solved them. None where the poses are too few, several trials are fitted at once, or
+    None where the poses are too few, several trials are fitted at once, or
     something other than the free parameters and the readings determines the rows: uncertain or
     missing readings, nuisance parameters, rows that compare poses, measured passive joints, smooth
     errors, chains of stages, or fewer readings than lengths (`Problem.folds_plain_rows`).
@@ -109,8 +108,8 @@ def select_part(problem: Problem) -> Problem | None:
     n = problem.readings.shape[1]
     if not problem.folds_plain_rows or len(problem) != 1:
         return None
-    count = BLOCK
-    if n < SHARE * count or problem.equations[0] * count < EQUATIONS * problem.parameters * n:
+    count = n // SHARE
+    if n < FEWEST_POSES or problem.equations[0] * count < EQUATIONS * problem.parameters * n:
         return None
     return take_poses(problem, spread_poses(n, count))
 
