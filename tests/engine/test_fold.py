@@ -54,6 +54,18 @@ def test_folded_trials_equal_single_trials_bit_for_bit(engine, rows):
         assert_array_equal(together[i], engine.fold(np.zeros((1, 7, 7)), rows[i : i + 1])[0])
 
 
+@pytest.mark.parametrize("height", [40, 200])
+@pytest.mark.parametrize("trials", [1, 3])
+def test_begun_factors_and_factors_of_zeros_are_folded_bit_for_bit_as_alone(engine, height, trials):
+    rng = np.random.default_rng(height)
+    rows, factor = rng.normal(size=(trials, height, 7)), np.zeros((3, 7, 7))
+    factor[1] = np.triu(rng.normal(size=(7, 7)))
+    together = engine.fold(factor, rows)
+    for i in range(3):
+        own = rows[[i]] if trials > 1 else rows
+        assert_array_equal(together[i], engine.fold(factor[[i]], own)[0])
+
+
 def test_trials_can_share_rows(engine, rows):
     shared = engine.fold(np.zeros((2, 7, 7)), rows[:1])
     assert_array_equal(shared[0], shared[1])

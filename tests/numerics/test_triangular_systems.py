@@ -67,3 +67,18 @@ def test_systems_do_not_depend_on_those_beside_them_bit_for_bit():
     for i in range(T):
         alone, _ = solve_regular(triangle[i : i + 1], right[i : i + 1], RANK_TOLERANCE)
         assert np.array_equal(alone[0], together[i])
+
+
+@pytest.mark.parametrize("p", [9, 42])
+def test_a_system_beside_an_unusable_one_has_the_bits_and_the_verdict_of_one_alone(p):
+    rng = np.random.default_rng(4)
+    for seed in range(20):
+        factor = np.zeros((T, p + 1, p + 1))  # of which the triangles are views
+        factor[:, :p, :p] = make_triangles(p, 0.9 * MARGIN * RANK_TOLERANCE, seed)
+        right, damaged = rng.standard_normal((T, p)), factor.copy()
+        damaged[0, 0, 0] = 0.0
+        whole = solve_regular(damaged[:, :p, :p], right, RANK_TOLERANCE)
+        for i in range(T):
+            alone = solve_regular(damaged[i : i + 1, :p, :p], right[i : i + 1], RANK_TOLERANCE)
+            for mine, ours in zip(alone, whole, strict=True):
+                assert np.array_equal(mine[0], ours[i])

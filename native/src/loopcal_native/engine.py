@@ -311,6 +311,7 @@ class NativeFunctions:
     ) -> tuple[FloatArray, FloatArray]:
         """Solve upper triangular systems, and bound the inverse of their matrices."""
         triangle, right = as_reals(triangle), as_reals(right)
+        require(right.ndim == 2, f"a right side (t, p), not {right.shape}")
         t, p = right.shape
         require(triangle.shape == (t, p, p), f"triangles ({t}, {p}, {p}), not {triangle.shape}")
         x, growth = np.empty_like(right), np.zeros(t)
@@ -322,7 +323,8 @@ class NativeFunctions:
     def compare_poses(self, T: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the differences of poses, and their derivatives by twists."""
         arrays = [as_reals(T), as_reals(reference)]
-        t, n = shape = max(len(T), len(reference)), max(arrays[0].shape[1], arrays[1].shape[1])
+        (t, n), (t_other, n_other) = (a.shape[:2] if a.ndim > 2 else (-1, -1) for a in arrays)
+        shape = t, n = t_other if t == 1 else t, n_other if n == 1 else n
         require_rows("T", arrays[0], (4, 4), shape)
         require_rows("references", arrays[1], (12,), shape)
         residual, by_twist = np.empty((t, n, 6)), np.empty((t, n, 6, 6))

@@ -138,7 +138,7 @@ class Program:
         ]
 
     @cached_property
-    def shared_drives(self) -> int:
+    def shared_drive_count(self) -> int:
         """Number of driven joints beyond one for each actuator."""
         driven = sum(int((columns >= 0).sum()) for g in self.groups for columns in g.actuator)
         return driven - self.n_joints

@@ -336,7 +336,8 @@ def minimize_by_halving(
             if is_part_worse is not None:
                 parts = parts & is_part_worse(point, candidate)
             share = np.where(parts, (0.5 if attempt < control.attempts - 1 else 0.0) * share, share)
-        with np.errstate(invalid="ignore"):  # infinite sums of squares, which cannot be evaluated
+        with np.errstate(invalid="ignore"):
+            # inf - inf and 0 * inf give NaN; these trials are stuck already
             gained = point.cost - candidate.cost
             promised = step.change > control.stuck * point.cost
             stuck |= promised & ~(gained > control.stuck * step.change)

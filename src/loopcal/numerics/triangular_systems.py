@@ -62,6 +62,7 @@ def solve_regular(
     tolerance : a singular value counts as zero up to this share of the largest one.
     """
     t, p = right.shape
+    triangle = np.ascontiguousarray(triangle)  # the order of sums depends on the strides
     diagonal = np.abs(np.einsum("tii->ti", triangle))
     with np.errstate(over="ignore"):
         norm = np.sqrt(np.einsum("tij,tij->t", triangle, triangle))

@@ -24,6 +24,9 @@ zeros = np.zeros((9, *(rows_of_poses[4].pattern.parameters + 1,) * 2))
 
 rods = make_case(load_robot("hexapod-42"), n=3)
 target = Target(rods.q, (0, 1, -1, 3, 4, 5), False, rods.home.T[0, 0])
+reached = engine.solve(rods.program, rods.e, rods.q, rods.home)
+T, reference = np.tile(np.eye(4), (9, 3, 1, 1)), np.ones((9, 3, 12))
+triangle, right = np.tile(np.eye(9), (9, 1, 1)), np.ones((9, 9))
 
 def call(times):
     for _ in range(times):
@@ -32,6 +35,9 @@ def call(times):
         engine.differentiate(*arguments, state, inputs)
         engine.fold(R, rows)
         engine.fold_poses(zeros, *rows_of_poses)
+        engine.certify(rods.program, rods.e, rods.home, reached)
+        engine.compare_poses(T, reference)
+        engine.solve_triangles(triangle, right)
         engine.reach(rods.program, rods.e, target, rods.home)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 

@@ -51,8 +51,9 @@ def certify(
         for i, first in np.ndindex(t, -(-n // chunk)):
             rows = slice(first * chunk, (first + 1) * chunk)
             one = begin.select(min(i, len(e) - 1))
-            goals = goal.T[i, rows, :3].transpose(1, 2, 0).copy()
-            out[i, rows] = np.where(one.reaches(goals), one.sign, 0)
+            goals = goal.T[i, rows, :3].transpose(1, 2, 0)
+            goals = goals.repeat(1 + (goals.shape[2] == 1), axis=2)  # one has sums of other bits
+            out[i, rows] = np.where(one.reaches(goals), one.sign, 0)[: n - rows.start]
     return out
 
 
@@ -115,19 +116,19 @@ class Begin(NamedTuple):
         rows, distance = _measure_rods(goal, self.tip, self.attachment, unit)
         stretch = distance - self.distance
         inverse = self.inverse[..., 0]
-        step = inverse @ stretch
+        step = np.einsum("ij,jn->in", inverse, stretch)
         turn, shift = step[:3] / unit, step[3:]
         length = np.maximum(np.abs(turn).max(axis=0) * size, np.abs(shift).max(axis=0))
         turned = matmul(exponential(turn), self.T[:, :3]) - goal[:, :3]
         missed = self.T[:, 3] + shift - goal[:, 3]
-        apart = np.add.reduce(turned**2, axis=(0, 1))
+        apart = np.add.reduce(np.add.reduce(turned**2, axis=0), axis=0)
         error = np.sqrt((ANGLE * unit) ** 2 * apart + dot(missed, missed))
         left = np.sqrt(np.add.reduce(self.swing**2, axis=0)) * error
         falls = left**2 <= DECREASE**2 * np.add.reduce(stretch**2, axis=0)
         shortest = np.minimum.reduce(distance - self.swing * error, axis=0)
         h = 1 / shortest
         bend = self.bend[0] + (self.bend[1] + self.bend[2] * h) * h
-        off = inverse @ rows
+        off = np.einsum("ij,fjn->fin", inverse, rows)
         off[range(6), range(6)] -= 1.0
         # the spectral norm of `off` is the root of that of its square, which this norm exceeds
         square = np.zeros(len(error))

@@ -61,9 +61,13 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     The stack is triangularized by QR, many rows in parts that fit the cache.
     """
     t, p = factor.shape[:2]
-    stack = [np.broadcast_to(rows, (t, *rows.shape[1:]))]
-    if factor.any():
-        stack.insert(0, factor)
+    rows, is_begun = np.broadcast_to(rows, (t, *rows.shape[1:])), factor.any(axis=(1, 2))
+    if is_begun.any() and not is_begun.all():
+        out = np.empty_like(factor)
+        for part in (is_begun, ~is_begun):  # a factor of zeros would change the bits
+            out[part] = fold(factor[part], rows[part])
+        return out
+    stack = [factor, rows] if is_begun.any() else [rows]
     height = PART * p
     count = rows.shape[1] // height
     if count > 1:

@@ -169,7 +169,7 @@ def _iterate(
     """
     size, N = equations.program.size, coordinates.shape[1]
     program = equations.program
-    closed, small = RESIDUAL * size, STEP * size
+    closed_gap, short_step = RESIDUAL * size, STEP * size
     may_stay_open = program.may_stay_open or program.sigma is not None
     status, steps = np.full(N, EXHAUSTED, np.int8), np.full(N, max_iterations)
     done = Solved(np.empty_like(coordinates), np.empty(N), np.empty(N), status, steps)
@@ -181,14 +181,14 @@ def _iterate(
         # some coordinates are in no equation
         now = now._replace(pivot=now.pivot * np.isfinite(np.add.reduce(coordinates[:12], axis=0)))
         for step in range(max_iterations):
-            settled = (now.reducible <= closed) & ((applied <= small) | (at_rounding > 2))
-            sound = np.isfinite(now.reducible + now.length) & (now.pivot > SINGULAR)
-            end = settled | ~sound | (share < 1e-5)
+            settled = (now.reducible <= closed_gap) & ((applied <= short_step) | (at_rounding > 2))
+            is_sound = np.isfinite(now.reducible + now.length) & (now.pivot > SINGULAR)
+            end = settled | ~is_sound | (share < 1e-5)
             is_near = False if goal is None else equations.lead_to(now, goal[..., alive]) & ~end
             end |= is_near
             if end.any():
-                shut = settled & ((now.residual <= 1e4 * closed) | may_stay_open)
-                reason = np.where(sound, np.where(shut, CONVERGED, STALLED), NOT_FINITE)
+                is_closed = settled & ((now.residual <= 1e4 * closed_gap) | may_stay_open)
+                reason = np.where(is_sound, np.where(is_closed, CONVERGED, STALLED), NOT_FINITE)
                 reason = np.where(is_near, NEAR_GOAL, reason)
                 last = now if end.all() else now.select(np.flatnonzero(end))
                 _store(done, alive[end], last, reason[end], step)
@@ -201,7 +201,7 @@ def _iterate(
             length = fraction * now.length
             reduced = equations.reduce(equations.move(now, fraction))
             # the next step of such rows would be below rounding
-            end = (length <= small) & (reduced.norm <= closed)
+            end = (length <= short_step) & (reduced.norm <= closed_gap)
             if end.any() and step + 1 < max_iterations:
                 last = now._replace(coordinates=reduced.coordinates, residual=reduced.norm)
                 last = last if end.all() else last.select(np.flatnonzero(end))
@@ -213,7 +213,7 @@ def _iterate(
                 share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
                 fraction, length, reduced = fraction[keep], length[keep], reduced.select(keep)
             trial = equations.complete(reduced)
-            low = trial.reducible <= closed
+            low = trial.reducible <= closed_gap
             better = low | (trial.residual <= (1 - 1e-4 * fraction) * now.residual)
             better |= trial.reducible <= 0.5 * now.reducible
             at_rounding = (at_rounding + 1) * low
@@ -277,7 +277,7 @@ class _Equations:
         inner = np.zeros(N)
         for top in tops:
             if len(top):
-                inner += np.add.reduce(top[:, -1] ** 2, axis=(0, 1))
+                inner += np.add.reduce(np.add.reduce(top[:, -1] ** 2, axis=0), axis=0)
         norm = np.sqrt(inner + np.add.reduce(low[:, m:] ** 2, axis=0).reshape(N))
         sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
         return Reduced(coordinates, tops, low, inner, norm, sign, pivot)
@@ -355,7 +355,8 @@ class _Equations:
         size, T = self.program.size, now.coordinates[:12].reshape(3, 4, -1)
         rotation = matmul(exponential(now.step[:3]), T[:, :3]) - goal[:, :3]
         position = T[:, 3] + now.step[3:6] - goal[:, 3]
-        square = 0.5 * size**2 * np.add.reduce(rotation**2, axis=(0, 1)) + dot(position, position)
+        turned = np.add.reduce(np.add.reduce(rotation**2, axis=0), axis=0)
+        square = 0.5 * size**2 * turned + dot(position, position)
         length = np.minimum(NEAR * size, NEARER * now.length)
         return (now.length <= 0.5 * size) & (square <= length**2)
 

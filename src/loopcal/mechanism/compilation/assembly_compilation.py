@@ -371,7 +371,7 @@ def _find_home(robot: Mechanism) -> State:
         Too few controlled coordinates, or loops that cannot be closed.
     """
     program, values = robot.program, robot.values[None]
-    shared = program.shared_drives
+    shared = program.shared_drive_count
     movable = len(program.freedoms) - program.count_equations(free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(

@@ -262,7 +262,7 @@ def needs_readings(program: Program) -> bool:
     """Return whether the inverse solution is one for readings: joints with a shared drive would
     part, and where loops may stay open, a free actuator would take a part of the gap.
     """
-    return program.may_stay_open or program.shared_drives > 0
+    return program.may_stay_open or program.shared_drive_count > 0
 
 
 def _inverse_by_readings(
@@ -297,7 +297,7 @@ def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, sta
 
     With shared drives, coordinates that are not controlled are those of the start.
     """
-    if not robot.program.shared_drives:
+    if not robot.program.shared_drive_count:
         shaped = target.reshape(*start.T.shape[:2], -1)
         return _close_with_free_actuators(robot, values, shaped, start, start)
     e, _ = robot.slots(values)

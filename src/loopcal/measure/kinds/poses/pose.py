@@ -199,10 +199,10 @@ def _is_singular(rates: FloatArray) -> BoolArray:
 
 
 def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (.., r, 6) of poses T (.., r, 4, 4), and their derivatives (.., r, 6, 6) by
+    """Return residuals (t, r, 6) of poses T (t | 1, r, 4, 4), and their derivatives (t, r, 6, 6) by
     the twists of T.
 
-    reference : (.., r, 12) rotations row by row, then positions.
+    reference : (t | 1, r, 12) rotations row by row, then positions.
     """
     compared = engine.compare_poses(T, reference)
     if compared is not None:
