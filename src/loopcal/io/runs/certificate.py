@@ -256,7 +256,8 @@ def _add_quantity(
 
 def _add_statements(parent: Element, content: Mapping[str, Any]) -> None:
     """Add the verdict with what it is subject to, and the statement on each limit."""
-    stated = [f for f in content.get("findings") or () if f["severity"] == "warning"]
+    findings = [f for f in content.get("findings") or () if isinstance(f, Mapping)]
+    stated = [f for f in findings if f.get("severity") == "warning" and "text" in f]
     expected = (content.get("expected_error") or {}).get("finding")
     if expected and content.get("states_expected_error"):
         stated.append(expected)
