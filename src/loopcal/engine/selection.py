@@ -85,11 +85,10 @@ def select_engine(choice: str = "") -> Engine:
         engine = load()(variant)
         if not isinstance(engine, Engine):
             raise TypeError(f"{engine!r} is no engine")
-    except (ImportError, OSError, ValueError) as cause:  # their texts say what to do
-        finding = report_finding("engine.not-usable", engine=choice, reason=str(cause))
-        raise MissingPackageError(finding) from cause
     except Exception as cause:  # the code of others, or a record of functions of another version
         reason = "it belongs to another version of loopcal, or fails; install both anew"
+        if isinstance(cause, ImportError | OSError | ValueError):  # their texts say what to do
+            reason = str(cause)
         finding = report_finding("engine.not-usable", engine=choice, reason=reason)
         raise MissingPackageError(finding) from cause
     return engine

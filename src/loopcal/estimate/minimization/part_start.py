@@ -100,10 +100,10 @@ def sum_squares(problem: Problem, deviation: FloatArray) -> float:
 def select_part(problem: Problem) -> Problem | None:
     """Return the problem of a spread part of the poses.
 
-    None where the poses are too few, several trials are fitted at once, or
-    something other than the free parameters and the readings determines the rows: uncertain or
-    missing readings, nuisance parameters, rows that compare poses, measured passive joints, smooth
-    errors, chains of stages, or fewer readings than lengths (`Problem.folds_plain_rows`).
+    None where the poses are too few, several trials are fitted at once, or something other than the
+    free parameters and the readings determines the rows: uncertain or missing readings, nuisance
+    parameters, rows that compare poses, measured passive joints, smooth errors, chains of stages,
+    or fewer readings than lengths (`Problem.folds_plain_rows`).
     """
     n = problem.readings.shape[1]
     if not problem.folds_plain_rows or len(problem) != 1:
