@@ -13,7 +13,15 @@ from tests.engine.cases import Case, make_case
 
 HAS_NATIVE = find_spec("loopcal_native") is not None
 ENGINES = ["numpy", "native"] if HAS_NATIVE else ["numpy"]
-collect_ignore = [] if HAS_NATIVE else ["native"]
+OPTIONAL = ["test_compare_poses.py", "test_triangles.py"]
+"""Tests of functions that an engine need not have; NumPy leaves them to other packages."""
+collect_ignore = [] if HAS_NATIVE else ["native", *OPTIONAL]
+
+
+def list_engines_with(function: str) -> list[Engine]:
+    """Return the installed engines that have an optional function."""
+    engines = [select_engine(name) for name in ENGINES]
+    return [engine for engine in engines if getattr(engine, function) is not None]
 
 
 @pytest.fixture(scope="session", params=ENGINES)

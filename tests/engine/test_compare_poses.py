@@ -8,17 +8,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.engine import Engine
+from tests.engine.conftest import list_engines_with
 
 ANGLES = [0.0, 1e-160, 1e-12, 1e-8, 1e-5, 1e-3, 0.3, 0.8, 1.0, 1.6, 2.4, 3.0, np.pi - 1e-9, np.pi]
 
 
-@pytest.fixture(scope="module")
-def compare(engine: Engine) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """Return the engine's function, which it need not have."""
-    if engine.compare_poses is None:
-        pytest.skip(f"{engine.name} leaves differences of poses to loopcal.geometry")
-    return engine.compare_poses
+@pytest.fixture(scope="module", params=list_engines_with("compare_poses"), ids=str)
+def compare(request) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """Return the function of an engine that has it."""
+    return request.param.compare_poses
 
 
 def draw_poses(angle: float, t: int = 3, n: int = 13) -> tuple[np.ndarray, np.ndarray]:

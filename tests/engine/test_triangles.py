@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal.engine import Engine
+from tests.engine.conftest import list_engines_with
 
 
-@pytest.fixture(scope="module")
-def solve(engine: Engine) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """Return the engine's function, which it need not have."""
-    if engine.solve_triangles is None:
-        pytest.skip(f"{engine.name} leaves triangular systems to loopcal.numerics")
-    return engine.solve_triangles
+@pytest.fixture(scope="module", params=list_engines_with("solve_triangles"), ids=str)
+def solve(request) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """Return the function of an engine that has it."""
+    return request.param.solve_triangles
 
 
 def make_systems(t: int, p: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -153,6 +153,16 @@ def certificate(tmp_path, run) -> str:
     return format_certificate(lc.load_run(run), load_administration(write_facts(tmp_path)))
 
 
+@pytest.mark.parametrize("findings", [[7], ["a text"], []])
+def test_a_changed_run_has_no_certificate(tmp_path, run, findings) -> None:
+    path = run / "result.json"
+    content = json.loads(path.read_text("utf-8"))
+    assert content["findings"] != findings
+    path.write_text(json.dumps({**content, "findings": findings}), "utf-8")
+    with pytest.raises(FileError, match="not what the calibration wrote"):
+        format_certificate(lc.load_run(run), load_administration(write_facts(tmp_path)))
+
+
 def test_certificate_follows_the_schema_and_states_the_run(tmp_path, run) -> None:
     text = format_certificate(lc.load_run(run), load_administration(write_facts(tmp_path, HOSTILE)))
     root = ElementTree.fromstring(text)

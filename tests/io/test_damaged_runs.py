@@ -169,16 +169,6 @@ def test_broken_archive_is_refused(run, damage, is_digest_right) -> None:
         lc.load_run(run)
 
 
-@pytest.mark.parametrize(
-    "findings", ["a text", ["a text"], [{"severity": "warning"}], [{"text": ""}]]
-)
-def test_findings_that_are_none_are_refused(run, findings) -> None:
-    result = json.loads((run / "result.json").read_text())
-    write_result(run, {**result, "findings": findings})
-    with pytest.raises(FileError, match="findings"):
-        lc.load_run(run)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_names_the_damaged_file(run, capsys, command) -> None:
     (run / "arrays.npz").write_bytes(pack())

@@ -17,6 +17,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, register_namespac
 
 from loopcal.errors import DataError
 from loopcal.io.runs.certificate_settings import Administration, Contact
+from loopcal.io.runs.run_folder import refuse_changed_run
 from loopcal.plain_text import escape
 from loopcal.units import Dimension, find_unit
 
@@ -64,11 +65,13 @@ def format_certificate(run: Run, administration: Administration) -> str:
     Raises
     ------
     DataError : a robot file instead of a run, or a run that failed.
+    FileError : `files.run-changed`.
     """
     if not run.result:
         raise DataError(f"{run.path} is a robot file, which states no result; give a run folder")
     if run.failure is not None:
         raise DataError(run.failure)
+    refuse_changed_run(run)
     for prefix, uri in (("dcc", DCC), ("si", SI), ("xsi", XSI)):
         register_namespace(prefix, uri)
     root = Element(f"{{{DCC}}}digitalCalibrationCertificate", schemaVersion=VERSION)

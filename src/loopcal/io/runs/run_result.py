@@ -127,13 +127,6 @@ class StoredSentence(_Part):
 
 
 @dataclass(frozen=True)
-class StoredFinding(StoredSentence):
-    """An entry of `findings`."""
-
-    severity: str
-
-
-@dataclass(frozen=True)
 class StoredBudget(_Part):
     """The uncertainty budget under `expected_error`; earlier versions state no `sources`."""
 
@@ -159,7 +152,6 @@ class StoredResult(_Part):
     reasons: tuple[str, ...] = ()
     split: StoredSplit | None = None
     expected_error: StoredBudget | None = None
-    findings: tuple[StoredFinding, ...] | None = None
     nulls: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
 
