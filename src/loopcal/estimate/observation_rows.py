@@ -24,8 +24,9 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 BLOCK = 2048
 """Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
 enough for the cache."""
-PLAIN_BLOCK = 8192
-"""The same of rows that the engine folds as it makes them, so that less of them is in memory."""
+PLAIN_BLOCK = 16384
+"""The same of rows that the engine folds as it makes them, so that less of them is in memory: fewer
+blocks leave less time to Python, which runs in one thread at a time."""
 
 
 def _no_nuisance() -> IntArray:

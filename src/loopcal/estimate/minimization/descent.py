@@ -243,11 +243,12 @@ def descend(
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
         begin = problem.start(z) if start is None else start
         first = problem.linearize(z, begin)
-    good = np.isfinite(first.cost) & np.isfinite(first.factor).all(axis=(1, 2))
-    factor = np.where(good[:, None, None], first.factor, 0.0)
-    cost = np.where(good, first.cost, np.inf)
+    good = _is_finite(first)
+    if not good.all():
+        factor = np.where(good[:, None, None], first.factor, 0.0)
+        first = replace(first, factor=factor, cost=np.where(good, first.cost, np.inf))
     arrival = np.full(len(z), np.inf) if arrival is None else arrival
-    point = model.locate(replace(first, deviation=z, factor=factor, cost=cost), arrival)
+    point = model.locate(replace(first, deviation=z), arrival)
     linear_model = point.linear_model
     deviations, costs = [z.copy()], [point.cost.copy()]
 
@@ -279,6 +280,11 @@ def descend(
         deviation_history=np.stack(deviations),
         cost_history=np.stack(costs),
     )
+
+
+def _is_finite(linearized: Linearization) -> BoolArray:
+    """Return the trials (t,) whose cost and factor are finite."""
+    return np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,8 +365,7 @@ class _FilteredDescent:
     def evaluate(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Candidate:
         """Linearize at the deviations of the steps."""
         linearized = self.problem.take(trials).linearize(step.deviation, point.start)
-        good = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
-        cost = np.where(good, linearized.cost, np.inf)
+        cost = np.where(_is_finite(linearized), linearized.cost, np.inf)
         is_full = step.length >= step.full_length
         return _Candidate(self, linearized, cost, np.where(is_full, np.sqrt(step.change), np.inf))
 
