@@ -20,8 +20,11 @@ from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
+from loopcal.measure.kinds.poses.pose import compare_poses
 from loopcal.mechanism import sample_workspace
 from loopcal.mechanism.platform_coordinates import EULER, POSITION, read_coordinates, state_target
+from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.triangular_systems import solve_regular
 from tests.engine.cases import Case, draw_map, draw_twist_rows, make_case
 
 TRIALS, POSES = 5, 40
@@ -99,11 +102,7 @@ def differentiate(engine: Engine, case: Case) -> Results:
 
 def fold(engine: Engine, case: Case) -> Results:
     """Return R'R over the largest number in it, of rows with parts of zeros and of all sizes."""
-    rng = np.random.default_rng(len(case.name))
-    columns = int(rng.integers(2, 60))
-    rows = rng.normal(size=(TRIALS, 5 * columns, columns)) * 10.0 ** rng.uniform(-3, 3, columns)
-    rows[:, : len(rows[0]) // 2, : columns // 2] = 0.0
-    return [_scale_gram(engine.fold(np.zeros((TRIALS, columns, columns)), rows))]
+    return [_scale_gram(_fold_rows(engine, case))]
 
 
 def fold_poses(engine: Engine, case: Case) -> Results:
@@ -122,6 +121,37 @@ def fold_poses(engine: Engine, case: Case) -> Results:
     return [_scale_gram(factor), is_finite]
 
 
+def solve_triangles(engine: Engine, case: Case) -> Results:
+    """Return solutions of triangular systems in lengths of their columns over the largest number,
+    and which matrices are regular.
+    """
+    R = _fold_rows(_choose_baseline(), case)
+    right = np.random.default_rng(len(case.name)).normal(size=R.shape[:2])
+    with use_engine(engine.name):
+        x, is_regular = solve_regular(R, right, RANK_TOLERANCE)
+    scaled = x * np.linalg.norm(R, axis=1)
+    return [scaled / np.abs(scaled).max(), is_regular]
+
+
+def compare_measured_poses(engine: Engine, case: Case) -> Results:
+    """Return the differences of each pose and the next one, and their derivatives by twists."""
+    T = _close(case).T
+    other = np.roll(T, 1, axis=1)
+    reference = np.concatenate([other[..., :3, :3].reshape(*T.shape[:2], 9), other[..., :3, 3]], -1)
+    with use_engine(engine.name):
+        both = compare_poses(T, reference)
+    return [np.concatenate([part.ravel() for part in both])]
+
+
+def _fold_rows(engine: Engine, case: Case) -> np.ndarray:
+    """Return the factors of rows with parts of zeros and of all sizes."""
+    rng = np.random.default_rng(len(case.name))
+    columns = int(rng.integers(2, 60))
+    rows = rng.normal(size=(TRIALS, 5 * columns, columns)) * 10.0 ** rng.uniform(-3, 3, columns)
+    rows[:, : len(rows[0]) // 2, : columns // 2] = 0.0
+    return engine.fold(np.zeros((TRIALS, columns, columns)), rows)
+
+
 def _scale_gram(R: np.ndarray) -> np.ndarray:
     """Return R'R (t, p, p) of factors, their columns scaled to length 1; columns of zeros stay."""
     length = np.linalg.norm(R, axis=1, keepdims=True)
@@ -131,7 +161,12 @@ def _scale_gram(R: np.ndarray) -> np.ndarray:
 
 def _close(case: Case) -> State:
     """Return the state at which all engines begin: one with the same bits on every machine."""
-    return select_engine("native:baseline").solve(case.program, case.e, case.q, case.home)
+    return _choose_baseline().solve(case.program, case.e, case.q, case.home)
+
+
+def _choose_baseline() -> Engine:
+    """Return the engine that has the same bits on every machine, with what every processor has."""
+    return select_engine("native:baseline")
 
 
 FUNCTIONS: dict[str, tuple[Callable[[Engine, Case], Results], str]] = {
@@ -141,6 +176,8 @@ FUNCTIONS: dict[str, tuple[Callable[[Engine, Case], Results], str]] = {
     "sensitivities": (differentiate, "largest entry"),
     "factor": (fold, "lengths of its columns"),
     "factor of poses": (fold_poses, "lengths of its columns"),
+    "triangular systems": (solve_triangles, "largest number"),
+    "differences of poses": (compare_measured_poses, "rad, m"),
 }
 
 
