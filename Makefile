@@ -29,7 +29,7 @@ demo: .venv/core.stamp native  ## calibrate the shipped hexapod from its measure
 test: .venv/dev.stamp native  ## every test except the full-size statistics
 	$(BIN)/pytest $(PARALLEL) -m "not evidence"
 
-quick: .venv/dev.stamp native  ## the tests that together take under 30 s
+quick: .venv/dev.stamp native  ## the tests that take less than a second each, about 2 min
 	$(BIN)/pytest $(PARALLEL) -m "quick or not (slow or evidence)"
 
 native: .venv/native.stamp  ## build the native engine into .venv; without a C++ compiler NumPy computes

@@ -149,6 +149,7 @@ def compare_fits(name: str, data: Measurements, order: Array | None = None) -> N
     assert (gap <= SHARE * sd + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_fit_does_not_depend_on_the_frame_of_the_instrument(name: str) -> None:
     data = measure_robot(name)

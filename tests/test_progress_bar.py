@@ -41,6 +41,7 @@ def test_two_pieces_of_work_have_a_line_each(monkeypatch) -> None:
     assert stream.getvalue().splitlines() == ["", "folds: 2 of 2", "", "resamples: 3 of 3"]
 
 
+@pytest.mark.slow
 def test_notebook_shows_bar_page_and_figure(tmp_path) -> None:
     client, formats = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     cells = [

@@ -101,6 +101,7 @@ def test_links_between_pages_lead_to_existing_files(
     ] == []
 
 
+@pytest.mark.slow
 def test_no_file_contains_a_path_of_one_machine(root: Path, repository_files: list[Path]) -> None:
     result = []
     for path in repository_files:

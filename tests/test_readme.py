@@ -42,6 +42,7 @@ def test_python_example_of_the_readme_runs_and_improves_the_robot(tmp_path, caps
     assert "42 of 42 parameter combinations" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_commands_of_the_readme_run(capsys) -> None:
     part = README[README.index("## On the command line") : README.index("## In Python")]
     for words in list_commands(part):

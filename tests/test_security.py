@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 FORBIDDEN_MODULES = {
     "asyncio", "code", "dbm", "ftplib", "http", "imaplib", "marshal", "multiprocessing", "pickle",
     "poplib", "pty", "runpy", "shelve", "smtplib", "socket", "socketserver", "ssl", "subprocess",
@@ -65,6 +67,7 @@ calibrate five-bar data.csv -o run --method map --force
 export run -o run.csv"""
 
 
+@pytest.mark.slow
 def test_no_module_can_start_a_program_open_an_address_or_run_text(root: Path) -> None:
     found = []
     wrong = FORBIDDEN_MODULES | FORBIDDEN_CALLS
@@ -94,6 +97,7 @@ def test_arrays_are_never_pickled(root: Path) -> None:
     assert [call for call in calls if "allow_pickle=False" not in call] == []
 
 
+@pytest.mark.slow
 def test_commands_start_no_program_open_no_address_and_write_only_named_files(tmp_path) -> None:
     words = [sys.executable, "-c", WATCH, COMMANDS]
     environment = {**os.environ, "MPLBACKEND": "Agg"}

@@ -62,6 +62,7 @@ def test_numbers_equal_those_of_the_formulas() -> None:
     assert turns.repeatabilities[0].value == pytest.approx(3 * 5e-6, rel=0.8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2)])
 @pytest.mark.parametrize(("visits", "bias"), [(5, 0.0), (5, 5.0), (30, 0.3), (30, 2.0)])
 def test_intervals_contain_the_truth(visits, bias, sd) -> None:

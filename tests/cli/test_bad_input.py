@@ -310,6 +310,7 @@ def test_too_few_equations_are_refused_by_default_with_a_hint_to_method_map(run_
     assert "Hint: use --method map" in found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_every_kind_is_calibrated_or_refused_with_a_message(
     tmp_path, monkeypatch, capsys, kind

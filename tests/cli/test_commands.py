@@ -138,6 +138,7 @@ def test_calibration_from_a_corrected_robot_file_gives_the_same_estimate(run) ->
     assert first.robot.record.text == second.robot.record.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", ["map", "ls", "ridge", "ridge --lam 0.5", "tsvd --keep 30", "tsvd"]
 )
@@ -243,6 +244,7 @@ def test_check_expand_shows_joint_angles_at_the_home_pose(run, name) -> None:
                     assert found != pytest.approx(np.degrees(joint.start), abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", sorted(list_shipped_robots()))
 def test_check_expand_of_every_shipped_robot_truncates_no_number(run, robot) -> None:
     code, out, err = run(f"check {robot} --expand")

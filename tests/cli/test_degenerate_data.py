@@ -44,6 +44,7 @@ CASES = {
 METHODS = ("map", "ls", "ridge", "tsvd", "map --noise estimated", "map --hold-out 0.1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_no_command_shows_or_writes_what_is_not_finite(case, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -58,6 +58,7 @@ def test_list_contains_every_record_without_distances(data_folder) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop_offset", [0.0, 40.0, -40.0])
 @pytest.mark.parametrize("name", CALIBRATED)
 def test_calibration_from_wrong_end_stops_gives_the_geometry_of_the_firmware(
@@ -276,6 +277,7 @@ def test_assumed_sigma_is_estimated_where_the_data_can(import_record, capsys) ->
     assert main([*words.split(), "--force"]) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])
 def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
     import_record, capsys, tmp_path, data_folder, name

@@ -107,6 +107,7 @@ def type_in(name: str, text: str) -> None:
     Path(file).write_text(typed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRINTERS)
 def test_typing_what_is_printed_makes_the_real_bed_flat(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

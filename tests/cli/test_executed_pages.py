@@ -39,6 +39,7 @@ def read_estimates(run: str) -> dict[str, float]:
     return {parameter["name"]: parameter["estimate"] for parameter in parameters}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES)
 def test_page_runs_and_prints_what_it_shows(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -104,6 +105,7 @@ def test_readme_of_a_folder_lists_every_page(folder) -> None:
     assert set(listed) == names
 
 
+@pytest.mark.slow
 def test_table_of_instruments_states_the_ranks_of_the_hexapod() -> None:
     rows = re.findall(
         r"\| `(\w+)`(?: \((\w)\))? \| (\d+) of 42 \|", read_page("instruments/README")

@@ -4,6 +4,8 @@
 import shutil
 from pathlib import Path
 
+import pytest
+
 from loopcal.cli import main
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
@@ -35,6 +37,7 @@ def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
     assert capsys.readouterr().err.startswith("loopcal: note: The calibration used 2 of 12 rows")
 
 
+@pytest.mark.slow
 def test_prior_refuses_fitted_rows_whatever_their_file_looks_like(
     tmp_path, monkeypatch, capsys
 ) -> None:

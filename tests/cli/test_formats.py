@@ -69,6 +69,7 @@ def test_import_reads_the_geometry_and_every_probe_of_printer_cfg(
     assert int(robot.parameters.free.sum()) == (9 if record["distances"] else 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIRMWARE_CALIBRATED)
 def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
     folder, capsys, data_folder, name
@@ -101,6 +102,7 @@ def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
     )
 
 
+@pytest.mark.slow
 def test_exported_printer_cfg_imports_with_the_calibrated_values(folder, data_folder) -> None:
     record = read_records(data_folder)[FIRMWARE_CALIBRATED[0]]
     (folder / "printer.cfg").write_bytes(
@@ -217,6 +219,7 @@ def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(folder, capsys, dat
     assert (folder / "same.urdf").read_bytes() == source.read_bytes()
 
 
+@pytest.mark.slow
 def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
     folder, capsys, data_folder
 ) -> None:

@@ -119,6 +119,7 @@ def complete(words: str, tmp_path: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_commands_options_robots_and_files_are_completed(tmp_path) -> None:
     assert complete("loopcal com", tmp_path) == [
         "plain,compare",

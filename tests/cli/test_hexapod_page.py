@@ -17,6 +17,8 @@ from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
 from loopcal.typing import FloatArray
 from tests.cli.page_commands import list_commands
 
+pytestmark = pytest.mark.slow
+
 PLACES = np.array([[0.15, 0.0, 0.0], [-0.08, 0.13, 0.0], [-0.08, -0.13, 0.0], [0.0, 0.0, 0.1]])
 """Points of the platform by which poses are compared [m]."""
 

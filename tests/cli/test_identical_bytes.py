@@ -102,6 +102,7 @@ def list_differences(first: dict[str, bytes], second: dict[str, bytes]) -> list[
     return sorted(n for n in first.keys() | second.keys() if first.get(n) != second.get(n))
 
 
+@pytest.mark.slow
 def test_files_and_pages_are_identical_in_another_environment(tmp_path, root) -> None:
     commands = SHORT.format(root=root)
     first = run_commands(tmp_path / "first", commands, USUAL)

@@ -127,6 +127,7 @@ def test_invalid_sigma_reading_is_refused_in_one_sentence(run, words, sentence):
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_summary_says_what_is_undetermined_and_what_to_measure(run):
     out = " ".join(run("hexapod-42 --frames base,tool")[1].split())
     assert "determine 30 of 42 parameter combinations (rank tolerance 1e-11 of" in out
@@ -147,6 +148,7 @@ def test_directions_that_change_poses_are_named_in_the_summary(run):
     assert sum(part["count"] for part in parts if part) == undetermined
 
 
+@pytest.mark.slow
 def test_a_rank_tolerance_is_applied_and_printed(run):
     usual = json.loads(run("hexapod-42 --json")[1])
     cut = json.loads(run("hexapod-42 --json --rank-tolerance 0.02")[1])

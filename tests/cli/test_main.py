@@ -82,6 +82,7 @@ UNUSED = {
 """Packages that an ordinary calibration does not need, each of which takes time to import."""
 
 
+@pytest.mark.slow
 def test_ordinary_calibration_imports_only_what_it_needs(tmp_path) -> None:
     example = Path("examples/hexapod-42/measurements.csv").resolve()
     words = ["calibrate", "hexapod-42", str(example), "-o", str(tmp_path / "run")]

@@ -14,6 +14,7 @@ def _folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({*FAMILIES, *list_shipped_robots()}))
 def test_new_robot_file_loads_and_lists_its_optional_keys(name) -> None:
     assert main(["new", name, "-o", "mine.yaml"]) == 0

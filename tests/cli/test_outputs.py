@@ -82,6 +82,7 @@ def test_force_replaces_a_file_that_is_not_an_input(run) -> None:
     assert "note status" in Path("old.csv").read_text()
 
 
+@pytest.mark.slow
 def test_run_folder_used_as_input_is_not_replaced(run) -> None:
     assert run("calibrate robot.yaml data.csv -o run")[0] == 0
     before = read_all_files()

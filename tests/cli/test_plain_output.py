@@ -130,6 +130,7 @@ READERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", SECRETS)
 def test_nothing_is_shown_of_a_file_that_is_not_one_of_loopcal(folder, capsys, content) -> None:
     (folder / "file").write_text(SECRETS[content])

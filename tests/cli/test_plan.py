@@ -33,6 +33,7 @@ def read_rows(path) -> list[dict[str, str]]:
     return list(csv.DictReader(lines))
 
 
+@pytest.mark.slow
 def test_filled_in_plan_is_calibrated_with_its_held_out_poses(folder, capsys):
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--curve"]) == 0
     said = capsys.readouterr().out
@@ -60,6 +61,7 @@ def test_filled_in_plan_is_calibrated_with_its_held_out_poses(folder, capsys):
     )
 
 
+@pytest.mark.slow
 def test_sheet_states_commands_that_agree_with_the_data_file(folder):
     assert main(["plan", "hexapod-42", "-o", "plan", "--poses", "10", "--candidates", "30"]) == 0
     robot = load_robot("hexapod-42")
@@ -145,6 +147,7 @@ def test_json_output_agrees_with_the_plan_file(folder, capsys):
     assert document.items() <= written.items()
 
 
+@pytest.mark.slow
 def test_earlier_data_file_states_the_instrument_of_a_plan(folder, capsys):
     assert (
         run("simulate linear-delta --draw 12 --kind position --sigma-position 3um -o before.csv")
@@ -181,6 +184,7 @@ def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(folder, 
     assert "plan planes and lines" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -242,6 +246,7 @@ def test_invalid_plan_options_are_refused_and_nothing_is_written(folder, capsys,
     assert not (folder / "plan").exists()
 
 
+@pytest.mark.slow
 def test_force_replaces_a_plan_but_no_other_folder(folder, capsys):
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 0
     (folder / "plan" / "plan.png").unlink()
@@ -256,6 +261,7 @@ def test_force_replaces_a_plan_but_no_other_folder(folder, capsys):
         assert "something other than a plan" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_force_keeps_measured_values_and_files_of_the_user(folder, capsys):
     again = ["plan", "linear-delta", "-o", "plan", *SMALL, "--force"]
     assert main(again) == 0
@@ -283,6 +289,7 @@ def test_force_keeps_measured_values_and_files_of_the_user(folder, capsys):
     assert data.read_text() == empty
 
 
+@pytest.mark.slow
 def test_second_plan_builds_on_the_measurements_of_the_first(folder, capsys):
     first = [
         "plan",

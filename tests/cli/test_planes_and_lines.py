@@ -53,6 +53,7 @@ def planned(tmp_path_factory, root) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_commands_of_the_page_report_rank_33_from_plan_to_calibration(
     folder, planned, root, capsys
 ):

@@ -29,6 +29,7 @@ def read_page(root: Path, name: str) -> str:
     return " ".join(text.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_of_the_page_run(page, root, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)

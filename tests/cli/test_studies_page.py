@@ -32,6 +32,7 @@ def shrink(file: Path) -> None:
     file.write_text(text.replace("poses: [10, 20, 40]", "poses: [10, 20]"))
 
 
+@pytest.mark.slow
 def test_commands_and_code_of_the_page_lead_from_a_new_file_to_figures(page, capsys) -> None:
     commands = list_commands(page)
     names = {words[1] for words in commands}

@@ -169,6 +169,7 @@ def test_folder_in_use_changed_study_other_version_and_two_drivers_are_refused(
         assert (code, "has format 9" in err) == (1, True)
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_folder_that_is_continued(tmp_path) -> None:
     file = write_study(tmp_path, 4000, 5)
     words = [sys.executable, "-m", "loopcal", "study", "run", file.name, "-o", "f"]
@@ -190,6 +191,7 @@ def test_ctrl_c_leaves_a_folder_that_is_continued(tmp_path) -> None:
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_time_limit_leaves_a_folder_that_is_continued(run, tmp_path) -> None:
     file = write_study(tmp_path, 100_000, 5).name
     code, _, err = run(f"run {file} -o f {ONE} --time-limit 2s")

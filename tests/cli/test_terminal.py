@@ -6,6 +6,8 @@ import pty
 import subprocess
 import sys
 
+import pytest
+
 from loopcal.cli import terminal
 from loopcal.cli.commands.calibration_commands import calibrate, validate
 from loopcal.cli.hints import HINTS, find_hint, hint_for
@@ -116,6 +118,7 @@ def test_bar_begins_at_the_steps_that_are_done_and_keeps_its_time():
     assert [(task.completed, task.total) for task in bar._bar.tasks] == [(1, 9)]
 
 
+@pytest.mark.slow
 def test_progress_is_hidden_for_short_work_and_without_a_terminal():
     assert _run_on_terminal(1, 60.0).split() == ["end"]
     words = [sys.executable, "-c", WORK, "8", "0.05"]

@@ -52,6 +52,7 @@ def cover_positions(robot, fit, truth):
     return np.abs(error) <= stdtrit(degrees, 0.975) * sd
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("correlation", "before"), [(0.6, 0.93), (0.9, 0.82)])
 def test_poses_are_covered_where_errors_are_correlated(correlation, before):
     robot, inside, adjusted, named = ROBOTS["linear-delta"], [], [], []
@@ -131,6 +132,7 @@ def test_slow_errors_that_no_test_shows_are_allowed_for_where_residuals_are_smal
     assert np.mean(adjusted) > np.mean(inside)
 
 
+@pytest.mark.slow
 def test_clean_data_change_nothing():
     changed = 0
     for seed in range(60):

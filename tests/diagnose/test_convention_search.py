@@ -186,6 +186,7 @@ def simulate_cables(n: int, measured: int, seed: int = 0) -> Measurements:
     return replace(data, observations=(rows.take(np.arange(measured)),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 3)])
 def test_swapped_belts_of_a_redundant_robot_are_refused(pair) -> None:
     """Few poses are measured; the redundant readings of the others must agree as well."""
@@ -234,6 +235,7 @@ RANDOM = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", RANDOM)
 def test_random_data_are_explained_by_nothing_and_the_text_lists_what_was_tried(case) -> None:
     name, kind = RANDOM[case]

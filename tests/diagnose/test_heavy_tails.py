@@ -38,6 +38,7 @@ def make_rows(errors, basis):
     return ResidualRows(basis, residual, basis, root, zero, zero, zero, zero)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "taken"), [(30, 18), (60, 20), (1400, 40)])
 def test_normal_errors_of_few_correlated_or_many_residuals_have_the_stated_level(rows, taken):
     rng = np.random.default_rng(rows)
@@ -51,6 +52,7 @@ def test_normal_errors_of_few_correlated_or_many_residuals_have_the_stated_level
     assert (p < 0.01).mean() < 0.035  # P(binomial(300, 0.01) > 10) = 4e-4
 
 
+@pytest.mark.slow
 def test_students_errors_are_reported_with_what_to_do():
     found = [check_heavy_tails(*fit_delta(draw_student(N, 3, seed), seed)) for seed in range(20)]
     p = np.array([result.p_value for result in found])

@@ -39,6 +39,7 @@ def draw_normal(seed: int) -> np.ndarray:
     return np.random.default_rng(seed + 10**6).standard_normal((POSES, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.5, 2.0])
 def test_false_alarm_rate_holds_whatever_the_stated_sigma_is(ratio: float) -> None:
     """5 % of 40 data sets is 2; before, a sigma twice too small named poses in nearly all."""
@@ -49,6 +50,7 @@ def test_false_alarm_rate_holds_whatever_the_stated_sigma_is(ratio: float) -> No
     assert alarms <= binom.ppf(0.999, SETS, 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("method", [LeastSquares(), None])
 def test_a_wrong_pose_is_found_whatever_the_stated_sigma_is(ratio, method) -> None:
@@ -64,6 +66,7 @@ def test_a_wrong_pose_is_found_whatever_the_stated_sigma_is(ratio, method) -> No
         assert result.scale == pytest.approx(ratio, rel=0.5)
 
 
+@pytest.mark.slow
 def test_heavy_tails_name_few_poses() -> None:
     """Student's t with 3 degrees of freedom has single values far out, not a third of the poses."""
     named = []

@@ -72,6 +72,7 @@ def rms_error(fit) -> float:
     return float(np.sqrt(np.mean((fit.estimate - zoo.hexapod_truth()) ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])
 def test_robust_fit_with_outliers_is_nearly_as_good_as_a_fit_of_clean_data(loss):
     clean, robust, plain = [], [], []
@@ -147,6 +148,7 @@ def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
         assert result.leverage.sum() == pytest.approx(42.0)
 
 
+@pytest.mark.slow
 def test_false_alarm_rate_of_clean_data_sets_is_the_stated_one():
     robot, t, alarms = hexapod(), 200, 0
     measured = simulate_trials(robot, sample_truth(robot, t, 8), hexapod_poses(14), tracker(), 8)
@@ -198,6 +200,7 @@ def test_unknown_excluded_poses_and_nonpositive_loss_constants_are_refused():
         Tukey(-1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [(), ("frame",)])
 def test_distance_of_an_excluded_pose_without_a_reading_equals_the_chi_square_loss(frame):
     """The pose estimate of an excluded pose comes from its rows in the frame of the other poses,
@@ -374,6 +377,7 @@ def list_result(result: OutlierCheck) -> tuple[object, ...]:
     return result.outliers, result.ambiguous, result.scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [{3: 1e-3, 50: -2e-4}, {7: 3e-5, 8: 4e-5}, {}])
 @pytest.mark.parametrize("n", [6, 9, 20, 80])
 def test_far_outliers_are_compared_with_others_only_where_these_may_replace_them(

@@ -108,6 +108,7 @@ def test_tolerances_that_are_right_give_the_lowest_error_near_lam_1(robot) -> No
     assert total[1.0] == min(total.values())
 
 
+@pytest.mark.slow
 def test_unknown_frames_are_scored_by_folds_that_are_fitted_again(robot) -> None:
     data = measure(robot, Position(unknown=("frame",), frame="tracker"), 12)
     curves = compute_regularization_curves(robot, data, folds=2, seed=2)

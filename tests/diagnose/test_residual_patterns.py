@@ -38,6 +38,7 @@ CLEAN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "kind", "n", "method"), CLEAN)
 def test_independent_errors_give_uniform_probabilities(robot, kind, n, method):
     fits, p_values, found = 40, [], 0

@@ -166,6 +166,7 @@ def test_accuracy_of_angles_may_be_stated():
             judge_useful_accuracy(analysis, *wrong)
 
 
+@pytest.mark.slow
 def test_command_states_what_is_useful(capsys, complete):
     assert main(["identifiability", str(complete), "--useful", "10um"]) == 0
     text = capsys.readouterr().out

@@ -25,6 +25,8 @@ from loopcal.report.scene.scene_data import load_script
 from loopcal.report.tables import Table
 from loopcal.report.validation_view import READING_NOISE, view_errors
 
+pytestmark = pytest.mark.slow
+
 ORDER = (
     *("verdict", "determined", "outliers", "errors", "residuals", "workspace", "parameters"),
     *("budget", "controller", "provenance", "poses"),

@@ -17,6 +17,8 @@ from loopcal.report.document.stored_options import describe_call, list_options
 from loopcal.report.tables import Table
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 
+pytestmark = pytest.mark.slow
+
 LIMIT = 60e-6
 """Limit on the position error [m]."""
 

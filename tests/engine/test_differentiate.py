@@ -78,6 +78,7 @@ def test_redundant_and_mixed_limbs_of_shipped_robots_agree_with_the_rows(engine,
     assert_agree(actual, derivatives_by_blocks(engine, case, state, inputs))
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_central_differences(engine, case):
     p, q = case.program, case.q[:, :2]
     state = engine.solve(p, case.e, q, case.home)

@@ -104,6 +104,7 @@ def compile_limb_derivative(letters, ending, chosen, slots, size):
     return compile_quickly(jax.jacfwd(rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "robot", ["mixed_hexapod", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
 )

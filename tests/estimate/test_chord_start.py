@@ -61,6 +61,7 @@ def measure_distance(usual: IdentifiedTrials, other: IdentifiedTrials) -> np.nda
     return (difference / usual.standard_deviations()[good]).max(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 10.0])
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), MAP(InflatedTolerances())], ids=repr)
 @pytest.mark.parametrize(("robot", "poses"), [(HEXAPOD, 20), (HEXAPOD, 8), (DELTA, 12)])

@@ -139,6 +139,7 @@ def position_errors(values, truth):
     return np.sqrt(((found.T - true.T)[..., :3, 3] ** 2).sum(axis=-1).mean(axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "moved",
     [
@@ -222,6 +223,7 @@ def test_choice_with_the_method_of_a_fit_is_the_same():
     np.testing.assert_allclose((second.estimate - first.estimate) / first.tolerance, 0.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_right_tolerances_rarely_get_a_component():
     _, trials = simulate_deltas(150, {}, seed=4)
     fits = [identify(DELTA, trials.trial(i)) for i in range(150)]

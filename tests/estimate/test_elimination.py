@@ -123,6 +123,7 @@ def eliminate_dense(problem, tree):
     return best, variance, unobservable, rank, np.concatenate(left)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unseen", [0, 1, 2])
 def test_nested_elimination_equals_dense_elimination_with_unobservable_directions(unseen):
     deep = 0

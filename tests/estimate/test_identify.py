@@ -66,6 +66,7 @@ def test_corrected_robot_has_the_estimate(fit):
     assert np.array_equal(fit.plus_minus, fit.interval())
 
 
+@pytest.mark.slow
 def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
     # errors up to 5 mm; our bounds on medians and on the worst of 100 draws [mm]
     robot, truth = zoo.nategh(), zoo.nategh_truth()

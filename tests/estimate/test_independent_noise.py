@@ -82,6 +82,7 @@ def expand(dense, q, scale, degrees):
     return np.sqrt(trace * stats.f.ppf(0.95, h, degrees))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["given", "estimated"])
 def test_expanded_uncertainty_of_poses_and_its_coverage_with_6_degrees_of_freedom(noise):
     fits = 150

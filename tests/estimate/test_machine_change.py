@@ -58,6 +58,7 @@ def test_a_wrong_sigma_does_not_change_the_test(limb) -> None:
             assert wrong.chi_square / wrong.degrees < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "poses", "unknown"), [(2.0, 20, ()), (0.5, 8, ("frame",))])
 def test_unmoved_machines_are_declared_moved_at_the_stated_rate(ratio, poses, unknown) -> None:
     """5 % of 16; p-values are uniform. Before, a sigma twice too small moved nearly every one."""

@@ -56,6 +56,7 @@ def test_identifiability_names_the_open_poses_and_their_gaps(wrong, data):
     assert f"pose {found['poses'][0]} by " in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "readings_alone", "poses"),
     [
@@ -89,6 +90,7 @@ def test_every_entry_point_answers_in_words(wrong, data, readings_alone, poses):
         assert note.data["poses"] == open_poses.poses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["spools ten times as wide"], indirect=True)
 def test_a_fit_that_does_not_converge_from_open_poses_is_refused(wrong, data):
     with pytest.raises(EstimationError) as error:

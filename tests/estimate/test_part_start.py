@@ -98,6 +98,7 @@ def require_same_bits(fit: Identification, plain: Identification) -> None:
     assert fit.history.iterations == plain.history.iterations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), None], ids=repr)
 def test_the_result_is_that_of_all_poses_from_the_beginning(monkeypatch, data, method):
     fit, plain = fit_both(monkeypatch, data, FitOptions(method=method))
@@ -133,6 +134,7 @@ def test_the_history_has_the_steps_of_the_part_with_comparable_sums_of_squares(m
     assert "poses)" not in said[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_truth_as_a_start_is_judged_as_without_a_part(monkeypatch, seed):
     measured = measure(list_poses(), seed=seed, truth=DELTA)
@@ -146,6 +148,7 @@ def test_the_truth_as_a_start_is_judged_as_without_a_part(monkeypatch, seed):
     np.testing.assert_allclose(check.p_value, expected.p_value, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_both_descents_together_take_the_steps_that_are_allowed(monkeypatch, data):
     def limit(iterations: int) -> FitOptions:
         return FitOptions(method=LeastSquares(), control=StepControl(iterations=iterations))
@@ -177,6 +180,7 @@ def test_poses_that_are_degenerate_at_even_strides_give_a_part_of_full_rank(monk
     assert (np.abs(fit.estimate - plain.estimate) < 1e-6 * sigma).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -285,11 +289,13 @@ def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot
     np.testing.assert_allclose(unfixed @ unfixed.T, expected @ expected.T, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_start_out_of_reach_is_refused_as_without_a_part(data):
     with pytest.raises(EstimationError, match="poses"):
         identify(DELTA, data, options=FitOptions(method=LeastSquares(), start=3.0 * DELTA.values))
 
 
+@pytest.mark.slow
 def test_poses_out_of_reach_that_are_not_in_the_part_are_refused_as_without_it(monkeypatch):
     poses, values = sample_workspace(DELTA, 500, 1).coordinates, DELTA.values.copy()
     lengths = [i for i, name in enumerate(DELTA.parameters.names) if "length" in name]

@@ -80,6 +80,7 @@ def test_correct_tolerances_are_inflated_little_and_at_no_cost():
     assert error(result) < 1.02 * error(held)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("narrow", [1.4, 1.7])
 def test_slightly_narrow_tolerances_keep_the_coverage_of_parameters(narrow):
     robot, measured = simulate_hexapods(40)
@@ -95,6 +96,7 @@ def test_slightly_narrow_tolerances_keep_the_coverage_of_parameters(narrow):
     assert cover(None) > 0.92  # 93 % up to the error of 40 fits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("narrow", [3.0, 10.0])
 def test_narrow_tolerances_are_reported_and_inflated_by_the_default_method(narrow):
     robot, measured = simulate_hexapods(40)

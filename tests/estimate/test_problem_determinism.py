@@ -140,6 +140,7 @@ def assert_same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
         assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_equal_arguments_give_equal_bits_in_any_order_and_in_threads(name):
     calls = list_calls(PROBLEMS[name]())

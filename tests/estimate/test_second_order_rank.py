@@ -21,6 +21,7 @@ from tests.estimate.plane_line_data import plan_groups, simulate_plan
 FIRST_ORDER, PARAMETERS = 33, 42
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma", "method"), [(1e-6, LeastSquares()), (1e-5, None), (1e-4, LeastSquares())]
 )
@@ -97,6 +98,7 @@ def test_identifiability_of_a_filled_sheet_is_that_of_its_plan():
         assert result.gap > 1e9
 
 
+@pytest.mark.slow
 def test_uncertain_readings_and_a_loss_do_not_change_the_rank():
     robot = lc.load_robot("hexapod-nategh-agheli")
     _, data = simulate_plan(plan_groups(), 1e-5, seed=4)
@@ -123,6 +125,7 @@ def test_only_gaps_beyond_their_noise_determine_rotations(gap, rank):
 TOUCHED = {name for name, kind in KINDS.items() if not kind.changes_with_pose}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [

@@ -94,6 +94,7 @@ def measure_memory(trials: Trials) -> tuple[float, float]:
     return peak, kept
 
 
+@pytest.mark.slow
 def test_memory_of_many_trials_is_that_of_their_results():
     few, many = simulate(8), simulate(40)
     measure_memory(few)  # what is made once

@@ -412,6 +412,7 @@ def wrong_reading():
     return replace(data, readings=readings)
 
 
+@pytest.mark.slow
 def test_wrong_reading_is_named_and_corrected_by_exclusion_or_a_loss(wrong_reading):
     plain = identify(hexapod(), wrong_reading, LeastSquares())
     assert find_outliers(plain, wrong_reading).names == ("5",)

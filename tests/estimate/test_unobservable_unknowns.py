@@ -77,6 +77,7 @@ def test_start_values_are_not_estimated_from_rounding():
     assert_array_equal(guess_nuisance_values(data, T), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [None, UM])
 def test_fit_converges_from_an_unobservable_to_a_weakly_observable_target(sigma):
     """The true machine rotates by up to 0.2 mrad between commands of equal orientation, which makes

@@ -51,6 +51,7 @@ def list_reported_findings() -> Iterator[tuple[str, str, set[str]]]:
 CATALOG = load_catalog()
 
 
+@pytest.mark.slow
 def test_every_reported_code_is_in_the_catalog_with_the_same_fields():
     reported = list(list_reported_findings())
     assert len(reported) > 50
@@ -112,6 +113,7 @@ def test_findings_page_is_up_to_date():
     assert page == findings_reference.write_page(), "run `make docs`"
 
 
+@pytest.mark.slow
 def test_no_message_of_the_library_names_a_command_line_option():
     named = {
         name

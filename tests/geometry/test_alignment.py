@@ -25,6 +25,7 @@ def minimize_from_random_rotations(A, b, rng):
     return min(minimize(evaluate, start, tol=1e-14).fun for start in starts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_lowest_minimum_is_the_one_that_scipy_reaches_from_many_starts(seed, scale):

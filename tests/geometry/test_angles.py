@@ -18,6 +18,7 @@ quarter = st.integers(-2, 2).map(lambda k: k * np.pi / 2)
 any_angles = st.lists(st.one_of(turn, quarter), min_size=3, max_size=3).map(np.array)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", geometry.EULER_ORDERS)
 @given(angles=any_angles)
 @settings(max_examples=40)  # of each of 24 orders

@@ -159,6 +159,7 @@ def test_fixture_has_exactly_the_registered_cases():
     assert all(fnmatch.filter(CASES, one) for patterns in NOISE_TESTED for one in patterns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -19,6 +19,7 @@ ROBOTS = ("hexapod-42", "linear-delta", "3-prs", "five-bar")
 WRONG = (..., {}, [], [None], {"rod": 1}, "x", 1e160, -1e308, None, True, [[1]], "*a")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_wrong_value_in_a_robot_file_is_refused_or_builds_a_robot(name) -> None:
     """Every place is tried with one wrong value, a different one at each."""

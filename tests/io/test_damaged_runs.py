@@ -261,6 +261,7 @@ OF_FIT = ("parameters", "local", "status", "dropped", "sigma_scale")
 WRONG = (..., -1.5, "{x}", [], {}, None, True, [[1]], {"a": 1}, 10**30)
 
 
+@pytest.mark.slow
 def test_every_wrong_value_of_a_result_is_refused_or_harmless(run) -> None:
     """The parts that loopcal reads are tried in full, with all kinds of values."""
     whole = json.loads((run / "result.json").read_text())

@@ -135,6 +135,7 @@ def test_folder_that_cannot_be_removed_is_not_replaced() -> None:
         shutil.rmtree(place)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exists", [False, True])
 def test_of_four_writers_at_once_exactly_one_wins_without_force(tmp_path, exists) -> None:
     for n in range(8):

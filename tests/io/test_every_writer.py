@@ -251,6 +251,7 @@ def run(command: str) -> int:
     return 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("writer", "command"), [(writer, c) for writer, words in COMMANDS.items() for c in words]
 )

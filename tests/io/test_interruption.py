@@ -23,6 +23,7 @@ def inputs(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_two_files_are_written_together_or_restored(tmp_path) -> None:
     outcomes = examine(CASES["new"], tmp_path, 12, 4)
     assert list_wrong_outcomes(outcomes) == []

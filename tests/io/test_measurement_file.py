@@ -73,6 +73,7 @@ def make_measurements(robot, poses, kind) -> Measurements:
     return Measurements(robot.name, inverse(robot, poses).q, (rows,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
 def test_measurements_of_every_kind_are_read_as_saved(tmp_path, robot, poses, kind) -> None:
     data = make_measurements(robot, poses, kind)
@@ -130,6 +131,7 @@ def test_frame_tool_repeats_gaps_and_correlated_noise_are_read_as_saved(
     np.testing.assert_allclose(read.T_platform_tool, np.linalg.inv(frame), atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
 def test_template_lacks_only_rows(tmp_path, robot, poses, kind) -> None:
     path = tmp_path / "data.csv"

@@ -26,6 +26,7 @@ def write_table(tmp_path: Path, robot: str, rows: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_impossible_identified_values_are_refused_at_their_line(name: str, tmp_path: Path) -> None:
     robot = load_robot(name)
@@ -80,6 +81,7 @@ def test_a_length_that_is_declared_positive_needs_such_a_value(tmp_path: Path, n
         load_robot(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_values_of_tolerated_machines_are_accepted(name: str, tmp_path: Path) -> None:
     robot = load_robot(name)

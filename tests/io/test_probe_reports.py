@@ -168,6 +168,7 @@ def test_g32_of_reprapfirmware_with_the_points_of_bed_g() -> None:
     calibrate_with("config.g --probes report.txt --probes bed.g", truth)
 
 
+@pytest.mark.slow
 def test_a_height_map_of_reprapfirmware() -> None:
     robot, truth = make_truth("config.g")
     grid = [(-60 + 30 * k, -60 + 30 * j) for j in range(5) for k in range(5)]

@@ -40,6 +40,7 @@ def write(path, text: str):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", STYLES.values(), ids=STYLES)
 def test_robot_file_of_any_style_takes_the_identified_table(tmp_path, text: str) -> None:
     robot = load_robot(write(tmp_path / "robot.yaml", text))

@@ -205,6 +205,7 @@ def test_inches_without_the_unit_are_refused(robot, sheet, points, tmp_path) -> 
         examine(robot, sheet, export)
 
 
+@pytest.mark.slow
 def test_mirrored_axes_are_refused_with_the_export(robot, sheet, points, tmp_path) -> None:
     mirrored = [(name, xyz * [1.0, -1.0, 1.0]) for name, xyz in points]
     data = fill(robot, sheet, write_spatial_analyzer(tmp_path / "left.txt", mirrored)).data

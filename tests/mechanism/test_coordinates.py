@@ -33,6 +33,7 @@ def random_poses(n, tilt=1.2, seed=3):
     return geometry.make_pose(geometry.tilt_torsion_to_matrix(*angles.T), rng.normal(size=(n, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", COORDINATE_SETS)
 @given(part=st.lists(st.floats(0.0, 1.0), min_size=6, max_size=6))
 def test_coordinates_round_trip(names, part):

@@ -45,6 +45,7 @@ def perturb_values(robot, size=2e-4, seed=1, t=1):
     return robot.values + np.random.default_rng(seed).normal(size=(t, len(robot.parameters))) * size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "legs"), [("hexapod", hexapod_closure), ("delta", delta_closure)])
 def test_pose_derivatives_of_families_agree_with_differences_and_jax(name, legs, jax):
     robot, sol, _ = sample_inverse(name, 4)

@@ -21,6 +21,7 @@ def test_each_machine_has_ten_mistakes() -> None:
     assert {name: len(cases) for name, cases in CASES.items()} == dict.fromkeys(MACHINES, 10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MACHINES)
 def test_correct_files_lead_to_a_calibration_without_a_warning(
     name, correct_files, tmp_path, monkeypatch, capsys
@@ -32,6 +33,7 @@ def test_correct_files_lead_to_a_calibration_without_a_warning(
     assert not any(word in text for word in ("warning", "failure", "note:", "Traceback"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "mistake"), [(name, mistake) for name, cases in CASES.items() for mistake in cases]
 )

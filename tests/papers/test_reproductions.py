@@ -85,6 +85,7 @@ def test_statements_of_the_paper_and_own_checks_have_two_lists() -> None:
     )
 
 
+@pytest.mark.slow
 def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> None:
     folder = write_folder(tmp_path / "a" / "out", build_reproduction(), MADE_BY)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
@@ -110,6 +111,7 @@ def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> No
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 4, 9, 14])
 @pytest.mark.parametrize("log", ["", "y", "xy"])
 def test_legend_covers_no_curve_and_lies_within_the_picture(count, log) -> None:

@@ -44,6 +44,7 @@ def test_four_points_for_a_cubic_are_the_known_ones() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("criterion", [D(), A(), I(L, 3)], ids=lambda criterion: criterion.name)
 @pytest.mark.parametrize("nuisance", [0, 2])
 @pytest.mark.parametrize("prior", [False, True])

@@ -4,6 +4,7 @@
 import re
 
 import numpy as np
+import pytest
 
 import loopcal as lc
 from loopcal.measure import Instrument, Pose, Sensor, sample_truth, simulate
@@ -24,6 +25,7 @@ def calibrate_drawn(name: str) -> lc.CalibrationReport:
     return lc.calibrate(robot, simulate(machine, poses, instrument, 1), options)
 
 
+@pytest.mark.slow
 def test_report_of_a_tripod_says_that_commanded_poses_are_still_missed(tmp_path) -> None:
     report = calibrate_drawn("3-prs")
     errors = report.validation

@@ -46,12 +46,14 @@ def check(figure: matplotlib.figure.Figure) -> None:
             assert label in WITHOUT_UNIT or "[" in label or "more parameters" in label, label
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", OF_FITS, ids=lambda draw: draw.__name__)
 @pytest.mark.parametrize("name", ["linear_delta", "hexapod"])
 def test_figure_of_a_fit_has_units_and_no_warnings(draw, name, request) -> None:
     check(draw(request.getfixturevalue(name).fit))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", OF_FITS, ids=lambda draw: draw.__name__)
 def test_figure_has_the_same_bytes_each_time(draw, five_bar) -> None:
     figure = draw(five_bar.fit)

@@ -239,6 +239,7 @@ def test_missing_package_is_named_with_the_command_that_installs_it(
         getattr(five_bar.fit, method)()
 
 
+@pytest.mark.slow
 def test_results_draw_themselves(results, five_bar) -> None:
     fit = five_bar.fit
     figures = [getattr(fit.plot, name)() for name in ("residuals", "parameters")]

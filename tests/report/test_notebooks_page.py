@@ -6,11 +6,13 @@ import shutil
 
 import matplotlib.figure
 import pandas as pd
+import pytest
 import xarray as xr
 
 import loopcal as lc
 
 
+@pytest.mark.slow
 def test_python_code_of_the_page_runs(root, tmp_path, monkeypatch) -> None:
     shutil.copytree(root / "examples" / "hexapod-42", tmp_path / "examples" / "hexapod-42")
     monkeypatch.chdir(tmp_path)

@@ -115,6 +115,7 @@ def test_errors_of_blocks_are_corrected_by_the_dense_hat_matrix(sessions) -> Non
         assert errors.residual[rows] == pytest.approx(r[rows], abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [*CASES, "earlier calibration", "prior of the frame", "ridge"])
 def test_normal_errors_scatter_as_the_covariance_says(case) -> None:
     options, method = FitOptions(sigma_uncertainty=0.0), lc.MAP()
@@ -155,6 +156,7 @@ def test_the_same_seed_gives_the_same_resamples_and_another_one_others() -> None
     assert not (first == other).any()
 
 
+@pytest.mark.slow
 def test_errors_that_the_targets_of_a_pose_share_are_reported_and_widen_the_intervals() -> None:
     shared = measure(EIGHT_TARGETS, 30, 1, common=30 * UM)
     fit = identify(hexapod(), shared, lc.MAP(), options=FitOptions(noise="estimated"))
@@ -170,6 +172,7 @@ def test_errors_that_the_targets_of_a_pose_share_are_reported_and_widen_the_inte
     assert (own.blocks.unit, own.blocks.count) == ("session", 14)
 
 
+@pytest.mark.slow
 def test_independent_errors_are_not_reported_in_99_percent_of_fits() -> None:
     reported = 0
     for seed in range(25):

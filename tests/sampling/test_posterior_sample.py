@@ -113,6 +113,7 @@ def sample_by_walkers(
     return np.concatenate(kept)
 
 
+@pytest.mark.slow
 def test_a_curved_posterior_equals_that_of_a_markov_chain_and_is_reported() -> None:
     robot, data = delta(60.0, 20 * MM, poses=3)
     fit = identify(robot, data, options=EXACT)
@@ -152,6 +153,7 @@ def test_linear_intervals_of_linear_problems_are_confirmed_to_a_percent() -> Non
         assert np.abs(sample.intervals().shift).max() < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", ["targets", "sessions", "uncertain readings", "earlier", "estimated"]
 )

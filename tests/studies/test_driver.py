@@ -105,6 +105,7 @@ def test_folder_is_refused_where_it_is_in_use_changed_or_of_others(undisturbed, 
         run_study(source, tmp_path / "file", Serial())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exists", [True, False])
 def test_workers_that_are_not_reached_leave_nothing(tmp_path, exists) -> None:
     source, folder = read_source(write_study(tmp_path)), tmp_path / "study"
@@ -249,6 +250,7 @@ def test_tasks_that_are_given_up_are_reported_and_computed_the_next_time(
     assert (again.computed, again.is_complete) == (missing, True)
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_blocks(undisturbed, tmp_path) -> None:
     report = run_study(read_source(write_study(tmp_path)), tmp_path / "study", Processes(2))
     assert report.computed == 16

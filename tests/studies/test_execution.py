@@ -76,6 +76,7 @@ def check_numbers(answers: dict[int, Answer], count: int) -> None:
         assert np.array_equal(answer.result, draw_numbers(NumberTask(number)))
 
 
+@pytest.mark.slow
 def test_every_kind_of_worker_gives_the_same_results(executor) -> None:
     answers = collect(executor.map_blocks(draw_numbers, list_tasks(20, pause=0.01)))
     check_numbers(answers, 20)
@@ -101,6 +102,7 @@ def test_error_of_the_library_reaches_the_caller_with_its_place(executor) -> Non
     assert str(caught.value) == "study.yaml:7: task 3 is refused"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["processes", "dask"])
 def test_lost_workers_cost_only_their_tasks(kind, request, tmp_path) -> None:
     chosen = Processes(2)
@@ -112,6 +114,7 @@ def test_lost_workers_cost_only_their_tasks(kind, request, tmp_path) -> None:
         assert [n for n, answer in sorted(answers.items()) if answer.losses] == [0, 3, 6]
 
 
+@pytest.mark.slow
 def test_task_that_stops_every_worker_is_given_up() -> None:
     answers = collect(Processes(2).map_blocks(die_always, list_tasks(5)))
     lost = answers.pop(2)
@@ -145,6 +148,7 @@ list(Processes(1).map_blocks(draw_numbers, list_tasks(2)))
 """
 
 
+@pytest.mark.slow
 def test_script_without_guard_gets_a_sentence_instead_of_endless_processes(tmp_path) -> None:
     script = tmp_path / "script.py"
     script.write_text(UNGUARDED)
@@ -191,6 +195,7 @@ def is_running(process: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_dask_without_scheduler_or_workers_is_refused() -> None:
     with expect_refusal("workers.cluster-not-reached", StudyError):
         list(Dask("tcp://127.0.0.1:1", patience=0.5).map_blocks(draw_numbers, list_tasks(1)))
@@ -199,6 +204,7 @@ def test_dask_without_scheduler_or_workers_is_refused() -> None:
         list(Dask(address, patience=3.0).map_blocks(draw_numbers, list_tasks(1)))
 
 
+@pytest.mark.slow
 def test_scheduler_that_ends_is_reported() -> None:
     cluster = make_cluster(1)
     workers = Dask(cluster.scheduler_address, patience=5.0)  # also to wait for it to come back

@@ -150,6 +150,7 @@ def test_poses_depend_on_what_determines_them_only() -> None:
     assert count_poses(make_schedule(poses=planned, errors=true_errors)) == 1
 
 
+@pytest.mark.slow
 def test_time_estimate_counts_planning_once_for_all_blocks_and_cells_that_share_poses() -> None:
     planned = {"6": PosesLevel(6, "planned"), "8": PosesLevel(8, "planned")}
     study = make_study("five-bar", poses=planned, methods=METHODS, replicates=6000)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.studies import OUTCOMES
@@ -18,6 +19,7 @@ from loopcal.studies.specification.levels import (
 from tests.studies.studies import compute_cells, make_study
 
 
+@pytest.mark.slow
 def test_errors_in_fitted_frames_are_those_of_one_calibration():
     tracker = InstrumentLevel(("position",), sigma_position=2e-5, unknown_frames=("base", "tool"))
     study = make_study("hexapod-42", instruments={"t": tracker}, poses={"40": PosesLevel(40)})

@@ -279,6 +279,7 @@ DAMAGES = {
 """Damage -> text, what replaces it, line of the error, words of the error."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_errors_name_the_line(write, damage):
     old, new, line, words = DAMAGES[damage]

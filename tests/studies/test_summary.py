@@ -58,6 +58,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
     return store_scores(folder, make_study(), draw_scores)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "n"), [(0.5, 9), (0.5, 101), (0.95, 40), (0.95, 400)])
 def test_intervals_of_quantiles_cover_95_percent_or_more(share: float, n: int) -> None:
     draws = np.sort(np.random.default_rng(n).standard_exponential((4000, n)), axis=1)

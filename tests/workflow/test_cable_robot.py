@@ -208,6 +208,7 @@ def test_reading_errors_exclude_dropped_poses_and_need_pose_estimates(printer, f
     assert compute_reading_errors(replace(fit, poses=None), data) is None
 
 
+@pytest.mark.slow
 def test_only_a_wrong_motor_angle_is_reported_as_an_outlier(printer, fit):
     robot, data = printer
     examined = examine_fit(fit, data).outliers

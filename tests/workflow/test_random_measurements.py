@@ -18,6 +18,7 @@ HEADER = """# format: 1
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [MAP(), LeastSquares()], ids=["MAP", "least squares"])
 @pytest.mark.parametrize("noise", ["given", "estimated"])
 def test_random_positions_are_never_a_calibration(tmp_path, method, noise):

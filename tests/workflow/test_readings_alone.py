@@ -98,6 +98,7 @@ def test_fit_equals_the_closed_form_with_all_positions_as_unknowns(robot):
     np.testing.assert_allclose(found[1], lengths, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_starting_values_ten_percent_off_converge(robot, seed):
     anchors, zeros = draw_machine(10 + seed, 0.1)

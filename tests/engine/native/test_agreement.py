@@ -32,6 +32,7 @@ def assert_same_bits(results):
             assert_array_equal(other[name], array, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (5, 17), (9, 3)])
 def test_states_agree_with_numpy_and_between_instruction_sets(name, t, n):
@@ -48,6 +49,7 @@ def test_states_agree_with_numpy_and_between_instruction_sets(name, t, n):
     assert_same_bits(solved)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("free", [False, True])
 def test_blocks_agree_with_numpy_and_between_instruction_sets(name, free):
@@ -62,6 +64,7 @@ def test_blocks_agree_with_numpy_and_between_instruction_sets(name, free):
     assert_same_bits(calls)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (5, 17), (9, 3)])
 @pytest.mark.parametrize("per_trial", [False, True])
@@ -75,6 +78,7 @@ def test_derivatives_agree_with_numpy_and_between_instruction_sets(name, t, n, p
     assert_same_bits(calls)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (13, 5)])
 def test_folded_poses_agree_with_numpy_and_between_instruction_sets(name, t, n):
@@ -112,6 +116,7 @@ def test_inverse_solutions_agree_with_numpy_and_between_instruction_sets(name):
     assert_same_bits(solved)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize(("t", "n"), [(1, 21), (9, 3)])
 def test_limbs_of_a_given_platform_agree_with_numpy_and_between_instruction_sets(name, t, n):

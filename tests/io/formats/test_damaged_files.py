@@ -126,6 +126,7 @@ def try_damages(
     return refused, total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_a_damaged_file_is_refused_or_read(files, name: str) -> None:
     path = Path(FILES[name])
@@ -151,6 +152,7 @@ def convert(profile: Path, export: Path) -> None:
     save_conversion(convert_export(export, read_profile(profile)), "out.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tracker-points", "cmm-spheres", "six-dof"])
 @pytest.mark.parametrize("is_profile", [False, True])
 def test_a_damaged_export_or_profile_is_refused_or_read(files, name: str, is_profile) -> None:

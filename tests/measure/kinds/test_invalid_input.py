@@ -262,6 +262,7 @@ def test_heights_of_a_tilted_bed_are_constant_by_design(tilt, is_accepted):
         check_targets_move(data, zoo.make_poses(coordinates), SIZE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_poses_in_one_plane_give_unidentifiable_combinations_or_a_refusal(kind):
     """Poses without rotation at one height leave combinations unidentifiable in every kind.

@@ -72,6 +72,7 @@ def test_contradicting_readings_lead_to_their_least_squares_position(machine):
         np.testing.assert_allclose(position, best.x, atol=1e-8 * SIZE)  # [m] of scipy's minimum
 
 
+@pytest.mark.slow
 def test_sensitivities_agree_with_automatic_derivatives(machine):
     import jax
 

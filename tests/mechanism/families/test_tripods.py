@@ -279,6 +279,7 @@ def sensitivities_by_complex_steps(
     return loops(still, none).real, np.asarray(-np.linalg.solve(J, G)[:6], dtype=float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-3, 1e-2])
 @pytest.mark.parametrize("case", MODELS)
 def test_sensitivities_at_perturbed_parameters_equal_complex_steps(case: str, size: float) -> None:

@@ -81,6 +81,7 @@ def make_far_poses(robot, far, n):
     return geometry.apply_twist(np.broadcast_to(robot.home_state.T[0, 0], (n, 4, 4)), twist)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list_robots_with_few_freedoms())
 def test_projection_is_converged_only_where_the_distance_is_stationary(name):
     """The gradient by central differences of inverse solutions vanishes where a row is converged,

@@ -92,6 +92,7 @@ def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(
     assert home >= SHARE * total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_unreachable_coordinates_are_marked_without_an_exception(name: str) -> None:
     machine = load_cached_robot(name)

@@ -113,6 +113,7 @@ def test_a_hexapod_turned_around_is_solved_once_at_its_pose(
     assert len(calls) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["3-prs", "excavator"])
 def test_limited_steps_still_project_to_the_nearest_pose(name: str) -> None:
     robot, n = load_cached_robot(name), 8

@@ -79,6 +79,7 @@ def measure_mobility_sign(robot: Mechanism, solution: Solution) -> Array:
     return np.sign(np.linalg.det(np.nan_to_num(by_twist @ slopes.readings[0])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wide", WIDE)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide: float) -> None:
@@ -96,6 +97,7 @@ def test_converged_rows_return_from_home_and_other_modes_do_not(name: str, wide:
         assert "in another mode than the start" in str(result.explain(int(row)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_modes_are_those_of_complete_forward_solutions(name: str) -> None:
     robot = load_cached_robot(name)
@@ -135,6 +137,7 @@ def test_the_test_of_modes_ends_long_before_rounding() -> None:
     assert ended.iterations.mean() < 0.6 * forward_trials(robot, values, q).iterations.mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_no_target_called_reached_differs_from_the_pose_of_its_readings(name: str) -> None:
     robot = load_cached_robot(name)

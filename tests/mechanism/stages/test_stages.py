@@ -122,6 +122,7 @@ def test_excavator_agrees_with_the_law_of_cosines() -> None:
     np.testing.assert_allclose(back.T, multiply_triangles(q), rtol=0, atol=1e-9 * machine.size)
 
 
+@pytest.mark.slow
 def test_four_targets_in_four_coordinates_are_no_pose() -> None:
     machine = load_cached_robot("excavator")
     sample = sample_workspace(machine, 4, seed=1)
@@ -173,6 +174,7 @@ def test_tricept_agrees_with_a_constraint_solver() -> None:
 # --- every chain, with errors of all parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINS)
 def test_forward_after_inverse_returns_the_pose_of_a_chain_with_errors(name: str) -> None:
     machine = load_cached_robot(name)
@@ -185,6 +187,7 @@ def test_forward_after_inverse_returns_the_pose_of_a_chain_with_errors(name: str
     np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-9 * machine.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINS)
 def test_each_trial_of_a_batch_equals_its_own_solution(name: str) -> None:
     machine = load_cached_robot(name)

@@ -81,6 +81,7 @@ def test_constraints_and_transmissions_need_no_other_file(tmp_path) -> None:
         np.testing.assert_allclose(forward(other, q).T, forward(robot, q).T, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [None, 0, 2, 5])
 def test_hexapods_with_constraints_agree_with_the_solver(tmp_path, seed) -> None:
     legs = ["UPS", "SPU", "RUS", "PUS", "SPS", "UPS"]

@@ -41,6 +41,7 @@ def read(path: Path) -> tuple[Imported, Mechanism]:
     return imported, build_imported_robot(path, imported)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [None, 1])
 @pytest.mark.parametrize("machine", MACHINES)
 def test_hexapods_of_any_legs_agree_with_the_solver(tmp_path, machine, seed) -> None:
@@ -62,6 +63,7 @@ def test_hexapods_of_any_legs_agree_with_the_solver(tmp_path, machine, seed) -> 
     assert "files.motors-differ" not in {f.code for f in imported.findings}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [None, 0, 1, 2])
 @pytest.mark.parametrize("machine", ["UPS", "mixed"])
 def test_every_parameter_is_the_shift_of_an_origin_in_the_urdf(tmp_path, machine, seed) -> None:

@@ -73,6 +73,7 @@ def draw_readings(robot: Mechanism, count: int) -> np.ndarray:
     return home + np.random.default_rng(2).uniform(-0.05, 0.05, (count, home.shape[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("machine", "seed"),
     [("leg", None), ("leg", 3), ("head", 3), ("arm", None), ("digger", 3), ("tilted table", 3)],
