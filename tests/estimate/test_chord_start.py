@@ -104,7 +104,7 @@ def test_the_test_of_the_next_step_refuses_trials(monkeypatch):
 def test_numbers_depend_neither_on_threads_nor_on_the_other_trials(monkeypatch):
     trials, options = simulate(HEXAPOD, 9, 20), FitOptions(method=MAP())
     one = identify_trials(HEXAPOD, trials, options=options, chord_start=True)
-    monkeypatch.setattr(problem_module, "PLAIN_BLOCK", 40)  # two trials in each part
+    monkeypatch.setattr(problem_module, "TRIAL_BLOCK", 40)  # two trials in each part
     for threads in (1, 3):
         other = identify_trials(HEXAPOD, trials, options=options, chord_start=True, threads=threads)
         assert np.array_equal(one.values, other.values)

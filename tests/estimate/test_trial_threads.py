@@ -32,7 +32,7 @@ POSES = BLOCK // 4
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch):
     """Divide rows that the engine folds into parts as small as those of others."""
-    monkeypatch.setattr(problem_module, "PLAIN_BLOCK", BLOCK)
+    monkeypatch.setattr(problem_module, "TRIAL_BLOCK", BLOCK)
 
 
 def simulate(trials: int, kind=None, poses: int = POSES) -> Trials:

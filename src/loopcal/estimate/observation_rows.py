@@ -24,9 +24,11 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 BLOCK = 2048
 """Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
 enough for the cache."""
-PLAIN_BLOCK = 16384
-"""The same of rows that the engine folds as it makes them, so that less of them is in memory: fewer
-blocks leave less time to Python, which runs in one thread at a time."""
+PLAIN_BLOCK = 8192
+"""The same of rows that the engine folds as it makes them, so that less of them is in memory."""
+TRIAL_BLOCK = 16384
+"""The same where the poses are those of many trials: larger parts leave less time to Python, which
+runs in one thread at a time."""
 
 
 def _no_nuisance() -> IntArray:
@@ -95,7 +97,7 @@ class ObservationRows:
         t, r = self.measured.shape[:2]
         if t == 1:
             columns = self._columns
-        elif t * r > PLAIN_BLOCK:  # too many to keep
+        elif t * r > TRIAL_BLOCK:  # too many to keep
             columns = self.kind.prepare_columns(self.measured[trials])
         elif np.array_equal(trials, np.arange(t)):
             columns = self._columns

@@ -30,13 +30,14 @@ from loopcal.estimate.nuisance.elimination import NuisanceElimination, fold_node
 from loopcal.estimate.observation_rows import (
     BLOCK,
     PLAIN_BLOCK,
+    TRIAL_BLOCK,
     ObservationRows,
     Residuals,
     count_by_component,
 )
 from loopcal.estimate.poses.consistent import ConsistentPoses, remove_null_space
 from loopcal.estimate.poses.division import divide_exact_poses
-from loopcal.estimate.poses.exact import ExactPoses
+from loopcal.estimate.poses.exact import ExactPoses, have_plain_rows
 from loopcal.estimate.poses.leverage import spread_rows
 from loopcal.estimate.poses.linearization import LinearizedPoses, evaluate_rows
 from loopcal.estimate.poses.states import PoseSolution, PoseStates
@@ -93,7 +94,8 @@ class Problem:
         """Rows at the poses, which readings determine or which are estimated."""
         observed = self.free, self.readings[0], self.rows, self.nuisance
         if self.coordinates is None:
-            return divide_exact_poses(*observed, self.located, BLOCK)
+            size = PLAIN_BLOCK if self.folds_plain_rows else BLOCK
+            return divide_exact_poses(*observed, self.located, size)
         from loopcal.estimate.poses.uncertain_division import divide_uncertain_poses
 
         assert self.member is not None
@@ -148,7 +150,7 @@ class Problem:
     @property
     def part_size(self) -> int:
         """Number of trials whose rows are made together."""
-        size = PLAIN_BLOCK if self.folds_plain_rows else BLOCK
+        size = TRIAL_BLOCK if self.folds_plain_rows else BLOCK
         return max(1, size // self.poses.block_size)
 
     def weighted(self, weight: FloatArray) -> Problem:
@@ -194,9 +196,8 @@ class Problem:
         Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
         begins at `start`.
         """
-        t, shared, folds = len(self), None, self.folds_plain_rows
-        exact = self.poses if isinstance(self.poses, ExactPoses) else None
-        single = exact if exact is not None and exact.is_single_block else None
+        t, shared, folds, poses = len(self), None, self.folds_plain_rows, self.poses
+        single = poses if isinstance(poses, ExactPoses) and poses.is_single_block else None
         is_equal = t > 1 and bool((deviation == deviation[0]).all())
         if single is not None and is_equal:
             shared = single.solve_single_block(deviation[:1], self.trials, start, not folds)
@@ -248,8 +249,7 @@ class Problem:
         `observe` receives the number of each block, its poses, and what its rows of each kind
         evaluate to; None for a kind without rows there.
         """
-        t = len(self)
-        shapes = [(t, *r.whitener.shape[1:3]) for r in self.rows]
+        shapes = [(len(self), *r.whitener.shape[1:3]) for r in self.rows]
         kinds = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
         for i, (block, poses) in enumerate(self.poses.iterate_poses(solution, deviation)):
             evaluations: list[Evaluation | None] = []
@@ -335,11 +335,11 @@ class Problem:
         """Return the poses that a row needs and that are not reached at deviation (1, p)."""
         return self.poses.find_unreached(deviation, start)
 
-    @property
+    @cached_property
     def folds_plain_rows(self) -> bool:
         """Whether the engine makes the rows of exact poses as it folds them."""
-        exact = isinstance(self.poses, ExactPoses) and self.poses.is_plain
-        return exact and self.consistent is None
+        is_more = self.is_uncertain or self.consistent is not None or self.located is not None
+        return not is_more and have_plain_rows(self.free, self.rows, self.nuisance)
 
     def _eliminate(
         self, solution: PoseSolution, z: FloatArray, trials: IntArray, start: Start

@@ -242,11 +242,7 @@ def descend(
     progress(0, 1, "fitting")
     with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
         begin = problem.start(z) if start is None else start
-        first = problem.linearize(z, begin)
-    good = _is_finite(first)
-    if not good.all():
-        factor = np.where(good[:, None, None], first.factor, 0.0)
-        first = replace(first, factor=factor, cost=np.where(good, first.cost, np.inf))
+        first = _clear_failed(problem.linearize(z, begin))
     arrival = np.full(len(z), np.inf) if arrival is None else arrival
     point = model.locate(replace(first, deviation=z), arrival)
     linear_model = point.linear_model
@@ -282,9 +278,13 @@ def descend(
     )
 
 
-def _is_finite(linearized: Linearization) -> BoolArray:
-    """Return the trials (t,) whose cost and factor are finite."""
-    return np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
+def _clear_failed(linearized: Linearization) -> Linearization:
+    """Return a linearization with infinite cost and no rows where one of them is not finite."""
+    is_finite = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
+    if is_finite.all():
+        return linearized
+    factor = np.where(is_finite[:, None, None], linearized.factor, 0.0)
+    return replace(linearized, factor=factor, cost=np.where(is_finite, linearized.cost, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,14 +309,16 @@ class _Point(TrialBatch):
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """The linearization at proposed deviations, cost (a,) infinite where it is not finite; its
-    linear model is made where it is needed.
-    """
+    """The linearization at proposed deviations; its linear model is made where it is needed."""
 
     model: _FilteredDescent
     linearized: Linearization
-    cost: FloatArray
     arrival: FloatArray
+
+    @property
+    def cost(self) -> FloatArray:
+        """(a,) sums of squares, infinite where the rows are not finite."""
+        return self.linearized.cost
 
     def take(self, trials: IntArray) -> _Point:
         """Return the points of some trials."""
@@ -365,9 +367,9 @@ class _FilteredDescent:
     def evaluate(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Candidate:
         """Linearize at the deviations of the steps."""
         linearized = self.problem.take(trials).linearize(step.deviation, point.start)
-        cost = np.where(_is_finite(linearized), linearized.cost, np.inf)
         is_full = step.length >= step.full_length
-        return _Candidate(self, linearized, cost, np.where(is_full, np.sqrt(step.change), np.inf))
+        arrival = np.where(is_full, np.sqrt(step.change), np.inf)
+        return _Candidate(self, _clear_failed(linearized), arrival)
 
     def judge(
         self, point: _Point, step: FilteredStep, candidate: _Candidate

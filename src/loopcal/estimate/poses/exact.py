@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from loopcal.estimate.nuisance.elimination import (
     fold_node_rows,
     solve_for_nuisance,
 )
-from loopcal.estimate.observation_rows import PoseBlock
+from loopcal.estimate.observation_rows import ObservationRows, PoseBlock
 from loopcal.estimate.poses.linearization import (
     LinearizedPoses,
     join_located,
@@ -38,6 +37,17 @@ from loopcal.numerics.sorted_values import find_distinct
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+def have_plain_rows(
+    free: FreeParameters, rows: Sequence[ObservationRows], nuisance: NuisanceElimination | None
+) -> bool:
+    """Return whether the platform's twist by the parameters determines all rows of solved poses, so
+    that the engine folds them without writing its derivatives.
+    """
+    is_simple = all(r.kind.poses_per_row == 1 and not r.kind.sensed_joints for r in rows)
+    has_more = nuisance is not None or free.errors is not None
+    return is_simple and not (has_more or free.robot.stages or free.robot.has_open_sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,19 +80,6 @@ class ExactPoses:
     def is_single_block(self) -> bool:
         """Whether all rows belong to one block, so that poses are kept from start to start."""
         return len(self.blocks) == 1 and self.located is None
-
-    @cached_property
-    def is_plain(self) -> bool:
-        """Whether the platform's twist by the parameters determines all rows, so that the engine
-        folds them without writing its derivatives.
-        """
-        kinds = (rows.kind for block in self.blocks for rows in block.rows)
-        is_simple = all(kind.poses_per_row == 1 and not kind.sensed_joints for kind in kinds)
-        has_more = self.nuisance is not None or self.located is not None or self.names
-        robot = self.free.robot
-        return is_simple and not (
-            has_more or self.free.errors or robot.stages or robot.has_open_sums
-        )
 
     def at_readings(self, q: FloatArray) -> ExactPoses:
         """Return these rows at other readings (a, n, actuators) [SI]."""
@@ -171,7 +168,7 @@ class ExactPoses:
     ) -> tuple[FloatArray, BoolArray]:
         """Fold the rows of all blocks; return also which trials (a,) lack a needed pose.
 
-        For rows that are plain, see `is_plain`.
+        For rows that are plain, see `have_plain_rows`.
         """
         robot, is_lost = self.free.robot, np.zeros(len(z), dtype=bool)
         for block in self.blocks:
