@@ -258,7 +258,7 @@ def _collect_covariance(observations: Sequence[Observations], quantity: str) -> 
     """Return the covariances (e, 3, 3) of errors as `compute_row_errors` orders them; None where
     nobody stated the noise of some.
     """
-    parts = [np.zeros((0, 3, 3))]
+    covariances = [np.zeros((0, 3, 3))]
     for o in observations:
         for group in (g for g in list_error_groups(o.kind) if g.quantity == quantity):
             columns = np.array(group.columns)
@@ -268,8 +268,8 @@ def _collect_covariance(observations: Sequence[Observations], quantity: str) -> 
             block = np.zeros((len(o), 3, 3))
             c = len(columns)
             block[:, :c, :c] = o.covariance[:, columns[:, None], columns]
-            parts.append(block[measured])
-    return np.concatenate(parts)
+            covariances.append(block[measured])
+    return np.concatenate(covariances)
 
 
 def _rotate(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -260,13 +260,13 @@ def _propagate(
     own = [factor[:, U:] @ assumed.to_z * assumed.is_estimated for factor in factors]
     penalty = np.diag(np.sqrt(assumed.penalty))
     Q, R = np.linalg.qr(np.concatenate([*own, penalty]))
-    parts = np.split(Q, np.cumsum([len(rows) for rows in own]))
+    Q_blocks = np.split(Q, np.cumsum([len(rows) for rows in own]))
     size = [assumed.noise] * len(own)
     errors = [
         assumed.to_z @ substitute_backward(R, s * q.T)
-        for s, q in zip(size, parts[:-1], strict=True)
+        for s, q in zip(size, Q_blocks[:-1], strict=True)
     ]
-    errors.append(assumed.to_z @ substitute_backward(R, (parts[-1] * assumed.spread[:, None]).T))
+    errors.append(assumed.to_z @ substitute_backward(R, (Q_blocks[-1] * assumed.spread[:, None]).T))
     moved = [assumed.noise * factor[:, :U].T for factor in factors]
     return errors, [*moved, np.zeros((U, len(penalty)))]
 

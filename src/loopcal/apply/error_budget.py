@@ -175,7 +175,7 @@ class ErrorBudget(TableResult):
 
     def _list_line(self, line: SourceBudget) -> dict[str, Any]:
         """Return a source by name for JSON."""
-        halved, at = line.halved, self.names.index(self.worst) if self.worst else None
+        halved, worst_index = line.halved, self.names.index(self.worst) if self.worst else None
         source = line.source._asdict()
         if not np.isfinite(line.source.degrees):
             source["degrees"] = None
@@ -189,7 +189,9 @@ class ErrorBudget(TableResult):
             else {
                 "position_rms": halved.position,
                 "orientation_rms": halved.orientation,
-                "worst_parameter_sd": None if at is None else float(halved.parameters[at]),
+                "worst_parameter_sd": None
+                if worst_index is None
+                else float(halved.parameters[worst_index]),
             },
         }
 
@@ -371,12 +373,12 @@ def _word(
     dimensions = (("position", Dimension.LENGTH), ("orientation", Dimension.ANGLE))
     for (name, dimension), sources in zip(dimensions, errors, strict=True):
         size = fit.robot.size if dimension is Dimension.LENGTH else 1.0
-        parts = {key: float(np.sqrt(value)) for key, value in sources._asdict().items()}
+        rms_by_source = {key: float(np.sqrt(value)) for key, value in sources._asdict().items()}
         stated[name] = None
         if sources.rms > ROUNDING * size:
             quantities = {
                 key: fit.robot.to_quantity(value, dimension)
-                for key, value in parts.items()
+                for key, value in rms_by_source.items()
                 if value > NEGLIGIBLE * sources.rms
             }
             stated[name] = (fit.robot.to_quantity(sources.rms, dimension), quantities)

@@ -164,8 +164,8 @@ class Validation(TableResult):
         only actuator readings are compared.
         """
         if self.has_several_kinds or not self.quantities:
-            every = self.kinds[-1]
-            return {"weighted": ErrorChange(every.before, every.after, 1.0, every.count)}
+            weighted = self.kinds[-1]
+            return {"weighted": ErrorChange(weighted.before, weighted.after, 1.0, weighted.count)}
         return {
             quantity: ErrorChange(
                 self.before.statistics(quantity).rms,

@@ -267,7 +267,7 @@ def compute_row_errors(
     ----------
     observations : of every kind. residuals : (r, m) [SI] of each. first_row : number of the first.
     """
-    parts: dict[str, list[QuantityErrors]] = {}
+    errors_by_quantity: dict[str, list[QuantityErrors]] = {}
     for o, residual in zip(observations, residuals, strict=True):
         shown = np.where(o.present, residual, np.nan)
         for group in list_error_groups(o.kind):
@@ -286,9 +286,9 @@ def compute_row_errors(
                 (group.target,) * int(measured.sum()),
                 names,
             )
-            parts.setdefault(group.quantity, []).append(errors)
+            errors_by_quantity.setdefault(group.quantity, []).append(errors)
         first_row += len(o)
-    joined = {name: _join(some) for name, some in parts.items()}
+    joined = {name: _join(of_kinds) for name, of_kinds in errors_by_quantity.items()}
     return PoseErrors({name: errors for name, errors in joined.items() if len(errors.rows)})
 
 
@@ -361,13 +361,13 @@ def _median_of_largest(variances: FloatArray) -> float:
     return float(np.sqrt(high))
 
 
-def _join(parts: Sequence[QuantityErrors]) -> QuantityErrors:
+def _join(errors_of_kinds: Sequence[QuantityErrors]) -> QuantityErrors:
     """Return the errors of one quantity of several kinds or sets as one."""
-    names = dict.fromkeys(name for part in parts for name in part.measured)
+    names = dict.fromkeys(name for part in errors_of_kinds for name in part.measured)
     return QuantityErrors(
-        parts[0].dimension,
-        np.concatenate([part.components for part in parts]),
-        np.concatenate([part.rows for part in parts]),
-        tuple(target for part in parts for target in part.targets),
+        errors_of_kinds[0].dimension,
+        np.concatenate([part.components for part in errors_of_kinds]),
+        np.concatenate([part.rows for part in errors_of_kinds]),
+        tuple(target for part in errors_of_kinds for target in part.targets),
         tuple(names),
     )

@@ -222,13 +222,13 @@ def compare_with_values(
         if not np.isfinite(value):
             raise EstimationError(f"the value of {name!r} is {value}; give a finite number")
     _refuse_other_fixed_values(fit, values)
-    at = [i for i, name in enumerate(fit.names) if name in values]
-    if not at:
+    indices = [i for i, name in enumerate(fit.names) if name in values]
+    if not indices:
         raise EstimationError(
             f"no value belongs to an estimated parameter of {fit.robot.name!r}; give some of "
             f"{', '.join(fit.names)}"
         )
-    return _compare(fit, np.array(at), np.array([values[fit.names[i]] for i in at]))
+    return _compare(fit, np.array(indices), np.array([values[fit.names[i]] for i in indices]))
 
 
 def _refuse_other_fixed_values(fit: Identification, values: Mapping[str, float]) -> None:
@@ -291,32 +291,32 @@ def refuse_other_dimensions(
     )
 
 
-def _compare(fit: Identification, at: IntArray, given: FloatArray) -> ValueComparison:
-    """Compare the free parameters at places `at` (k,) with given values (k,) [SI]."""
-    posterior, tolerance = fit.posterior, fit.tolerance[at]
-    raw = fit.estimate[at] - given
-    parts = (posterior.unit[at] / tolerance)[:, None] * posterior.directions[at]
-    comparable = _find_complement(parts[:, ~posterior.determined])
+def _compare(fit: Identification, indices: IntArray, given: FloatArray) -> ValueComparison:
+    """Compare the free parameters at `indices` (k,) with given values (k,) [SI]."""
+    posterior, tolerance = fit.posterior, fit.tolerance[indices]
+    raw = fit.estimate[indices] - given
+    directions = (posterior.unit[indices] / tolerance)[:, None] * posterior.directions[indices]
+    comparable = _find_complement(directions[:, ~posterior.determined])
     z = comparable @ (comparable.T @ (raw / tolerance))
     # a direction that a truncation leaves out is determined, but not estimated
     is_open = ~posterior.determined | np.isinf(posterior.variance)
-    tested = _find_complement(parts[:, is_open])
+    tested = _find_complement(directions[:, is_open])
     y = tested.T @ (raw / tolerance)
     known = np.where(is_open, 0.0, posterior.variance)
     whitened, u, second_order = np.full(len(y), np.nan), np.eye(len(y)), np.nan
     left = np.inf
     if np.isfinite(known).all() and len(y):
-        scaled = parts * np.sqrt(known)
+        scaled = directions * np.sqrt(known)
         u, s, wt = np.linalg.svd(tested.T @ scaled, full_matrices=False)
         whitened = (u.T @ y) / s
         # the most probable change of all parameters with this difference of the compared ones
         change = posterior.directions @ (np.sqrt(known) * (wt.T @ whitened))
         second_order = measure_second_order(posterior, posterior.unit * change)
         whitening = np.zeros((len(y), len(posterior.unit)))
-        whitening[:, at] = ((u / s).T @ tested.T) / tolerance
+        whitening[:, indices] = ((u / s).T @ tested.T) / tolerance
         left = float(posterior.count_degrees(whitening))
     chi_square = float(np.sum(whitened**2))
-    names = tuple(fit.names[i] for i in at)
+    names = tuple(fit.names[i] for i in indices)
     sigma, direction = _name_largest(names, tested @ u, whitened)
     is_cut = comparable.shape[1] < len(names)
     p_value, *bounds = (

@@ -102,7 +102,7 @@ class FrameRows:
         evaluations: Sequence[Evaluation | None],
     ) -> None:
         """Add the rows of every kind at poses T (1, n, 4, 4) and joints name -> (1, n)."""
-        elimination, parts, trial = self._problem.nuisance, [], np.zeros(1, dtype=np.int64)
+        elimination, node_rows, trial = self._problem.nuisance, [], np.zeros(1, dtype=np.int64)
         by_frames = frame_twists(T, self._problem.free.robot.size)
         poses = LinearizedPoses(T, np.ones(T.shape[:2], dtype=bool), by_frames, joints)
         tree = None if elimination is None else elimination.tree
@@ -111,8 +111,8 @@ class FrameRows:
                 kind = linearize_rows(rows, poses, trial, self._nuisance, evaluated=evaluated)
                 length = float(np.linalg.norm(kind.by_parameters))
                 self._effect = float(np.hypot(self._effect, length))
-                parts += divide_among_nodes(kind, list_members(elimination, rows), tree)
-        self._factor = fold_node_rows(self._factor, self._factors, parts)
+                node_rows += divide_among_nodes(kind, list_members(elimination, rows), tree)
+        self._factor = fold_node_rows(self._factor, self._factors, node_rows)
 
     def find_unfixed(self) -> FloatArray | None:
         """Return an orthonormal basis (12, k) of the motions of frames that change no measured
@@ -246,7 +246,7 @@ def list_instrument_frames(data: Measurements) -> Iterable[tuple[str, FloatArray
         for session in find_distinct(rows.session).tolist():
             full = f"{session}.{name}" if session else name
             listed[full] = (cast(FloatArray, stated), is_unknown)
-    return [(name, *parts) for name, parts in listed.items()]
+    return [(name, *fields) for name, fields in listed.items()]
 
 
 def _describe_unknown(

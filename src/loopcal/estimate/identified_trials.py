@@ -47,10 +47,10 @@ class IdentifiedTrials(TableResult):
     @cached_property
     def decomposition(self) -> Decomposition:
         """The decompositions of the rows: variances and leverages are read from them."""
-        parts = [model.decomposition for model in self.linear_models]
-        if any(part.dual is not None for part in parts):
-            parts = [part.with_dual() for part in parts]
-        return Decomposition.join(parts)
+        decompositions = [model.decomposition for model in self.linear_models]
+        if any(part.dual is not None for part in decompositions):
+            decompositions = [part.with_dual() for part in decompositions]
+        return Decomposition.join(decompositions)
 
     @cached_property
     def penalty(self) -> FloatArray:

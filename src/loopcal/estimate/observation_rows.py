@@ -81,10 +81,10 @@ class ObservationRows:
         """Return some rows with poses renumbered: pose i becomes place[i]."""
         if len(rows) == len(self.poses):
             return replace(self, poses=place[self.poses])
-        parts = (self.measured[:, rows], self.whitener[:, rows], self.nuisance[rows])
+        selected = (self.measured[:, rows], self.whitener[:, rows], self.nuisance[rows])
         factor = None if self.factor is None else self.factor[rows]
         offset = None if self.offset is None else self.offset[:, rows]
-        return ObservationRows(self.kind, place[self.poses[rows]], *parts, factor, offset)
+        return ObservationRows(self.kind, place[self.poses[rows]], *selected, factor, offset)
 
     def cut_trials(self, trials: IntArray) -> ObservationRows:
         """Return the rows of some trials (a,), which are numbered from 0 then."""

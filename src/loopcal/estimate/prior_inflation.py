@@ -82,8 +82,10 @@ def choose_methods(
         )
     ):
         unpenalized = method.unpenalized(len(free))
-        one = rows.take(np.array([i]))
-        components = ComponentSearch(one, method.correlation, unpenalized, candidates).choose()
+        trial_rows = rows.take(np.array([i]))
+        components = ComponentSearch(
+            trial_rows, method.correlation, unpenalized, candidates
+        ).choose()
         if not _are_same(components, method.components):
             chosen[int(i)] = replace(method, components=components)
     return chosen
@@ -128,8 +130,8 @@ def add_factor_uncertainty(result: Identification, fit: Descent) -> Identificati
     errors = [_estimate_factor_error(result, fit, factor)] if factor > 1.0 else []
     errors += _estimate_component_errors(fit, method, factor)
     scale = result.tolerance[:, None]
-    parts = tuple(component.to_row(result.names) for component in method.components)
-    finding = report_finding("prior.inflation", factor=factor, parts=parts)
+    component_rows = tuple(component.to_row(result.names) for component in method.components)
+    finding = report_finding("prior.inflation", factor=factor, parts=component_rows)
     change = np.concatenate([error.change[:, None] for error in errors], axis=1)
     inflated = add_covariance(result, scale * change, np.inf, finding)
     uncertain = [CovariancePart(TOLERANCES, scale * e.caused, e.degrees) for e in errors]
@@ -232,7 +234,9 @@ def _are_same(
     first: tuple[ToleranceComponent, ...], second: tuple[ToleranceComponent, ...]
 ) -> bool:
     """Return whether components are the same and their factors nearly so."""
-    one, other = ({(c.kind, c.places): c.factor for c in parts} for parts in (first, second))
-    return one.keys() == other.keys() and all(
-        abs(factor / other[key] - 1.0) <= SAME_FACTOR for key, factor in one.items()
+    factors, other_factors = (
+        {(c.kind, c.places): c.factor for c in components} for components in (first, second)
+    )
+    return factors.keys() == other_factors.keys() and all(
+        abs(factor / other_factors[key] - 1.0) <= SAME_FACTOR for key, factor in factors.items()
     )

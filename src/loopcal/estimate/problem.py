@@ -183,8 +183,8 @@ class Problem:
         if self.nuisance is None or not seek or not self.nuisance.is_free.any():
             return start
         for i in range(t):
-            one = np.array([i])
-            located = self.poses.locate(deviation[one], start.take(one))
+            trial = np.array([i])
+            located = self.poses.locate(deviation[trial], start.take(trial))
             if located is not None:
                 data = self.data(int(self.trials[i]))
                 return start.with_nuisance(self.nuisance.start_values(data, *located))
@@ -353,8 +353,8 @@ class Problem:
             assert isinstance(self.poses, ExactPoses)
             factor, is_lost = self.poses.fold_rows(factor, solution, z, trials)
         else:
-            for parts, lost in self.poses.iterate_rows(solution, z, trials):
-                factor = fold_node_rows(factor, factors, parts)
+            for node_rows, lost in self.poses.iterate_rows(solution, z, trials):
+                factor = fold_node_rows(factor, factors, node_rows)
                 is_lost |= lost
         equations = select_counts(self.component_count.sum(axis=1), trials)
         if solution.estimates is not None:

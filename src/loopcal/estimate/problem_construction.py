@@ -92,13 +92,13 @@ def _compute_whiteners(sensor: Sensor, measured: FloatArray) -> FloatArray:
     trials are equal.
     """
     kind, step = sensor.kind, max(1, BLOCK // max(1, measured.shape[1]))
-    parts = [measured[first : first + step] for first in range(0, len(measured), step)]
-    first = _list_noise(kind, parts[0][:1])
-    if all(_is_equal(_list_noise(kind, part), first) for part in parts):
-        parts = [parts[0][:1]]
+    batches = [measured[first : first + step] for first in range(0, len(measured), step)]
+    first = _list_noise(kind, batches[0][:1])
+    if all(_is_equal(_list_noise(kind, batch), first) for batch in batches):
+        batches = [batches[0][:1]]
     white = []
-    for part in parts:  # so that what they are computed with stays small
-        N, present = _list_noise(kind, part)
+    for batch in batches:  # so that what they are computed with stays small
+        N, present = _list_noise(kind, batch)
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)

@@ -198,6 +198,6 @@ def repeat_trial(start: Start, count: int) -> Start:
     return map_arrays(lambda array: np.repeat(array[:1], count, axis=0), start)
 
 
-def join_fits(parts: Sequence[ResampleFits]) -> ResampleFits:
+def join_fits(batches: Sequence[ResampleFits]) -> ResampleFits:
     """Return the fits of all parts."""
-    return TrialBatch.join(parts)
+    return TrialBatch.join(batches)

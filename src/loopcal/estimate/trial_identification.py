@@ -92,14 +92,14 @@ def identify_trials(
     shared = None
     if chord_start and options.begin == "kinematics" and len(values) == 1 and len(z):
         shared = share_factor(problem, z[:1], method, options.rank_tolerance)
-    parts = _fit_parts(problem, z, options, free, threads, shared)
+    fits = _fit_parts(problem, z, options, free, threads, shared)
     return IdentifiedTrials(
-        free.values(np.concatenate([part.deviation for part in parts])),
-        np.concatenate([part.status for part in parts]),
-        np.concatenate([part.iterations for part in parts]),
-        np.concatenate([part.cost for part in parts]),
+        free.values(np.concatenate([fit.deviation for fit in fits])),
+        np.concatenate([fit.status for fit in fits]),
+        np.concatenate([fit.iterations for fit in fits]),
+        np.concatenate([fit.cost for fit in fits]),
         free,
-        tuple(part.linear_model for part in parts),
+        tuple(fit.linear_model for fit in fits),
         method,
     )
 
@@ -144,11 +144,11 @@ def _fit_parts(
         fit = repeat_trials(own, first, options, free)
         return _Part(fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
 
-    parts = list(_divide(problem))
-    if threads == 1 or len(parts) == 1:
-        return [fit(part) for part in parts]
+    batches = list(_divide(problem))
+    if threads == 1 or len(batches) == 1:
+        return [fit(batch) for batch in batches]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(fit, parts))
+        return list(pool.map(fit, batches))
 
 
 def _descend_from_chords(

@@ -149,8 +149,8 @@ def _correct_positions(
     gap = np.concatenate([each.ravel() for each in gaps])
     shift = np.zeros((sheet.n_poses, 3))
     for pose in np.unique(poses):
-        held = poses == pose
-        shift[pose] = np.linalg.lstsq(along[held], -gap[held], rcond=None)[0]
+        is_of_pose = poses == pose
+        shift[pose] = np.linalg.lstsq(along[is_of_pose], -gap[is_of_pose], rcond=None)[0]
     return shift, float(np.abs(gap).max(initial=0.0))
 
 

@@ -335,9 +335,9 @@ def _is_rigid_motion(
     motions[3:, :3, 3] = h * np.eye(3)
     noise = np.zeros((6, len(T), len(kind.noise_columns)))
     moved = kind.measure(motions[:, None] @ T, noise)
-    at = np.ix_(np.flatnonzero(static.present), np.array(static.columns))
-    slope = np.stack([(values[at] - predicted[at]).ravel() / h for values in moved], axis=1)
-    change = predicted[at] - static.rows.measured[at]
+    cells = np.ix_(np.flatnonzero(static.present), np.array(static.columns))
+    slope = np.stack([(values[cells] - predicted[cells]).ravel() / h for values in moved], axis=1)
+    change = predicted[cells] - static.rows.measured[cells]
     motion = np.linalg.lstsq(slope, -change.ravel(), rcond=1e-6)[0]
     rest = change + (slope @ motion).reshape(change.shape)
     is_constant = np.ptp(rest, axis=0) <= CONSTANT_SHARE * possible

@@ -61,15 +61,15 @@ class FullSteps:
         Return the trials (a,) that reached a lower point, and these points.
         """
         ahead = np.flatnonzero(self.is_ahead)
-        there = self._point.take(ahead)
-        length = model.propose(there, np.zeros(len(ahead))).full_length
+        points_ahead = self._point.take(ahead)
+        length = model.propose(points_ahead, np.zeros(len(ahead))).full_length
         contracts = length <= CONTRACTION * self._length[ahead]
         is_lower = contracts & self._is_low[ahead]
         goes_on = contracts & ~is_lower & (self._count[ahead] < LONGEST_CHAIN)
         self._end(ahead[~goes_on & ~is_lower])
         arrived = ahead[is_lower]
         self.is_ahead[arrived], self._wait[arrived], self._taken[arrived] = False, FIRST_WAIT, 0
-        return arrived, there.take(np.flatnonzero(is_lower))
+        return arrived, points_ahead.take(np.flatnonzero(is_lower))
 
     def start_due(self, point: Any, active: IntArray, damping: FloatArray) -> None:
         """Begin chains at the points of trials (a,) that took enough damped steps."""

@@ -332,10 +332,12 @@ def minimize_by_halving(
             worse = active & control.is_worse(candidate.cost, point.cost)
             if not worse.any():
                 break
-            parts = np.broadcast_to(worse[:, None], share.shape)
+            worse_parts = np.broadcast_to(worse[:, None], share.shape)
             if is_part_worse is not None:
-                parts = parts & is_part_worse(point, candidate)
-            share = np.where(parts, (0.5 if attempt < control.attempts - 1 else 0.0) * share, share)
+                worse_parts = worse_parts & is_part_worse(point, candidate)
+            share = np.where(
+                worse_parts, (0.5 if attempt < control.attempts - 1 else 0.0) * share, share
+            )
         with np.errstate(invalid="ignore"):
             # inf - inf and 0 * inf give NaN; these trials are stuck already
             gained = point.cost - candidate.cost

@@ -28,8 +28,8 @@ def map_arrays(function: Callable[..., np.ndarray], *values: Value) -> Value:
     if isinstance(first, np.ndarray):
         return function(*values)  # type: ignore[return-value]
     if isinstance(first, tuple):
-        parts: Any = zip(*values, strict=True)  # type: ignore[call-overload]
-        return tuple(map_arrays(function, *part) for part in parts)  # type: ignore[return-value]
+        elements: Any = zip(*values, strict=True)  # type: ignore[call-overload]
+        return tuple(map_arrays(function, *part) for part in elements)  # type: ignore[return-value]
     if is_dataclass(first):
         names = _list_batched(type(first))
         made = {n: map_arrays(function, *[getattr(value, n) for value in values]) for n in names}
@@ -86,11 +86,11 @@ class TrialBatch:
         return bool(is_in_place.all())
 
     @staticmethod
-    def join(parts: Sequence[Value]) -> Value:
+    def join(batches: Sequence[Value]) -> Value:
         """Return the trials of all parts, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        return map_arrays(lambda *arrays: np.concatenate(arrays), *parts)
+        if len(batches) == 1:
+            return batches[0]
+        return map_arrays(lambda *arrays: np.concatenate(arrays), *batches)
 
 
 def _count_trials(value: Any) -> int:

@@ -83,17 +83,19 @@ def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> Pape
     folder = files(paper.module.rpartition(".")[0])
     source = paper.studies[wanted] if is_own else next(iter(paper.studies.values()))
     text = (folder / source).read_text("utf-8")
-    found = re.search(r"^  .*\{file: (?P<name>[\w.]+)\}$", text, re.MULTILINE)
-    poses_text = "" if found is None else (folder / found["name"]).read_text("utf-8")
+    poses_match = re.search(r"^  .*\{file: (?P<name>[\w.]+)\}$", text, re.MULTILINE)
+    poses_text = "" if poses_match is None else (folder / poses_match["name"]).read_text("utf-8")
     if is_own:
-        if found is None:
+        if poses_match is None:
             return PaperStudyFile(path, text, None, "", wanted, ())
         poses = path.with_name(f"{path.stem}-poses.csv")
-        text = text.replace(f"{{file: {found['name']}}}", f"{{file: {quote_name(poses.name)}}}")
+        text = text.replace(
+            f"{{file: {poses_match['name']}}}", f"{{file: {quote_name(poses.name)}}}"
+        )
         return PaperStudyFile(path, text, poses, poses_text, wanted, ())
     replaced = []
     text = replace_key(text, "robots", f"robots: [{quote_robot(path, wanted)}]")
-    if found is not None:
+    if poses_match is not None:
         count = len(poses_text.splitlines()) - 1
         text = replace_key(text, "poses", f"poses: [{count}]  # drawn from the workspace")
         replaced.append("poses")

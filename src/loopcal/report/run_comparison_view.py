@@ -100,12 +100,12 @@ def build_errors(comparison: RunComparison, show_unit: Callable[[str], Unit]) ->
     """Return the errors after calibration of each run: at common held-out poses, or at its own."""
     has_common = comparison.common_poses > 0
     rows = []
-    for one in comparison.errors:
-        errors = one.common if has_common else one.own
+    for run_errors in comparison.errors:
+        errors = run_errors.common if has_common else run_errors.own
         for quantity, error in errors.items():
-            rows.append((one.run, quantity, *_format_errors(error, show_unit(quantity))))
+            rows.append((run_errors.run, quantity, *_format_errors(error, show_unit(quantity))))
         if not errors:
-            rows.append((one.run, ABSENT, ABSENT, ABSENT, ABSENT, ""))
+            rows.append((run_errors.run, ABSENT, ABSENT, ABSENT, ABSENT, ""))
     caption = (
         f"Errors after calibration at {comparison.common_poses} poses that are common to all runs"
         if has_common

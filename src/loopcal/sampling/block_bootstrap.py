@@ -194,8 +194,10 @@ class Bootstrap(TableResult):
         least = 0.5 / len(self.draws)
         z = 2.0 * ndtri(np.clip(share, least, 1.0 - least)) + ndtri(tails)[:, None]
         columns = range(self.draws.shape[1])
-        at = ndtr(z)
-        ends = [[np.quantile(self.draws[:, j], at[i, j]) for j in columns] for i in (0, 1)]
+        probabilities = ndtr(z)
+        ends = [
+            [np.quantile(self.draws[:, j], probabilities[i, j]) for j in columns] for i in (0, 1)
+        ]
         return np.array(ends[0]), np.array(ends[1])
 
 
@@ -239,12 +241,12 @@ def bootstrap(
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
     draw = _Draw(fit, linear, blocks, scheme, np.random.default_rng(np.random.SeedSequence(seed)))
-    parts = []
+    batches = []
     for first in range(0, count, BATCH):
         progress(first, count, "fitting resamples")
-        parts.append(fit_resamples(fit, linear, draw(min(BATCH, count - first))))
+        batches.append(fit_resamples(fit, linear, draw(min(BATCH, count - first))))
     progress(count, count, "fitting resamples")
-    fits = join_fits(parts)
+    fits = join_fits(batches)
     kept = fits.take(np.flatnonzero(fits.converged))
     if len(kept.deviation) < 2:
         raise EstimationError(report_finding("sampling.resamples-failed", count=count))

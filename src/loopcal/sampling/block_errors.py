@@ -98,13 +98,13 @@ def compute_block_errors(
     untested = []
     for g in range(clusters.count):
         mine = np.flatnonzero(cells.block == g)
-        parts = [cells.within(mine, i) for i in range(len(kinds))]
-        pairs = list(zip(kinds, parts, strict=True))
-        residual[mine] = np.concatenate([kind.residual[part] for kind, part in pairs])
-        by_nuisance = np.concatenate([kind.by_nuisance[part] for kind, part in pairs])
-        by_parameters = np.concatenate([kind.by_parameters[part] for kind, part in pairs])
+        cells_of_kinds = [cells.within(mine, i) for i in range(len(kinds))]
+        pairs = list(zip(kinds, cells_of_kinds, strict=True))
+        residual[mine] = np.concatenate([kind.residual[own_cells] for kind, own_cells in pairs])
+        by_nuisance = np.concatenate([kind.by_nuisance[own_cells] for kind, own_cells in pairs])
+        by_parameters = np.concatenate([kind.by_parameters[own_cells] for kind, own_cells in pairs])
         half = np.concatenate([by_nuisance, by_parameters @ V], axis=1)
-        poses = _pose_columns(problem.rows, kinds, parts)
+        poses = _pose_columns(problem.rows, kinds, cells_of_kinds)
         error[mine], lost = _correct(residual[mine], half, poses)
         residual[mine] += by_parameters @ shift
         untested.append(lost)
@@ -148,15 +148,15 @@ def _list_cells(rows: Sequence[ObservationRows], clusters: Clusters) -> _Cells:
 def _pose_columns(
     rows: Sequence[ObservationRows],
     kinds: Sequence[ObservedColumns],
-    parts: Sequence[tuple[IntArray, IntArray]],
+    cells_of_kinds: Sequence[tuple[IntArray, IntArray]],
 ) -> FloatArray:
     """Return the columns (M, K) of a block's cells by the coordinates of its poses."""
     if all(kind.by_coordinates is None for kind in kinds):
-        return np.zeros((sum(len(row) for row, _ in parts), 0))
-    linked = [r.poses_by_link[row] for r, (row, _) in zip(rows, parts, strict=True)]
+        return np.zeros((sum(len(row) for row, _ in cells_of_kinds), 0))
+    linked = [r.poses_by_link[row] for r, (row, _) in zip(rows, cells_of_kinds, strict=True)]
     poses = np.unique(np.concatenate([of_kind.ravel() for of_kind in linked]))
     blocks = []
-    for kind, names, (row, component) in zip(kinds, linked, parts, strict=True):
+    for kind, names, (row, component) in zip(kinds, linked, cells_of_kinds, strict=True):
         assert kind.by_coordinates is not None
         k = kind.by_coordinates.shape[-1]
         wide = np.zeros((len(row), len(poses), k))

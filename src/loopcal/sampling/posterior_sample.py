@@ -223,12 +223,12 @@ def sample_posterior(
 
 def _evaluate(density: PosteriorDensity, v: FloatArray, progress: Progress) -> FloatArray:
     """Return log p (T,) of draws v (T, k + u)."""
-    parts = []
+    log_densities = []
     for first in range(0, len(v), BATCH):
         progress(first, len(v), "evaluating draws")
-        parts.append(density.exact(v[first : first + BATCH]))
+        log_densities.append(density.exact(v[first : first + BATCH]))
     progress(len(v), len(v), "evaluating draws")
-    return np.concatenate(parts)
+    return np.concatenate(log_densities)
 
 
 @dataclass(frozen=True, eq=False)

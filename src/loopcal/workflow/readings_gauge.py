@@ -16,10 +16,10 @@ def is_readings_alone(data: Measurements) -> bool:
 def report_readings_gauge(motions: FrameMotions, count: int) -> Finding:
     """Return what `count` open combinations are: the place of frames, the size, and others."""
     others = count - motions.count - motions.has_scale
-    parts = (
+    combinations = (
         {"what": "frames", "frames": motions.frames, "count": motions.count},
         {"what": "scale", "frames": (), "count": int(motions.has_scale)},
         {"what": "others", "frames": (), "count": others},
     )
-    kept = tuple(part for part in parts if part["count"])
+    kept = tuple(part for part in combinations if part["count"])
     return report_finding("identifiability.readings-gauge", parts=kept)

@@ -60,9 +60,9 @@ def refuse_incomparable(
     if name := _find_lonely(mine.parameters.names, theirs.parameters.names):
         place = names[0] if name in mine.parameters.names else names[1]
         raise DataError(report_finding("runs.other-parameters", **words, name=name, place=place))
-    for what, one, other in _list_structure(mine, theirs):
-        if one != other:
-            data: dict[str, Any] = {"what": what, "mine": one, "theirs": other}
+    for what, first_text, second_text in _list_structure(mine, theirs):
+        if first_text != second_text:
+            data: dict[str, Any] = {"what": what, "mine": first_text, "theirs": second_text}
             raise DataError(report_finding("runs.other-mechanism", **words, **data))
     free = [list_free(run) for run in (first, second)]
     if not is_same_data and (name := _find_lonely(*free)):
@@ -81,9 +81,9 @@ def refuse_incomparable(
     refuse_other_dimensions(mine, theirs, names)
 
 
-def _find_lonely(one: Sequence[str], other: Sequence[str]) -> str:
+def _find_lonely(first: Sequence[str], second: Sequence[str]) -> str:
     """Return the first name that only one of two lists has; empty without any."""
-    different = [n for n in (*one, *other) if (n in one) != (n in other)]
+    different = [n for n in (*first, *second) if (n in first) != (n in second)]
     return different[0] if different else ""
 
 
@@ -92,14 +92,14 @@ def list_free(run: StoredRun) -> tuple[str, ...]:
     return tuple(row["name"] for row in run.result["fit"]["parameters"])
 
 
-def _list_structure(one: Mechanism, other: Mechanism) -> list[tuple[str, str, str]]:
+def _list_structure(first: Mechanism, second: Mechanism) -> list[tuple[str, str, str]]:
     """Return what must be equal, in words, and its text in both robots."""
-    table = other.parameters
-    theirs = [table.dimensions[table.index(name)] for name in one.parameters.names]
-    pairs = zip(one.parameters.names, one.parameters.dimensions, theirs, strict=True)
+    table = second.parameters
+    theirs = [table.dimensions[table.index(name)] for name in first.parameters.names]
+    pairs = zip(first.parameters.names, first.parameters.dimensions, theirs, strict=True)
     return [
-        ("actuators", _name_actuators(one), _name_actuators(other)),
-        ("controlled coordinates", ", ".join(one.controlled), ", ".join(other.controlled)),
+        ("actuators", _name_actuators(first), _name_actuators(second)),
+        ("controlled coordinates", ", ".join(first.controlled), ", ".join(second.controlled)),
         *((f"physical dimensions of {n}", a.value, b.value) for n, a, b in pairs),
     ]
 

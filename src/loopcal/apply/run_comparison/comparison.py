@@ -134,7 +134,7 @@ def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) ->
     ]
     errors, poses, notes = collect_errors(runs, names, data)
     findings += notes
-    if not poses and all(one.own for one in errors):
+    if not poses and all(run_errors.own for run_errors in errors):
         findings.append(report_finding("runs.no-common-poses"))
     parameters = tuple(dict.fromkeys(n for run in runs for n in list_free(run)))
     table = first.robot.parameters

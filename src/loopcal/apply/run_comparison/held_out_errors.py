@@ -58,11 +58,11 @@ def collect_errors(
         common = [errors for errors, _ in results]
         found_rows = [finding for _, findings in results for finding in findings]
         errors = zip(names, own, common, strict=True)
-        return tuple(RunErrors(*one) for one in errors), data.n_poses, tuple(found_rows)
+        return tuple(RunErrors(*fields) for fields in errors), data.n_poses, tuple(found_rows)
     poses = _find_common_poses(runs)
     common = [_read_errors(run, poses) if poses else {} for run in runs]
     errors = zip(names, own, common, strict=True)
-    return tuple(RunErrors(*one) for one in errors), len(poses), ()
+    return tuple(RunErrors(*fields) for fields in errors), len(poses), ()
 
 
 def _validate(
@@ -90,7 +90,7 @@ def _find_common_poses(runs: Sequence[StoredRun]) -> tuple[str, ...]:
     do not mean the same.
     """
     digests = [list_data_digests(run) for run in runs]
-    if not digests[0] or any(one != digests[0] for one in digests):
+    if not digests[0] or any(run_digests != digests[0] for run_digests in digests):
         return ()
     held_out = [((run.result.get("split") or {}).get("held_out") or ()) for run in runs]
     return tuple(label for label in held_out[0] if all(label in others for others in held_out))

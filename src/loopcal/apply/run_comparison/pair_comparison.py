@@ -117,7 +117,8 @@ def relate_data(first: StoredRun, second: StoredRun) -> DataRelation:
     noise = {**find_row_noise(first), **find_row_noise(second)}
     readings = len(first.robot.actuators)
     shared = min(
-        one.count_shared(other, readings, noise) for one, other in ((mine, theirs), (theirs, mine))
+        rows.count_shared(other_rows, readings, noise)
+        for rows, other_rows in ((mine, theirs), (theirs, mine))
     )
     total = max(len(mine), len(theirs))
     kind = "independent" if not shared else "same" if shared == total else "shared"

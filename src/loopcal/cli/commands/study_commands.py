@@ -339,10 +339,10 @@ def export(folder: Path, output: Path, force: bool, as_json: bool) -> None:
 
 
 @study.command()
-@click.argument("parts", metavar="PART...", nargs=-1, required=True, type=FILE)
+@click.argument("part_folders", metavar="PART...", nargs=-1, required=True, type=FILE)
 @file_option("-o", "--output", required=True, metavar="FOLDER", help="Folder to make or to add to.")
 @json_option
-def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
+def merge(part_folders: tuple[Path, ...], output: Path, as_json: bool) -> None:
     """Join folders of jobs that each computed a share of one study (see run --cells).
 
     \b
@@ -353,7 +353,7 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     from loopcal.studies.results.status import read_status, view_status
 
     with terminal.ProgressBar() as progress:
-        count = merge_studies(parts, output, progress)
+        count = merge_studies(part_folders, output, progress)
     state = read_status(output)
     if as_json:
         terminal.print_json({"new_blocks": count, "status": state})

@@ -164,7 +164,7 @@ class RobustSpread:
     ----------
     root : (p, k) L in tolerances, for the k directions that the fit estimates.
     scores : (G, k) h_g, the u_g in units of L.
-    parts : (G, k, h) the rows in units of L; without a prior the sum of their squares is k.
+    scaled_rows : (G, k, h) the rows in units of L; without a prior the sum of their squares is k.
     correction : (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h); 0 where g is 1, so that
         no residual can judge the row.
     columns : (G, h, w) rows by everything that is estimated, in standard deviations: their products
@@ -174,7 +174,7 @@ class RobustSpread:
 
     root: FloatArray
     scores: FloatArray
-    parts: FloatArray
+    scaled_rows: FloatArray
     correction: FloatArray
     leverage: FloatArray
     columns: FloatArray
@@ -196,16 +196,16 @@ class RobustSpread:
         # Q = sum_g |E' h_g|^2 with E E' = root' root; for independent errors its mean is `mean`
         _, s, vt = np.linalg.svd(root, full_matrices=False)
         E = vt[s > COMMON * s[0]].T * s[s > COMMON * s[0]]
-        parts = np.matmul(E.T, self.parts)
-        by_rows, parts = float((parts**2).sum()), parts * self.is_tested[:, None, :]
-        mean, observed = float((parts**2).sum()), float(((self.scores @ E) ** 2).sum())
+        rows = np.matmul(E.T, self.scaled_rows)
+        tested_rows = rows * self.is_tested[:, None, :]
+        mean, observed = float((tested_rows**2).sum()), float(((self.scores @ E) ** 2).sum())
         if not mean > 0.0:
             return NO_RATIO
         excess = self.times * (observed - mean)
         ratio = float(np.sqrt(max(total + excess, 0.0) / (total + added)))
-        degrees = self._degrees(parts, mean)
+        degrees = self._degrees(tested_rows, mean)
         p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
-        return Ratio(ratio, degrees, mean / by_rows, p_value)
+        return Ratio(ratio, degrees, mean / float((rows**2).sum()), p_value)
 
     def parameter_ratios(self, added: FloatArray | float = 0.0) -> FloatArray:
         """Return the ratio (p,) of each parameter; NaN without a standard deviation. `added` (p,) :
@@ -214,21 +214,22 @@ class RobustSpread:
         own = (self.root**2).sum(axis=1)
         observed = ((self.scores @ self.root.T) ** 2).sum(axis=0)
         expected = np.zeros(len(own))
-        for parts in self.parts * self.is_tested[:, None, :]:
-            expected += ((self.root @ parts) ** 2).sum(axis=1)
+        for tested_rows in self.scaled_rows * self.is_tested[:, None, :]:
+            expected += ((self.root @ tested_rows) ** 2).sum(axis=1)
         robust = own + self.times * (observed - expected)
         nothing = np.full(len(own), np.nan)
         square = np.divide(robust, own + added, out=nothing, where=own > 0.0)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
-    def _degrees(self, parts: FloatArray, mean: float) -> float:
+    def _degrees(self, tested_rows: FloatArray, mean: float) -> float:
         """Return the degrees of freedom 2 mean^2 / variance of Q for independent normal errors.
 
-        `parts` (G, r, h) are E' parts. Q = e' K e of all rows e has the variance 2 tr (K K). With
-        D the corrections, Z the columns and F_g = D_g parts_g' parts_g D_g, the blocks of two
-        clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and those of one |parts_g' parts_g|^2.
+        `tested_rows` (G, r, h) are E' scaled_rows. Q = e' K e of all rows e has the variance
+        2 tr (K K). With rows_g those of cluster g, D the corrections, Z the columns and F_g =
+        D_g rows_g' rows_g D_g, the blocks of two clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and
+        those of one |rows_g' rows_g|^2.
         """
-        products = np.matmul(parts.swapaxes(-1, -2), parts)
+        products = np.matmul(tested_rows.swapaxes(-1, -2), tested_rows)
         F = products * self.correction[:, :, None] * self.correction[:, None, :]
         width = self.columns.shape[-1]
         joint = self.columns.reshape(-1, width).T @ np.matmul(F, self.columns).reshape(-1, width)
@@ -264,11 +265,11 @@ def compute_robust_spread(
     remaining = 1.0 - leverage
     is_tested = remaining > TESTABLE
     correction = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
-    parts = np.matmul(P.swapaxes(-1, -2), vectors)
+    scaled_rows = np.matmul(P.swapaxes(-1, -2), vectors)
     residual = correction * np.matmul(r[:, None, :], vectors)[:, 0]
-    scores = np.matmul(parts, residual[..., None])[..., 0]
+    scores = np.matmul(scaled_rows, residual[..., None])[..., 0]
     columns = np.matmul(vectors.swapaxes(-1, -2), half)
-    return RobustSpread(V * sd, scores, parts, correction, leverage, columns, times)
+    return RobustSpread(V * sd, scores, scaled_rows, correction, leverage, columns, times)
 
 
 def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:

@@ -53,7 +53,10 @@ def explain_change(changes: ParameterChanges, level: float) -> ChangeCause:
     kinds: dict[str, list[tuple[tuple[str, ...], list[int]]]] = {
         "parameter": [((name,), [i]) for i, name in enumerate(changes.names)],
         "limb": [((limb,), places) for limb, places in limbs.items()],
-        "limbs": [((one, two), [*limbs[one], *limbs[two]]) for one, two in combinations(limbs, 2)],
+        "limbs": [
+            ((first, second), [*limbs[first], *limbs[second]])
+            for first, second in combinations(limbs, 2)
+        ],
     }
     for kind, causes in kinds.items():
         cause = _choose(changes, kind, causes, level)

@@ -82,12 +82,12 @@ class ParameterChanges:
         """How much of the k degrees of freedom the noise of each calibration causes, and the
         degrees of freedom of its variance; then the same of all other errors together.
         """
-        parts = [(float((part.root**2).sum()), part.degrees) for part in self.errors]
-        if len(parts) <= OF_NOISE:
-            return tuple(parts)
-        total = sum(share for share, _ in parts[OF_NOISE:])
-        squares = ((np.array(share), degrees) for share, degrees in parts[OF_NOISE:])
-        return (*parts[:OF_NOISE], (total, float(combine_degrees(np.array(total), squares))))
+        shares = [(float((part.root**2).sum()), part.degrees) for part in self.errors]
+        if len(shares) <= OF_NOISE:
+            return tuple(shares)
+        total = sum(share for share, _ in shares[OF_NOISE:])
+        squares = ((np.array(share), degrees) for share, degrees in shares[OF_NOISE:])
+        return (*shares[:OF_NOISE], (total, float(combine_degrees(np.array(total), squares))))
 
     def compute_p_value(self, chi_square: float, degrees: int) -> float:
         """Return the probability of a larger chi-square if nothing has changed; NaN without a
@@ -159,8 +159,8 @@ def compare_information(first: Posterior, second: Posterior) -> ParameterChanges
     left = u[:, rank:].T
     count = len(scaled[0])
     slope, value = left[:, count:] @ scaled[1] / unit, left @ np.concatenate(values)
-    parts = (left[:, :count], left[:, count:])
-    return _whiten(first, second, slope, value, parts, (before, after))
+    combinations = (left[:, :count], left[:, count:])
+    return _whiten(first, second, slope, value, combinations, (before, after))
 
 
 def _divide_by_noise(information: DataInformation) -> tuple[FloatArray, FloatArray]:
@@ -194,12 +194,14 @@ def _whiten(
     second: Posterior,
     slope: FloatArray,
     value: FloatArray,
-    parts: tuple[FloatArray, FloatArray],
+    combinations: tuple[FloatArray, FloatArray],
     information: tuple[DataInformation, DataInformation],
 ) -> ParameterChanges:
     """Divide rows by the root of their covariance, which errors beside the noise increase."""
-    errors = [ErrorPart(part, own.degrees) for part, own in zip(parts, information, strict=True)]
-    for posterior, part, own in zip((first, second), parts, information, strict=True):
+    errors = [
+        ErrorPart(part, own.degrees) for part, own in zip(combinations, information, strict=True)
+    ]
+    for posterior, part, own in zip((first, second), combinations, information, strict=True):
         rows = part @ own.rows / np.sqrt(own.variance)
         errors += [
             ErrorPart(rows @ added.root, added.degrees) for added in _list_added_parts(posterior)

@@ -106,7 +106,7 @@ def _cut_series(series: IntArray) -> list[IntArray]:
     for first, last in zip(starts, np.r_[starts[1:], len(series)], strict=True):
         for part in np.array_split(np.arange(first, last), -(-(last - first) // LONGEST)):
             by_length.setdefault(len(part), []).append(part)
-    return [np.array(parts) for parts in by_length.values()]
+    return [np.array(segments) for segments in by_length.values()]
 
 
 def _evaluate(

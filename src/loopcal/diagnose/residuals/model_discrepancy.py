@@ -90,12 +90,12 @@ class SlowErrors:
 
     Attributes
     ----------
-    rows : that show them. found : number of the errors, of rotation or place -> size, probability.
+    rows : that show them. components : PLACE or ROTATION -> size and probability of these errors.
     is_slow : whether neighboring poses share them; otherwise each pose has its own.
     """
 
     rows: SlowErrorRows
-    found: Mapping[int, tuple[VarianceComponent, float]]
+    components: Mapping[int, tuple[VarianceComponent, float]]
     is_slow: bool = True
 
 
@@ -123,9 +123,9 @@ def find_slow_errors(
     level = compute_single_level(LEVEL, len(tested))
     known = count_sigma_degrees(fit.residual_test.noise, fit.options.sigma_uncertainty)
     slow = [SlowErrors(rows, detect_slow_errors(rows, known, level)) for rows in tested]
-    slow = [each for each in slow if each.found]
+    slow = [each for each in slow if each.components]
     if slow:
-        return min(slow, key=lambda each: min(p for _, p in each.found.values()))
+        return min(slow, key=lambda each: min(p for _, p in each.components.values()))
     return find_rough_errors(fit, data, linear, T)
 
 
@@ -145,7 +145,7 @@ def find_rough_errors(
     rows = project_slow_errors(fit, data, linear, errors)
     if rows is None:
         return None
-    found = {}
+    components = {}
     for part in (part for part in (PLACE, ROTATION) if _is_seen(rows, part)):
         u, w = _find_axes(rows.rows[:, _columns(rows.errors, part)])
         y = (u.T @ rows.residuals) / lack.sigma_scale
@@ -153,8 +153,8 @@ def find_rough_errors(
         if p_value < REPEATS_LEVEL:
             size = estimate_variance_component(w, y, lack.pure_degrees)
             variance = size.variance * lack.sigma_scale**2
-            found[part] = (size._replace(variance=variance), p_value)
-    return SlowErrors(rows, found, is_slow=False) if found else None
+            components[part] = (size._replace(variance=variance), p_value)
+    return SlowErrors(rows, components, is_slow=False) if components else None
 
 
 def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
@@ -164,12 +164,12 @@ def add_slow_errors(fit: Identification, slow: SlowErrors) -> Identification:
     """
     rows, first = slow.rows, fit.posterior
     amplitude, degrees = np.zeros(6), np.full(2, np.inf)
-    for part, (component, _) in slow.found.items():
+    for part, (component, _) in slow.components.items():
         amplitude[3 * part : 3 * part + 3] = np.sqrt(component.variance)
         degrees[part] = component.degrees
     errors = rows.errors.scaled(amplitude)
     root = rows.slope * np.repeat(amplitude, rows.errors.count // 6)
-    for part, (component, _) in slow.found.items():
+    for part, (component, _) in slow.components.items():
         own = root[:, _columns(rows.errors, part)]
         fit = add_covariance(fit, own, component.degrees, _report(fit, slow, part))
     discrepancy = ModelDiscrepancy(errors, root, degrees, first.directions, first.variance)
@@ -184,25 +184,25 @@ def detect_slow_errors(
     `known` degrees of freedom say that the residuals have unit variance. `level` : probability of
     finding any without such errors.
     """
-    parts = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
-    level = compute_single_level(level, len(parts))
-    residuals, whitened, found = rows.residuals, rows.rows, {}
-    while parts:
-        turned = {part: _find_axes(whitened[:, _columns(rows.errors, part)]) for part in parts}
+    remaining = [part for part in (PLACE, ROTATION) if _is_seen(rows, part)]
+    level = compute_single_level(level, len(remaining))
+    residuals, whitened, components = rows.residuals, rows.rows, {}
+    while remaining:
+        turned = {part: _find_axes(whitened[:, _columns(rows.errors, part)]) for part in remaining}
         tests = {part: (w, u.T @ residuals) for part, (u, w) in turned.items()}
         p_values = {part: compute_component_tail(*test) for part, test in tests.items()}
-        part = min(parts, key=lambda each: p_values[each])
+        part = min(remaining, key=lambda each: p_values[each])
         if p_values[part] >= level:
             break
         u, w = turned[part]
         component = estimate_variance_component(*tests[part], known)
-        found[part] = (component, p_values[part])
+        components[part] = (component, p_values[part])
         # u diag(1 / sqrt(1 + ratio w)) u' + (I - u u')
         shrink = 1.0 / np.sqrt(1.0 + component.ratio * w) - 1.0
         residuals = residuals + (u * shrink) @ (u.T @ residuals)
         whitened = whitened + (u * shrink) @ (u.T @ whitened)
-        parts.remove(part)
-    return found
+        remaining.remove(part)
+    return components
 
 
 def project_slow_errors(
@@ -263,7 +263,7 @@ def _report(fit: Identification, slow: SlowErrors, part: int) -> Finding:
     """Return the size of the errors of rotation or of place, and that they are in the uncertainty;
     a warning where they are beyond doubt.
     """
-    component, p_value = slow.found[part]
+    component, p_value = slow.components[part]
     dimension = (Dimension.ANGLE, Dimension.LENGTH)[part]
     return report_finding(
         DISCREPANCY,

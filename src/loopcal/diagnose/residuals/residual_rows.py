@@ -122,10 +122,10 @@ def collect_residual_rows(
     if linear.problem.is_uncertain:
         return None
     observations = [rows for rows in data.observations if len(rows)]
-    parts = list(_iterate_rows(linear, observations))
-    if not parts:
+    row_groups = list(_iterate_rows(linear, observations))
+    if not row_groups:
         return None
-    rows, kind, row, column = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    rows, kind, row, column = (np.concatenate(arrays) for arrays in zip(*row_groups, strict=True))
     first = np.cumsum([0, *(o.present.shape[1] for o in observations)])
     series = first[kind] + column
     place = np.concatenate([order_rows(o) for o in observations])
@@ -168,8 +168,8 @@ def _iterate_rows(
     linear: FitLinearization, observations: list[Observations]
 ) -> Iterator[tuple[FloatArray, IntArray, IntArray, IntArray]]:
     """Give rows (k, U + p + 1) that are present, with their kind, row and column (k,)."""
-    for parts in linear.problem.leverage_rows(linear.linearization, linear.solution):
-        for part in parts:
+    for node_rows in linear.problem.leverage_rows(linear.linearization, linear.solution):
+        for part in node_rows:
             present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
             i, column = np.nonzero(present[part.numbers])
             kind = np.full(len(i), part.kind)

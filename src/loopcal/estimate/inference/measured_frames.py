@@ -78,8 +78,8 @@ def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> MeasuredFrames | Non
         return None
     unfixed, readings, labels, *stacked = (arrays[PREFIX + name] for name in names)
     frames = {
-        str(name): InstrumentFrame(*parts)
-        for name, *parts in zip(labels.tolist(), *stacked, strict=True)
+        str(name): InstrumentFrame(*fields)
+        for name, *fields in zip(labels.tolist(), *stacked, strict=True)
     }
     return MeasuredFrames(unfixed, readings, frames)
 

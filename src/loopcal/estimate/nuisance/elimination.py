@@ -171,12 +171,12 @@ class NuisanceElimination:
         of their kind, and which of its rows (r,) they are.
         """
         of_kinds = [self.local.indices[i][members] for _, i, members in chosen]
-        parts = [(self.local.factor(i), members) for _, i, members in chosen]
+        factors = [(self.local.factor(i), members) for _, i, members in chosen]
         used = find_distinct(np.concatenate([places.ravel() for places in of_kinds]))
         setup = NuisanceParameters(
             ParameterTable(tuple(self.local.table.entries[i] for i in used)),
             tuple(np.searchsorted(used, places) for places in of_kinds),
-            tuple(None if factor is None else factor[members] for factor, members in parts),
+            tuple(None if factor is None else factor[members] for factor, members in factors),
         )
         part = replace(
             data,
@@ -281,16 +281,16 @@ def spread_columns(derivatives: FloatArray, columns: IntArray, width: int) -> Fl
 
 
 def fold_node_rows(
-    factor: FloatArray, factors: NodeFactors | None, parts: Sequence[NodeRows]
+    factor: FloatArray, factors: NodeFactors | None, node_rows: Sequence[NodeRows]
 ) -> FloatArray:
     """Fold rows into the factors of their nodes; return the machine's factor with its own rows."""
-    plain = [_flat(part) for part in parts if part.structure < 0]
+    plain = [_flat(part) for part in node_rows if part.structure < 0]
     if plain:
         factor = engine.fold(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
     if factors is None:
         return factor
-    for structure in sorted({part.structure for part in parts if part.structure >= 0}):
-        chosen = [part for part in parts if part.structure == structure]
+    for structure in sorted({part.structure for part in node_rows if part.structure >= 0}):
+        chosen = [part for part in node_rows if part.structure == structure]
         places = [np.repeat(factors.tree.place[part.nodes], part.rows.shape[2]) for part in chosen]
         rows = [_flat(part) for part in chosen]
         factors.add(structure, np.concatenate(rows, axis=1), np.concatenate(places))

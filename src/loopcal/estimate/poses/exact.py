@@ -179,8 +179,8 @@ class ExactPoses:
                 poses = locate_poses(self.free, block.readings, state, self.names)
             observed = [list_twist_rows(r, poses, trials) for r in block.rows if len(r.poses)]
             values = self.free.values(z[: len(state.T)])  # one trial may stand for all
-            parts = values, block.readings, state, self.free.columns, observed, factor
-            factor, is_finite = fold_pose_rows(robot, *parts, solution.driven)
+            inputs = values, block.readings, state, self.free.columns, observed, factor
+            factor, is_finite = fold_pose_rows(robot, *inputs, solution.driven)
             is_lost |= np.any(~(poses.is_reached & is_finite) & block.is_needed, axis=1)
         return factor, is_lost
 
@@ -191,12 +191,12 @@ class ExactPoses:
         tree = None if self.nuisance is None else self.nuisance.tree
         linearized = self.iterate_linearized(solution, z, trials)
         for (block, poses), members in zip(linearized, self.members, strict=True):
-            parts = []
+            node_rows = []
             for i, (rows, nodes) in enumerate(zip(block.rows, members, strict=True)):
                 if len(rows.poses):
                     kind = linearize_rows(rows, poses, trials, solution.nuisance)
-                    parts += [p._replace(kind=i) for p in divide_among_nodes(kind, nodes, tree)]
-            yield parts, poses.is_lost(block.is_needed)
+                    node_rows += [p._replace(kind=i) for p in divide_among_nodes(kind, nodes, tree)]
+            yield node_rows, poses.is_lost(block.is_needed)
 
     def poses_of(self, block: PoseBlock, part: NodeRows) -> IntArray:
         """Return the first pose of each of the rows of a part."""
@@ -239,8 +239,8 @@ class ExactPoses:
         pairs = zip(self.blocks, located, strict=True)
         if any(poses.is_lost(block.is_needed)[0] for block, poses in pairs):
             return None
-        parts = [(poses.T[0], poses) for poses in located]
-        return join_located(parts, self.names, np.arange(self.count))
+        poses_of_blocks = [(poses.T[0], poses) for poses in located]
+        return join_located(poses_of_blocks, self.names, np.arange(self.count))
 
     def _solve_for_nuisance(
         self, located: list[LinearizedPoses], values: FloatArray, trials: IntArray, control: Halving
@@ -252,12 +252,12 @@ class ExactPoses:
         def fold_at(tried: FloatArray) -> NodeFactors:
             factors = NodeFactors(nuisance.tree, len(trials), 0)
             for block, members, poses in zip(self.blocks, self.members, located, strict=True):
-                parts = []
+                node_rows = []
                 for rows, nodes in zip(block.rows, members, strict=True):
                     if rows.nuisance.shape[1] and len(rows.poses):
                         kind = linearize_rows(rows, poses, trials, tried, by_parameters=False)
-                        parts += divide_among_nodes(kind, nodes, nuisance.tree)
-                within = [part for part in parts if part.structure >= 0]
+                        node_rows += divide_among_nodes(kind, nodes, nuisance.tree)
+                within = [part for part in node_rows if part.structure >= 0]
                 fold_node_rows(empty_factor(0, 0), factors, within)
             return factors
 

@@ -37,9 +37,9 @@ def spread_rows(
     p : number of free parameters. nuisance : of the problem. at_nodes : None without any.
     """
     wide = 0 if nuisance is None else len(nuisance)
-    for block, (parts, _) in zip(poses.blocks, rows_of_blocks, strict=True):
+    for block, (node_rows, _) in zip(poses.blocks, rows_of_blocks, strict=True):
         of_block = []
-        for part in parts:
+        for part in node_rows:
             whitened = part.rows[0]
             w = whitened.shape[-1] - p - 1
             rows = np.zeros((*whitened.shape[:2], wide + p + 1))

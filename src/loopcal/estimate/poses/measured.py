@@ -137,11 +137,13 @@ class _MeasuredPoses:
         """Return the full steps, limited in length."""
         del damping
         robot, k = self.robot, len(point.T)
-        parts = [
+        rows_of_kinds = [
             _whitened_rows(rows, places[point.number], point.trial, point.T)
             for rows, places in self.rows
         ]
-        residual, by_twist = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
+        residual, by_twist = (
+            np.concatenate([part[i] for part in rows_of_kinds], axis=1) for i in (0, 1)
+        )
         state, T, closed = None, point.T, np.ones(k, dtype=bool)
         if self.moves_freely:
             slope = np.diag([1.0 / robot.size] * 3 + [1.0] * 3)[:, robot.program.freedoms]

@@ -74,11 +74,11 @@ def _select_rows(
     source: int,
 ) -> Iterator[tuple[list[NodeRows], BoolArray]]:
     """Give, block by block, the rows of a source at poses of exact readings."""
-    for block, (parts, lost) in zip(
+    for block, (node_rows, lost) in zip(
         poses.blocks, poses.iterate_rows(solution, z, trials), strict=True
     ):
         chosen = []
-        for part in parts:
+        for part in node_rows:
             kept = sources[part.kind][block.row_numbers[part.kind][part.numbers]] == source
             nodes, numbers, rows = part.nodes[kept], part.numbers[kept], part.rows[:, kept]
             if kept.any():
@@ -95,23 +95,25 @@ def _project_rows(
     source: int,
 ) -> Iterator[tuple[list[NodeRows], BoolArray]]:
     """Give, block by block, the rows of a source, projected along all rows of uncertain poses."""
-    for (block, at), groups in zip(poses.iterate_poses(solution, z), poses.groups, strict=True):
+    for (block, linearized), groups in zip(
+        poses.iterate_poses(solution, z), poses.groups, strict=True
+    ):
         kinds = [
-            linearize_rows(rows, at, trials, solution.nuisance) if len(rows.poses) else None
+            linearize_rows(rows, linearized, trials, solution.nuisance) if len(rows.poses) else None
             for rows in block.rows
         ]
         own = [
             None if kind is None else _mask(kind, of[numbers] == source)
             for kind, of, numbers in zip(kinds, sources, block.row_numbers, strict=True)
         ]
-        parts = []
+        node_rows = []
         for group in groups:
-            every, chosen = (_stack(poses, block, group, k) for k in (kinds, own))
+            all_rows, own_rows = (_stack(poses, block, group, k) for k in (kinds, own))
             width = group.poses.shape[1] * poses.coordinates.freedoms
-            solved = eliminate_columns(every, width).solution
-            rows = chosen[..., width:] - chosen[..., :width] @ solved
-            parts.append(NodeRows(group.structure, group.nodes, group.components, rows))
-        yield parts, at.is_lost(block.is_needed)
+            solved = eliminate_columns(all_rows, width).solution
+            rows = own_rows[..., width:] - own_rows[..., :width] @ solved
+            node_rows.append(NodeRows(group.structure, group.nodes, group.components, rows))
+        yield node_rows, linearized.is_lost(block.is_needed)
 
 
 def _stack(

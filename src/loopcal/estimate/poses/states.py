@@ -37,9 +37,9 @@ class PoseStates(TrialBatch):
         return map_arrays(replaced, self, other)
 
     @staticmethod
-    def join_poses(parts: Sequence[PoseStates], order: IntArray) -> PoseStates:
+    def join_poses(states: Sequence[PoseStates], order: IntArray) -> PoseStates:
         """Return the poses of all parts side by side, then in an order."""
-        return map_arrays(lambda *arrays: np.concatenate(arrays, axis=1)[:, order], *parts)
+        return map_arrays(lambda *arrays: np.concatenate(arrays, axis=1)[:, order], *states)
 
 
 def spread_states(state: engine.State, trials: int, poses: int) -> engine.State:

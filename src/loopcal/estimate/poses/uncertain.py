@@ -177,11 +177,11 @@ class UncertainPoses:
         linearized = self.iterate_linearized(solution, z, trials)
         for (block, poses), groups in zip(linearized, self.groups, strict=True):
             kinds = self._linearize_kinds(block, poses, trials, solution.nuisance)
-            parts = []
+            node_rows = []
             for group in groups:
                 rest = self._eliminate(block, group, kinds)[0].rest
-                parts.append(NodeRows(group.structure, group.nodes, group.components, rest))
-            yield parts, poses.is_lost(block.is_needed)
+                node_rows.append(NodeRows(group.structure, group.nodes, group.components, rest))
+            yield node_rows, poses.is_lost(block.is_needed)
 
     def poses_of(self, block: PoseBlock, part: NodeRows) -> IntArray:
         """Return the first pose of each component of a part."""
@@ -221,14 +221,14 @@ class UncertainPoses:
         """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost."""
         del solution
         assert start.poses is not None
-        values, parts = self.free.values(z), []
+        values, poses_of_blocks = self.free.values(z), []
         for block in self.blocks:
             closed = self.coordinates.close(values, start.poses.take_poses(block.poses), True)
             poses = self.coordinates.linearize(values, closed, block.poses)
             if poses.is_lost(block.is_needed)[0]:
                 return None
-            parts.append((closed.state.T[0], poses))
-        return join_located(parts, self.names, self._pose_order())
+            poses_of_blocks.append((closed.state.T[0], poses))
+        return join_located(poses_of_blocks, self.names, self._pose_order())
 
     def _evaluate(
         self,

@@ -105,8 +105,13 @@ class PerLegEstimate:
         factor, symbols = select_free_parameters(self.robot).display()
         table = zip(self.robot.parameters.entries, self.robot.values, factor, symbols, strict=True)
         rows = [
-            {"name": p.name, "unit": unit, "nominal": p.nominal / one, "estimate": value / one}
-            for p, value, one, unit in table
+            {
+                "name": p.name,
+                "unit": unit,
+                "nominal": p.nominal / unit_in_si,
+                "estimate": value / unit_in_si,
+            }
+            for p, value, unit_in_si, unit in table
         ]
         conditions = self.conditions.tolist()
         return {"robot": self.robot.name, "parameters": rows, "conditions": conditions}

@@ -29,9 +29,9 @@ def joints_to_free(data: Mapping[str, Any]) -> str:
     alternatives = []
     for chosen in data["proposals"]:
         places = dict.fromkeys(f"{added['limb']}.{added['joint']}" for added in chosen)
-        parts = []
+        instructions = []
         for place in places:
             lines = [a["line"] for a in chosen if f"{a['limb']}.{a['joint']}" == place]
-            parts.append(f"behind {place} write `{'` and `'.join(lines)}`")
-        alternatives.append(list_names(parts))
+            instructions.append(f"behind {place} write `{'` and `'.join(lines)}`")
+        alternatives.append(list_names(instructions))
     return "; or ".join(alternatives)

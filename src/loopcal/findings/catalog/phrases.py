@@ -248,8 +248,8 @@ def error_sources(data: Data) -> str:
         if not data[name]:
             continue
         total, sources = data[name]
-        parts = [f"{words[key]} {_quantity(sources[key])}" for key in words if key in sources]
-        sentences.append(f"{name} {_quantity(total)} ({', '.join(parts)})")
+        shares = [f"{words[key]} {_quantity(sources[key])}" for key in words if key in sources]
+        sentences.append(f"{name} {_quantity(total)} ({', '.join(shares)})")
     return "; ".join(sentences) or "none"
 
 
@@ -376,14 +376,14 @@ def violations(data: Data) -> str:
 
 def compared_errors(data: Data) -> str:
     """Return expected errors before and after calibration, and with random poses."""
-    parts = (
+    cases = (
         ("before", "before calibration"),
         ("random", f"with as many random {data['counted']}"),
         ("after", "with this plan"),
     )
     return ", ".join(
         f"{list_names(data[name]) or 'none'} {words}"
-        for name, words in parts
+        for name, words in cases
         if data[name] is not None
     )
 

@@ -98,8 +98,8 @@ def _parse_entries(doc: str) -> dict[str, str]:
     An entry is `name : type` with an indented phrase below it, or `name : phrase`, of which
     several may share a line.
     """
-    parts = SECTION.split(doc)
-    sections = zip(parts[1::2], parts[2::2], strict=True)
+    titles_and_bodies = SECTION.split(doc)
+    sections = zip(titles_and_bodies[1::2], titles_and_bodies[2::2], strict=True)
     text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
     entries: dict[str, str] = {}
     for match in LONG.finditer(text):

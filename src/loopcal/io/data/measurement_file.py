@@ -134,9 +134,10 @@ def _join_tables(
         if of_file
     ]
     with name_files(*(table.path for table in tables)):
-        every = [entry for of_file in read for entry in of_file]
+        entries = [entry for of_file in read for entry in of_file]
         of_poses, on_base = (
-            [entry for entry in every if entry[0].kind.is_of_base == flag] for flag in (False, True)
+            [entry for entry in entries if entry[0].kind.is_of_base == flag]
+            for flag in (False, True)
         )
         data = Measurements(
             robot.name,

@@ -109,8 +109,8 @@ class ValueFile(ABC):
         """Return the numbers of a value; FileError for other text."""
         text = self.text(group, name)
         what, line = self.phrase.format(group, name), self.values[group, name].line + 1
-        parts = [text] if separator is None else text.split(separator)
-        return tuple(parse_number(part.strip(), what, self.path, line) for part in parts)
+        number_texts = [text] if separator is None else text.split(separator)
+        return tuple(parse_number(part.strip(), what, self.path, line) for part in number_texts)
 
     def replace(self, name: Name, text: str) -> Self:
         """Return the file with another text of a value, which is added where it does not exist."""

@@ -161,9 +161,9 @@ def _span_tree(
     group = {base: base} | {name: name for j in joints for name in (j.body_a, j.body_b)}
     chosen, closing = [], []
     for joint in sorted(joints, key=rank):
-        one, other = group[joint.body_a], group[joint.body_b]
-        (closing if one == other else chosen).append(joint)
-        group = {body: one if name == other else name for body, name in group.items()}
+        group_a, group_b = group[joint.body_a], group[joint.body_b]
+        (closing if group_a == group_b else chosen).append(joint)
+        group = {body: group_a if name == group_b else name for body, name in group.items()}
     chosen = [joint for joint in joints if joint in chosen]
     tree: list[GraphJoint] = []
     bodies = {base}

@@ -40,8 +40,10 @@ def list_blocks(graph: JointGraph) -> tuple[Block, ...]:
     carrier = {joint.body_b: joint for joint in graph.tree}
     group = {joint: joint for joint in graph.joints}
     for closing in graph.closing:
-        one, other = (_list_carriers(carrier, body) for body in (closing.body_a, closing.body_b))
-        joined = {group[joint] for joint in {closing} | ({*one} ^ {*other})}
+        carriers_a, carriers_b = (
+            _list_carriers(carrier, body) for body in (closing.body_a, closing.body_b)
+        )
+        joined = {group[joint] for joint in {closing} | ({*carriers_a} ^ {*carriers_b})}
         group = {joint: closing if of in joined else of for joint, of in group.items()}
     blocks = []
     for first in dict.fromkeys(group[joint] for joint in graph.tree):

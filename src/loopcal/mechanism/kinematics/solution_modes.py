@@ -230,8 +230,8 @@ def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, Bo
     for connect in (connect_by_readings, connect_by_poses):
         if not len(rows):
             break
-        found, connected = connect(robot, *_select_both(start, goal, rows))
-        goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(found, len(rows), 1))
+        solutions, connected = connect(robot, *_select_both(start, goal, rows))
+        goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(solutions, len(rows), 1))
         is_other[rows] = ~connected
         rows = rows[~connected]
         unsure = rows[needs_path[rows]]

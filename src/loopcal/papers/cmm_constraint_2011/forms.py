@@ -134,8 +134,8 @@ def compare_estimates(layout: Layout, q: FloatArray, noise: float, name: str) ->
         fit = identify(layout.robot, data, METHODS[name])
         iterations, ranks = max(iterations, fit.history.iterations), ranks | {fit.rank}
         if fit.history.status == paper.status[i] == DescentStatus.CONVERGED:
-            one = PaperRows(layout, q[i : i + 1], sd, noise)
-            unlike.append(float(np.abs(_count_sds(one, fit.robot.values - values[i])).max()))
+            paper_row = PaperRows(layout, q[i : i + 1], sd, noise)
+            unlike.append(float(np.abs(_count_sds(paper_row, fit.robot.values - values[i])).max()))
     middle, largest = (np.median(unlike), max(unlike)) if unlike else (np.nan, np.nan)
     return FormRow(
         noise, name, len(q), len(unlike), iterations, tuple(sorted(ranks)), float(middle), largest

@@ -108,12 +108,12 @@ def compare_arrangements(
 ) -> tuple[Arrangement, ...]:
     """Compare ten groups, one group of as many points, and ten groups with lines along any axis."""
     progress("one plane and one line")
-    one = plan_points(study.robot, 1, GROUPS * POINTS, study.planned.axes, seed, sweeps=1)
+    one_group = plan_points(study.robot, 1, GROUPS * POINTS, study.planned.axes, seed, sweeps=1)
     progress("planes of any axis")
-    free = plan_points(study.robot, GROUPS, POINTS, ("x", "y", "z"), seed, sweeps=1)
+    any_axis = plan_points(study.robot, GROUPS, POINTS, ("x", "y", "z"), seed, sweeps=1)
     return tuple(
         evaluate_arrangement(name, s, seed, trials)
-        for name, s in ((TEN, study), (ONE, one), (ANY, free))
+        for name, s in ((TEN, study), (ONE, one_group), (ANY, any_axis))
     )
 
 

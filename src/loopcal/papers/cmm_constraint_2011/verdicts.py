@@ -128,26 +128,28 @@ def _judge_figure_5(words: Wording, results: Results) -> tuple[Verdict, ...]:
 
 
 def _judge_points(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    ten, one, free = (
+    ten_groups, one_group, any_axis = (
         next(a for a in results.arrangements if a.name == name) for name in (TEN, ONE, ANY)
     )
-    cost_ten, cost_one = (a.cell.compute_median(LS)[POSITION_ALIGNED] for a in (ten, one))
+    cost_ten, cost_one = (
+        a.cell.compute_median(LS)[POSITION_ALIGNED] for a in (ten_groups, one_group)
+    )
     return (
         words.judge(
             "exchange", draws=[{"gain": draw.gain} for draw in results.draws],
-            gain=results.draws[0].gain, least=min(draw.gain for draw in results.draws), ten=ten,
-            one=one,
+            gain=results.draws[0].gain, least=min(draw.gain for draw in results.draws),
+            ten=ten_groups, one=one_group,
         ),
         words.judge(
-            "one_plane", one=one, ten=ten, free=free, noise=NOISE, cost_one=cost_one,
-            cost_ten=cost_ten, limit=1.5 * cost_ten,
+            "one_plane", one=one_group, ten=ten_groups, free=any_axis, noise=NOISE,
+            cost_one=cost_one, cost_ten=cost_ten, limit=1.5 * cost_ten,
         ),
     )  # fmt: skip
 
 
 def _judge_fifty(words: Wording, results: Results) -> tuple[Verdict, ...]:
-    one, five = results.fifties
-    factors = five.compute_factors(PRIOR, ABSOLUTE)[: len(STATISTICS)]
+    one_plane, five_planes = results.fifties
+    factors = five_planes.compute_factors(PRIOR, ABSOLUTE)[: len(STATISTICS)]
     frames = {
         "ls": (ABSOLUTE, LS),
         "nominal": (AT_NOMINAL, LS),
@@ -155,17 +157,18 @@ def _judge_fifty(words: Wording, results: Results) -> tuple[Verdict, ...]:
         "prior": (ALIGNED, PRIOR),
     }
     changes: dict[str, Any] = {
-        name: [_format_change(fifty, *how) for fifty in (one, five)] for name, how in frames.items()
+        name: [_format_change(fifty, *how) for fifty in (one_plane, five_planes)]
+        for name, how in frames.items()
     }
     falls = [
         bool((fifty.compute_factors(method, frame) > 1.0).all())
-        for fifty in (one, five) for frame in FRAMES for method in METHODS
+        for fifty in (one_plane, five_planes) for frame in FRAMES for method in METHODS
     ]  # fmt: skip
     within = [draw.fifties[0].within_five for draw in results.draws]
     return (
         words.judge(
-            "iterations", draws=[{"within": share} for share in within], within=within[0], one=one,
-            five=five, least=min(within), most=max(within),
+            "iterations", draws=[{"within": share} for share in within], within=within[0],
+            one=one_plane, five=five_planes, least=min(within), most=max(within),
         ),
         words.judge(
             "full_poses", falling=sum(falls), ways=len(falls),

@@ -129,9 +129,9 @@ def sweep_noise(
             residual = compute_residuals(study, cell)
             integrated.append([integrate_errors(of_trial[None])[0] for of_trial in residual])
             if i + 1 == iterations:
-                parts = residual[..., :3] / MM, residual[..., 3:]
+                by_dimension = residual[..., :3] / MM, residual[..., 3:]
                 error = (study.truth.values - cell.values)[:, None] / MM
-                rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in (*parts, error)]
+                rms = [np.sqrt(np.mean(x**2, axis=(1, 2))) for x in (*by_dimension, error)]
                 sizes = np.column_stack([*rms, integrated[-1]])
         met = np.array(integrated) <= threshold
         needed = np.where(met.any(axis=0), 1.0 + met.argmax(axis=0), np.inf)

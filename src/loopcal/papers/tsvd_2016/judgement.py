@@ -38,11 +38,13 @@ def judge_groups(
     ends in `angle` in the angle alone.
     """
     groups = []
-    for members in zip(*(one.list_groups() for one in draws), strict=True):
+    for members in zip(*(draw.list_groups() for draw in draws), strict=True):
         numbers = {}
         for name, compared in pairs.items():
             first = 1 if name.endswith("angle") else 0
-            of_pairs = [one.compute_ratio(*pair)[first:2] for one in members for pair in compared]
+            of_pairs = [
+                group.compute_ratio(*pair)[first:2] for group in members for pair in compared
+            ]
             numbers[name] = float(np.max(of_pairs))
         groups.append(numbers)
     return words.judge(claim, draws=groups, groups=len(groups), trials=len(draws[0]), **data)
@@ -55,8 +57,8 @@ def judge_machines(
     shares = []
     for label, numbers in places.items():
         rows = _list_rows(numbers)
-        held = sum(judge_numbers(words.claims[claim], row) is True for row in rows)
-        shares.append({"name": label, "count": held, "of": len(rows)})
+        confirmed_count = sum(judge_numbers(words.claims[claim], row) is True for row in rows)
+        shares.append({"name": label, "count": confirmed_count, "of": len(rows)})
     names = next(iter(places.values()))
     combined = {
         name: (np.max if name.startswith("most") else np.min)(

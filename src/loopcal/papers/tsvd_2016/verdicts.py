@@ -125,9 +125,9 @@ def _describe_curve(situation: Situation, algorithm: str, i: int) -> dict[str, s
 
 def _judge_availability(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     places = {}
-    for one in draws:
-        chosen = one.six.chosen[LS]
-        places[one.six.label] = {
+    for draw in draws:
+        chosen = draw.six.chosen[LS]
+        places[draw.six.label] = {
             "most_diverged": np.isinf(chosen.errors[:, 0]).astype(float),
             "most_iterations": chosen.iterations.astype(float),
         }
@@ -145,12 +145,12 @@ def _judge_availability(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
 def _judge_gain(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     """Judge RE and TSVD against LS with settings that were best on other machines."""
     places, gains = {}, []
-    for one in draws:
-        ridge, tsvd = (one.six.compare_unseen(algorithm) for algorithm in (RE, TSVD))
-        places[one.six.label] = {"most_ridge": ridge.max(axis=1), "most_tsvd": tsvd.max(axis=1)}
+    for draw in draws:
+        ridge, tsvd = (draw.six.compare_unseen(algorithm) for algorithm in (RE, TSVD))
+        places[draw.six.label] = {"most_ridge": ridge.max(axis=1), "most_tsvd": tsvd.max(axis=1)}
         middle = {"ridge": format_pair(np.median(ridge, axis=0)),
                   "tsvd": format_pair(np.median(tsvd, axis=0))}  # fmt: skip
-        gains.append({"name": one.six.label, **middle})
+        gains.append({"name": draw.six.label, **middle})
     return judge_machines(words, "ls_not_best", places, gains=gains)
 
 
@@ -175,11 +175,11 @@ def _judge_best(words: Wording, situations: list[Situation]) -> Verdict:
 def _judge_failure(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     """Judge 5-DOF measurement: LS diverges, RE and TSVD improve the machine."""
     places = {}
-    for one in draws:
-        chosen, before = one.five.chosen, one.errors[BEFORE][:, :2]
+    for draw in draws:
+        chosen, before = draw.five.chosen, draw.errors[BEFORE][:, :2]
         left = {a: (chosen[a].errors[:, :2] / before).max(axis=1) for a in (RE, TSVD)}
         diverged = np.isinf(chosen[LS].errors[:, 0]).astype(float)
-        places[one.five.label] = {
+        places[draw.five.label] = {
             "least_diverged": diverged, "most_ridge": left[RE], "most_tsvd": left[TSVD],
         }  # fmt: skip
     rows = [
@@ -193,41 +193,42 @@ def _judge_failure(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
 def _judge_existence(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     """Judge whether exact 5-DOF measurements leave an error of the poses."""
     places, rows = {}, []
-    for one in draws:
-        left = one.five.exact[:, :2] / one.errors[BEFORE][:, :2]
-        places[one.five.label] = {"least_left": left.max(axis=1)}
-        largest = one.five.exact.max(axis=0)
-        rows.append({"name": one.five.label, "left": f"{largest[0]:.0e} mm / {largest[1]:.0e} deg",
-                     "parameters": float(np.median(one.five.exact[:, 3]))})  # fmt: skip
+    for draw in draws:
+        left = draw.five.exact[:, :2] / draw.errors[BEFORE][:, :2]
+        places[draw.five.label] = {"least_left": left.max(axis=1)}
+        largest = draw.five.exact.max(axis=0)
+        rows.append({"name": draw.five.label, "left": f"{largest[0]:.0e} mm / {largest[1]:.0e} deg",
+                     "parameters": float(np.median(draw.five.exact[:, 3]))})  # fmt: skip
     return judge_machines(words, "no_solution", places, rows=rows)
 
 
 def _judge_parameters(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     """Judge the parameter errors of the paper's RE and TSVD with 5- against 6-DOF measurement."""
     places, rows = {}, []
-    for one in draws:
+    for draw in draws:
         ratios = {
-            a: one.five.chosen[a].errors[:, 3] / one.six.chosen[a].errors[:, 3] for a in (RE, TSVD)
+            a: draw.five.chosen[a].errors[:, 3] / draw.six.chosen[a].errors[:, 3]
+            for a in (RE, TSVD)
         }
-        places[one.name] = {"least_ridge": ratios[RE], "least_tsvd": ratios[TSVD]}
+        places[draw.name] = {"least_ridge": ratios[RE], "least_tsvd": ratios[TSVD]}
         medians = {
             f"{key}_{f}": float(np.median(situation.chosen[a].errors[:, 3]))
             for key, a in (("ridge", RE), ("tsvd", TSVD))
-            for f, situation in (("six", one.six), ("five", one.five))
+            for f, situation in (("six", draw.six), ("five", draw.five))
         }
-        prior = {"six": one.compute_median(PRIOR)[3], "five": one.compute_median(PRIOR_FIVE)[3]}
-        rows.append({"name": one.name, **medians, **prior})
+        prior = {"six": draw.compute_median(PRIOR)[3], "five": draw.compute_median(PRIOR_FIVE)[3]}
+        rows.append({"name": draw.name, **medians, **prior})
     return judge_machines(words, "six_better", places, rows=rows)
 
 
 def _judge_deviation(words: Wording, draws: tuple[Draws, ...]) -> Verdict:
     """Judge both halves: parameters farther from the truth than nominal, and better poses."""
     places, rows = {}, []
-    for one in draws:
-        for situation in one.situations:
+    for draw in draws:
+        for situation in draw.situations:
             used = [situation.chosen[a] for a in (RANKED, RE, TSVD)]
             worse = np.array([c.errors[:, 4] for c in used])
-            left = np.array([(c.errors[:, :2] / one.errors[BEFORE][:, :2]).max(axis=1)
+            left = np.array([(c.errors[:, :2] / draw.errors[BEFORE][:, :2]).max(axis=1)
                              for c in used])  # fmt: skip
             numbers = {"least_worse": worse.min(axis=0), "most_left": left.max(axis=0)}
             places[situation.label] = numbers

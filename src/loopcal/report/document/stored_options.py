@@ -61,9 +61,9 @@ def _list_values(call: ast.Call) -> list[tuple[str, str]]:
 def _describe(node: ast.expr) -> str:
     """Return a value in words."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-        parts = [f"{name.replace('_', ' ')} {value}" for name, value in _list_values(node)]
-        parts = [*(_describe(value) for value in node.args), *parts]
-        return f"{node.func.id} ({', '.join(parts)})" if parts else node.func.id
+        arguments = [f"{name.replace('_', ' ')} {value}" for name, value in _list_values(node)]
+        arguments = [*(_describe(value) for value in node.args), *arguments]
+        return f"{node.func.id} ({', '.join(arguments)})" if arguments else node.func.id
     if isinstance(node, ast.Tuple | ast.List):
         return ", ".join(_describe(item) for item in node.elts)
     if isinstance(node, ast.Constant):

@@ -65,8 +65,8 @@ def draw_accuracy_map(accuracy: AccuracyMap) -> Figure:
     if np.nanmax(accuracy.uncertainty.orientation, initial=0.0) > NEGLIGIBLE:
         quantities.append(("orientation", DISPLAY_UNITS[Dimension.ANGLE]))
     figure = start_figure(1.8 + 3.5 * len(slices), 1.5 + 3.1 * len(quantities))
-    every: Any = figure.subplots(len(quantities), len(slices), squeeze=False)
-    for panels, (name, unit) in zip(every, quantities, strict=True):
+    axes_grid: Any = figure.subplots(len(quantities), len(slices), squeeze=False)
+    for panels, (name, unit) in zip(axes_grid, quantities, strict=True):
         values = getattr(accuracy.uncertainty, name) / unit.factor_to_si
         if layout.y is None:
             _draw_line(panels[0], accuracy, measured, layout.x, name, unit)

@@ -97,10 +97,10 @@ def draw_parameters(fit: FittedParameters) -> Figure:
     columns = max(-(-p // MOST_ROWS), 1)
     chunks = np.array_split(np.arange(p), columns)
     figure = start_figure(8.2 * columns, 1.6 + 0.19 * max(len(chunk) for chunk in chunks))
-    every: Any = figure.subplots(1, 2 * columns, squeeze=False, width_ratios=[3, 2] * columns)
+    axes_grid: Any = figure.subplots(1, 2 * columns, squeeze=False, width_ratios=[3, 2] * columns)
     for i, chunk in enumerate(chunks):
-        _draw_shifts(every[0, 2 * i], fit, chunk)
-        _draw_uncertainties(every[0, 2 * i + 1], fit, chunk)
+        _draw_shifts(axes_grid[0, 2 * i], fit, chunk)
+        _draw_uncertainties(axes_grid[0, 2 * i + 1], fit, chunk)
     handles = [
         Line2D([], [], color=SHIFT, marker="o", ms=DOT, lw=1.2, label="shift, 95 % interval"),
         Line2D([], [], color=WIDTH, marker="s", ms=DOT, ls="none", label="uncertainty (95 %)"),

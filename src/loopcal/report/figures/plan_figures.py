@@ -85,8 +85,8 @@ def draw_plan(plan: Plan) -> Figure:
 def _draw_path(axes: Axes, x: FloatArray, y: FloatArray, via_home: BoolArray) -> None:
     """Draw the path from home through all poses, with an arrow in the middle of each part."""
     for k in range(1, len(x)):
-        parts = [(k - 1, 0, "--"), (0, k, "--")] if via_home[k - 1] else [(k - 1, k, "-")]
-        for start, end, line in parts:
+        segments = [(k - 1, 0, "--"), (0, k, "--")] if via_home[k - 1] else [(k - 1, k, "-")]
+        for start, end, line in segments:
             ends = x[[start, end]], y[[start, end]]
             axes.plot(*ends, color=PALE, lw=THIN, ls=line, zorder=1)
             middle = ends[0].mean(), ends[1].mean()

@@ -104,15 +104,15 @@ def draw_budget(budget: ErrorBudget) -> Figure:
     panels: Any = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
     y = np.arange(len(lines))
     for axes, (kind, unit, place) in zip(panels, kinds, strict=True):
-        parts = np.sqrt([getattr(line, kind) for line in lines]) / unit.factor_to_si
+        rms_by_source = np.sqrt([getattr(line, kind) for line in lines]) / unit.factor_to_si
         total = getattr(budget, kind).rms / unit.factor_to_si
-        axes.barh(y, parts, height=0.6, color=COLORS[5])
+        axes.barh(y, rms_by_source, height=0.6, color=COLORS[5])
         axes.axvline(total, color=DARK, lw=LINE)
         for i, line in enumerate(lines):
             if line.halved is not None:
                 left = line.halved[place] / unit.factor_to_si
                 axes.plot([left], [i], "D", color=COLORS[1], ms=DOT + 1.0)
-        axes.set_xlim(0.0, 1.08 * max(total, parts.max(initial=0.0)))
+        axes.set_xlim(0.0, 1.08 * max(total, rms_by_source.max(initial=0.0)))
         title = f"{kind}: {format_number(total, 3)} {unit.symbol} in all"
         label_axes(axes, f"{kind} [{unit.symbol}]", "", title)
     names = [name_source(line.source.kind, line.source.name) for line in lines]

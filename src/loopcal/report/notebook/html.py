@@ -29,13 +29,13 @@ def render_html(blocks: Iterable[Block]) -> str:
 
     Names are shown as they are written: markup and control characters have no effect.
     """
-    parts = []
+    sections = []
     for is_table, group in groupby(blocks, lambda block: isinstance(block, Table)):
         if is_table:
-            parts += [_render_table(table) for table in group if isinstance(table, Table)]
+            sections += [_render_table(table) for table in group if isinstance(table, Table)]
         elif text := "\n".join(str(block) for block in group).strip("\n"):
-            parts.append(f"<pre>{html.escape(text)}</pre>")
-    return escape(f'<div class="loopcal">{STYLE}{"".join(parts)}</div>', "\n")
+            sections.append(f"<pre>{html.escape(text)}</pre>")
+    return escape(f'<div class="loopcal">{STYLE}{"".join(sections)}</div>', "\n")
 
 
 def _render_table(table: Table) -> str:

@@ -107,8 +107,8 @@ def _list_names(robot: Mechanism, parts: tuple[Part, ...], unit: Unit) -> list[d
     feet = [(limb.name, part) for limb, part in zip(robot.assembly.limbs, parts, strict=False)]
     marks = [(name, describe_part(part)["color"], part.points[0, 0]) for name, part in feet]
     axes = [part for part in parts if part.role == "frame"]
-    seen = "xy" if is_planar(robot) else "xyz"
-    marks += [(name, FRAME_COLORS[i], axes[i].points[0, 1]) for i, name in enumerate(seen)]
+    axis_names = "xy" if is_planar(robot) else "xyz"
+    marks += [(name, FRAME_COLORS[i], axes[i].points[0, 1]) for i, name in enumerate(axis_names)]
     return [
         {"text": escape(name), "color": color, "point": (place / unit.factor_to_si).tolist()}
         for name, color, place in marks

@@ -145,9 +145,9 @@ def _apply_quick_tier(content: StudyContent) -> StudyContent:
 def build_study(content: StudyContent) -> Study:
     """Return the study of the content of a file; raise as `load_study`."""
     file, values, places = content.file, content.values, content.places
-    parts = {key: value for key, value in values.items() if key in SETTINGS}
+    settings_values = {key: value for key, value in values.items() if key in SETTINGS}
     location = places["replicates"][:-1] if "replicates" in places else ()
-    settings = read_record(file, parts, StudySettings, None, location)
+    settings = read_record(file, settings_values, StudySettings, None, location)
     robots = read_robots(content)
     factors: dict[str, Any] = {
         key: read_levels(content, key, LEVELS[key]) for key in LEVELS if key in values
@@ -176,22 +176,24 @@ def _load_pose_files(
     for name, value, place in _list_items(content, "poses") if "poses" in content.values else ():
         stated = value if isinstance(value, dict) else {}
         if "coordinates" in stated:
-            at = (*place, "coordinates")
-            raise file.error("poses are given by a file; write 'file: poses.csv'", at)
+            key_place = (*place, "coordinates")
+            raise file.error("poses are given by a file; write 'file: poses.csv'", key_place)
         if "file" not in stated:
             continue
-        at = (*place, "file")
+        key_place = (*place, "file")
         if len(stated) > 1:
-            raise file.error("a file of poses needs no other setting; remove the others", at)
-        path = find_file_beside(file, stated["file"], at)
+            raise file.error("a file of poses needs no other setting; remove the others", key_place)
+        path = find_file_beside(file, stated["file"], key_place)
         if path is None:
-            raise file.error(f"there is no file {stated['file']!r} beside the study file", at)
+            raise file.error(
+                f"there is no file {stated['file']!r} beside the study file", key_place
+            )
         try:
             read = [load_poses(path, robot).tolist() for _, robot in robots.values()]
         except LoopcalError as error:
-            raise file.error(f"the poses cannot be read: {error}", at) from None
+            raise file.error(f"the poses cannot be read: {error}", key_place) from None
         if any(poses != read[0] for poses in read):
-            raise file.error("the robots of this study read other poses from this file", at)
+            raise file.error("the robots of this study read other poses from this file", key_place)
         coordinates = tuple(tuple(pose) for pose in read[0])
         levels[name] = replace(levels[name], count=len(coordinates), coordinates=coordinates)
     return levels
@@ -244,11 +246,11 @@ def _list_items(content: StudyContent, key: str) -> Iterator[tuple[str, Any, Loc
     if not items:
         raise file.error(f"{key!r} has no level; give at least one", place)
     names = set()
-    for name, value, at in items:
+    for name, value, level_place in items:
         if name in names:
-            raise file.error(f"two levels of {key!r} are named {name!r}; remove one", at)
+            raise file.error(f"two levels of {key!r} are named {name!r}; remove one", level_place)
         names.add(name)
-        yield name, value, at
+        yield name, value, level_place
 
 
 def _name(file: YamlFile, value: Any, place: Location) -> str:

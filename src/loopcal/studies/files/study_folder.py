@@ -149,10 +149,12 @@ def make_header(study: Study) -> StoreHeader:
 
 def _refuse_versions(store: StudyStore) -> None:
     """Raise FileError where blocks of this version would have other numbers."""
-    found = store.header.versions.get(NUMERICS_PART, "")
-    if found != str(NUMERICS):
+    stored_numerics = store.header.versions.get(NUMERICS_PART, "")
+    if stored_numerics != str(NUMERICS):
         code = "store.other-numbers"
-        finding = report_finding(code, part=NUMERICS_PART, found=found, known=str(NUMERICS))
+        finding = report_finding(
+            code, part=NUMERICS_PART, found=stored_numerics, known=str(NUMERICS)
+        )
         raise FileError(finding, store.path)
 
 

@@ -111,9 +111,9 @@ def list_deciding_shares(answer: Answer) -> list[LevelShare]:
     chosen = {share.level for share in answer.shares if share.level in answer.candidates}
     if not chosen:
         return list(answer.shares)
-    for one, other in pairwise(share.level for share in answer.shares):
-        if (one in answer.candidates) != (other in answer.candidates):
-            chosen |= {one, other}
+    for level, next_level in pairwise(share.level for share in answer.shares):
+        if (level in answer.candidates) != (next_level in answer.candidates):
+            chosen |= {level, next_level}
     return [share for share in answer.shares if share.level in chosen]
 
 

@@ -112,14 +112,14 @@ def draw_score(
     columns = min(len(groups), 3)
     rows = -(-len(groups) // columns)
     figure = start_figure(1.4 + 4.2 * columns, 1.2 + 3.4 * rows)
-    every: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes, (title, cells) in zip(every.flat, groups.items(), strict=False):
+    axes_grid: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes, (title, cells) in zip(axes_grid.flat, groups.items(), strict=False):
         _draw_panel(axes, cells, drawing)
         axes.set_title(title, fontsize=LABEL)
-    for axes in every.flat[len(groups) :]:
+    for axes in axes_grid.flat[len(groups) :]:
         axes.set_visible(False)
-    _scale_axes(every, summary, drawing)
-    add_legend(figure, _label(every, summary, drawing), 3 if columns == 1 else 5)
+    _scale_axes(axes_grid, summary, drawing)
+    add_legend(figure, _label(axes_grid, summary, drawing), 3 if columns == 1 else 5)
     return finish_figure(figure, "\n".join(_list_titles(study, summary, drawing, columns)))
 
 
@@ -212,7 +212,7 @@ def _list_kinds(summary: StudySummary, drawing: Drawing) -> list[str]:
     ]
 
 
-def _scale_axes(every: Any, summary: StudySummary, drawing: Drawing) -> None:
+def _scale_axes(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> None:
     """Choose the scales and the ticks of the axes."""
     kinds, along = _list_kinds(summary, drawing), drawing.layout.along
     ends = [
@@ -222,12 +222,12 @@ def _scale_axes(every: Any, summary: StudySummary, drawing: Drawing) -> None:
         if (interval := drawing.find_interval(cell, kind)) is not None
     ]
     if ends and min(ends) > 0.0 and max(ends) > WIDE * min(ends) and "mean" not in kinds:
-        every[0, 0].set_yscale("log")
-        label_logarithmic(every[0, 0].yaxis)
+        axes_grid[0, 0].set_yscale("log")
+        label_logarithmic(axes_grid[0, 0].yaxis)
     ticks = along.list_ticks()
     if along.is_numeric and min(ticks) > 0.0 and max(ticks) > WIDE * min(ticks):
-        every[0, 0].set_xscale("log")
-    for axes in every.flat:
+        axes_grid[0, 0].set_xscale("log")
+    for axes in axes_grid.flat:
         if "mean" in kinds:
             axes.axhline(COVERAGE, color=REFERENCE, lw=THIN, ls="--", zorder=1)
         style = {"rotation": 30, "ha": "right"} if along.is_crowded else {}
@@ -237,14 +237,14 @@ def _scale_axes(every: Any, summary: StudySummary, drawing: Drawing) -> None:
             axes.set_xlim(-0.5, len(ticks) - 0.5)
 
 
-def _label(every: Any, summary: StudySummary, drawing: Drawing) -> list[Any]:
+def _label(axes_grid: Any, summary: StudySummary, drawing: Drawing) -> list[Any]:
     """Write the labels of axes; return the entries of the legend."""
     from matplotlib.lines import Line2D
 
     layout, column, unit = drawing.layout, drawing.column, drawing.unit
-    for axes in every[-1]:
+    for axes in axes_grid[-1]:
         axes.set_xlabel(layout.along.label, fontsize=LABEL)
-    for axes in every[:, 0]:
+    for axes in axes_grid[:, 0]:
         axes.set_ylabel(f"{column.name.replace('_', ' ')} [{unit.symbol}]", fontsize=LABEL)
         axes.tick_params(axis="y", labelsize=SMALL)
     names = {} if layout.color is None else drawing.colors

@@ -142,7 +142,7 @@ def tabulate_all(study: Study, summary: StudySummary) -> Table:
     factors = list_factors(study)
     columns = [word_column(factor) for factor in factors]
     columns += [Column(name) for name in ("trials", "failed", "converged")]
-    parts = ("", " low", " high")
+    suffixes = ("", " low", " high")
     names = [c for c in study.columns[1:] if any(x.find_score(c.name) for x in summary.cells)]
     kinds = ("median", "high", "mean")
     present = [
@@ -153,9 +153,9 @@ def tabulate_all(study: Study, summary: StudySummary) -> Table:
     ]
     words = {"median": " median", "high": " 95 %", "mean": " mean"}
     columns += [
-        Column(f"{c.name}{words[kind]}{part}", "" if c.unit == "1" else c.unit)
+        Column(f"{c.name}{words[kind]}{suffix}", "" if c.unit == "1" else c.unit)
         for c, kind in present
-        for part in parts
+        for suffix in suffixes
     ]
     rows = []
     for cell in summary.cells:

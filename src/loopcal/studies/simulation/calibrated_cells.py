@@ -91,7 +91,7 @@ def _join_blocks(
         trials[0].readings,
         join([t.truth for t in trials]),
         join([f.values for f in fits]),
-        tuple(join(parts) for parts in zip(*(t.measured for t in trials), strict=True)),
+        tuple(join(measured) for measured in zip(*(t.measured for t in trials), strict=True)),
         join([f.outcome for f in fits]),
         iterations.astype(np.int64),
     )

@@ -222,12 +222,14 @@ def _refer_to_fitted(
 
 def _list_knowledge(fits: IdentifiedTrials) -> tuple[FloatArray, FloatArray]:
     """Return directions (t, p, p) and their variances (t, p), as in the posterior of each trial."""
-    parts = []
+    knowledge = []
     for i in range(len(fits.values)):
         chosen = np.array([i])
         prior = None if fits.prior_variance is None else fits.prior_variance[chosen]
-        parts.append(fits.decomposition.take(chosen).knowledge(fits.penalty[chosen], 1.0, prior))
-    return np.stack([part[0] for part in parts]), np.stack([part[1] for part in parts])
+        knowledge.append(
+            fits.decomposition.take(chosen).knowledge(fits.penalty[chosen], 1.0, prior)
+        )
+    return np.stack([part[0] for part in knowledge]), np.stack([part[1] for part in knowledge])
 
 
 def fit_each(cell: PreparedCell, trials: Trials) -> FittedTrials:

@@ -278,7 +278,7 @@ def _parse_probes(cfg: KlipperConfig) -> _Probes:
     return probes
 
 
-def _list_records(cfg: KlipperConfig, name: str, parts: Sequence[str]) -> list[str]:
+def _list_records(cfg: KlipperConfig, name: str, suffixes: Sequence[str]) -> list[str]:
     """Return the names of the records `height0`, `height1`, ... of which any part exists.
 
     Klipper reads up to the first number that is missing, and ignores all records behind it.
@@ -288,14 +288,14 @@ def _list_records(cfg: KlipperConfig, name: str, parts: Sequence[str]) -> list[s
     FileError : a record lacks one of its parts (suffixes of its name), or a number is left out; at
         a line of the record, or of the next one.
     """
-    pattern = re.compile(rf"{name}(\d+)({'|'.join(parts)})")
+    pattern = re.compile(rf"{name}(\d+)({'|'.join(suffixes)})")
     records: dict[int, list[str]] = {}
     for section, option in cfg.values:
         if section == PROBED and (match := pattern.fullmatch(option)):
             records.setdefault(int(match[1]), []).append(option)
     for place, number in enumerate(sorted(records)):
         present = records[number]
-        lacking = [part for part in parts if f"{name}{number}{part}" not in present]
+        lacking = [part for part in suffixes if f"{name}{number}{part}" not in present]
         code = "files.probe-part-missing" if lacking else "files.probe-left-out"
         if lacking or number != place:
             missing = f"{name}{number}{lacking[0]}" if lacking else f"{name}{place}"

@@ -125,7 +125,7 @@ def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
         (welds if isinstance(closure, Weld) else balls).append(closure)
     _check_motors(urdf, closures, motors)
     constraints = [_build_constraint(urdf, constraint) for constraint in urdf.constraints]
-    welds += [closure for one in constraints for closure in one if isinstance(closure, Weld)]
+    welds += [closure for group in constraints for closure in group if isinstance(closure, Weld)]
     # a ball joint at the origin of a movable joint has no origin of its own to shift
     centers = {
         joint.body_a if not joint.origin_a else joint.body_b
@@ -138,10 +138,10 @@ def read_mechanism(urdf: Urdf, path: Path | None) -> UrdfMechanism:
             for joint in _list_joints(urdf, closures.overrides)
         ),
         *balls,
-        *(closure for one in constraints for closure in one if isinstance(closure, GraphJoint)),
+        *(closure for group in constraints for closure in group if isinstance(closure, GraphJoint)),
     ]
-    found = [_find_link(urdf, name) for pair in closures.pairs for name in pair]
-    ends = frozenset(link for link in found if link is not None)
+    links = [_find_link(urdf, name) for pair in closures.pairs for name in pair]
+    ends = frozenset(link for link in links if link is not None)
     try:
         bodies = weld_bodies(urdf.root, welds)
         graph = assemble_graph(urdf.root, [bodies.move(joint) for joint in joints], motors)

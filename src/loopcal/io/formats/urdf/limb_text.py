@@ -107,12 +107,12 @@ def _format_far_shifts(limb: str, joint: GraphJoint, element: str, place: FloatA
     """Return entries of `parameters:`, the shifts of a far origin as shifts of the next place."""
     entries = []
     for axis in joint.shifts:
-        parts = -place["xyz".index(axis), :3]
+        coefficients = -place["xyz".index(axis), :3]
         maps = ", ".join(
             f"{{limb: {quote_scalar(limb)}, element: {quote_scalar(element)}, axis: {letter}, "
-            f"coefficient: {float(part)!r}}}"
-            for letter, part in zip("xyz", parts, strict=True)
-            if abs(part) > ZERO
+            f"coefficient: {float(coefficient)!r}}}"
+            for letter, coefficient in zip("xyz", coefficients, strict=True)
+            if abs(coefficient) > ZERO
         )
         name = quote_scalar(f"{limb}.{joint.origin_b}.{axis}")
         entries.append(f"  - {{name: {name}, length: 0, maps: [{maps}]}}\n")

@@ -79,8 +79,8 @@ class TargetKind(Kind):
             self, targets=targets, T_base_frame=check_pose(self.T_base_frame, "T_base_frame")
         )
         if self.places is not None:
-            one = np.ndim(self.places[0]) == 0 if len(self.places) else False
-            places = [self.places] if one else self.places
+            is_single_place = np.ndim(self.places[0]) == 0 if len(self.places) else False
+            places = [self.places] if is_single_place else self.places
             shape = (len(targets), 3)
             if len(places) != len(targets):
                 raise DataError(
