@@ -8,6 +8,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -42,6 +43,15 @@ def list_lazy_imports(tree: ast.Module) -> set[tuple[str, str]]:
 
 def test_packages_with_lazy_names_are_found() -> None:
     assert {"loopcal.apply", "loopcal.diagnose", "loopcal.io"} <= {*map(name_package, PACKAGES)}
+
+
+@pytest.mark.parametrize("path", sorted(SOURCE.rglob("__init__.py")), ids=name_package)
+def test_no_name_that_a_package_exports_is_that_of_its_module(path) -> None:
+    package, folder = import_module(name_package(path)), path.parent
+    modules = {file.stem for file in folder.glob("*.py")}
+    modules |= {file.parent.name for file in folder.glob("*/__init__.py")}
+    exported = {name: getattr(package, name, None) for name in modules - {"__init__"}}
+    assert not [n for n, value in exported.items() if not isinstance(value, ModuleType | None)]
 
 
 @pytest.mark.parametrize("path", PACKAGES, ids=name_package)
