@@ -139,7 +139,7 @@ SHARE = 1e-5
 """Of a standard deviation: how far two descents may end from each other."""
 
 
-def compare_fits(name: str, data: Measurements, order: Array | None = None) -> None:
+def check_estimate(name: str, data: Measurements, order: Array | None = None) -> None:
     """Assert that data lead to the values of `measure_robot`, within a share of their sd."""
     robot = load_cached_robot(name)
     result = identify(robot, data, options=OPTIONS)
@@ -157,10 +157,10 @@ def test_fit_does_not_depend_on_the_frame_of_the_instrument(name: str) -> None:
     G = geometry.invert_pose(make_motion(load_cached_robot(name), seed=7))
     points = rows.measured.reshape(-1, 3) @ G[:3, :3].T + G[:3, 3]
     moved = replace(rows, measured=points.reshape(rows.measured.shape))
-    compare_fits(name, replace(data, observations=(moved,)))
+    check_estimate(name, replace(data, observations=(moved,)))
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_fit_does_not_depend_on_the_order_of_poses(name: str) -> None:
     data = measure_robot(name)
-    compare_fits(name, data.take(np.random.default_rng(8).permutation(POSES)))
+    check_estimate(name, data.take(np.random.default_rng(8).permutation(POSES)))

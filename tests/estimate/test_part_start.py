@@ -91,7 +91,7 @@ def fit_both(
     return fit, identify(DELTA, data, options=options)
 
 
-def require_same_bits(fit: Identification, plain: Identification) -> None:
+def check_same_bits(fit: Identification, plain: Identification) -> None:
     """Compare two fits, and their iterations, bit for bit."""
     assert np.array_equal(fit.robot.values, plain.robot.values)
     assert np.array_equal(fit.history.cost, plain.history.cost)
@@ -156,8 +156,8 @@ def test_both_descents_together_take_the_steps_that_are_allowed(monkeypatch, dat
 
     fit = identify(DELTA, data, LeastSquares())
     steps = fit.history.iterations  # the last one is taken without another evaluation
-    require_same_bits(identify(DELTA, data, options=limit(steps - 1)), fit)
-    require_same_bits(*fit_both(monkeypatch, data, limit(steps - 2)))
+    check_same_bits(identify(DELTA, data, options=limit(steps - 1)), fit)
+    check_same_bits(*fit_both(monkeypatch, data, limit(steps - 2)))
 
 
 @pytest.mark.parametrize("period", [2, 3, 10, 49, 50, 100, 160])
@@ -193,13 +193,13 @@ def test_poses_that_are_degenerate_at_even_strides_give_a_part_of_full_rank(monk
     ids=["loss", "chosen-rank", "out-of-steps", "closure"],
 )
 def test_other_fits_begin_with_all_poses(monkeypatch, data, options):
-    require_same_bits(*fit_both(monkeypatch, data, options))
+    check_same_bits(*fit_both(monkeypatch, data, options))
 
 
 def test_a_fit_with_an_earlier_calibration_begins_with_all_poses(monkeypatch, data):
     earlier = identify(DELTA, measure(list_poses(40), seed=1), LeastSquares())
     options = FitOptions(method=LeastSquares(), prior=prior_from(earlier.posterior))
-    require_same_bits(*fit_both(monkeypatch, data, options))
+    check_same_bits(*fit_both(monkeypatch, data, options))
 
 
 def test_a_part_that_does_not_determine_all_parameters_is_not_used(monkeypatch):
@@ -208,7 +208,7 @@ def test_a_part_that_does_not_determine_all_parameters_is_not_used(monkeypatch):
     poses[np.setdiff1d(np.arange(MANY), others[:300])] = poses[0]  # 300 poses that are no part
     fit, plain = fit_both(monkeypatch, measure(poses), FitOptions(method=LeastSquares()))
     assert plain.spectrum.rank == len(plain.free_parameters)
-    require_same_bits(fit, plain)
+    check_same_bits(fit, plain)
 
 
 def test_parts_are_only_of_many_poses_that_readings_determine(data):

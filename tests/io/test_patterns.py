@@ -95,10 +95,22 @@ def test_patterns_that_take_memory_are_refused_before_they_are_compiled(
         refuse_pattern(file, pattern, ("ignore",))
 
 
-def test_usual_patterns_are_accepted(tmp_path) -> None:
-    file = read_yaml(write(tmp_path, "p.yaml", "ignore: ''\n"), "profile")
-    for pattern in (r"\d{4}-\d{2}-\d{2}", r"^(?!Total)\w{1,30}$", r"(?P<pose>[A-Z]{2,}\d*)", "{}"):
-        refuse_pattern(file, pattern, ("ignore",))
+@pytest.mark.parametrize(
+    ("pattern", "text", "occurs"),
+    [
+        (r"\d{4}-\d{2}-\d{2}", "at 2026-01-31, 10:00", True),
+        (r"^(?!Total)\w{1,30}$", "pose_7", True),
+        (r"^(?!Total)\w{1,30}$", "Total", False),
+        (r"(?P<pose>[A-Z]{2,}\d*)", "x AB12", True),
+        ("{}", "a {} b", True),
+    ],
+)
+def test_usual_patterns_are_accepted_and_match(
+    pattern: str, text: str, occurs: bool, tmp_path
+) -> None:
+    clock = make_clock(tmp_path, pattern)
+    refuse_pattern(clock.file, pattern, ("ignore",))
+    assert clock.search(compile_pattern(pattern), text, ("ignore",)) is occurs
 
 
 def test_slow_profile_is_refused_at_the_line_of_its_pattern(tmp_path) -> None:

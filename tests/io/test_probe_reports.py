@@ -73,7 +73,7 @@ def write_g30(points, heights, name: str = "report.txt") -> None:
     Path(name).write_text("\n".join(lines) + "\n")
 
 
-def calibrate_with(words: str, truth, tolerance: float = 6e-6) -> None:
+def check_calibration(words: str, truth, tolerance: float = 6e-6) -> None:
     """Import and calibrate; the identified parameters are the true ones."""
     assert run(f"import {words} -o printer.yaml --data heights.csv --force") == 0
     assert run("calibrate printer.yaml heights.csv -o run --method ls --force") in (0, 2)
@@ -91,7 +91,7 @@ def test_g30_of_marlin_leads_to_the_truth() -> None:
     heights = probe(robot, truth, POINTS)
     assert np.ptp(heights) > 0.1
     write_g30(POINTS, heights)
-    calibrate_with("m503.gcode --probes report.txt", truth)
+    check_calibration("m503.gcode --probes report.txt", truth)
 
 
 def test_a_height_entered_as_z_would_move_the_radius_in_the_wrong_direction() -> None:
@@ -141,7 +141,7 @@ def test_a_dry_run_of_g33_leads_to_the_truth() -> None:
             "End DRY-RUN                                   std dev:0.210",
         ]
     Path("g33.txt").write_text("\n".join(lines))
-    calibrate_with("m503.gcode --probes g33.txt", truth)
+    check_calibration("m503.gcode --probes g33.txt", truth)
 
 
 def test_positions_of_m114_are_touches_by_hand() -> None:
@@ -152,7 +152,7 @@ def test_positions_of_m114_are_touches_by_hand() -> None:
         for (x, y), h in zip(POINTS, heights, strict=True)
     ]
     Path("m114.txt").write_text("\n".join(lines))
-    calibrate_with("m503.gcode --probes m114.txt", truth)
+    check_calibration("m503.gcode --probes m114.txt", truth)
 
 
 def test_g32_of_reprapfirmware_with_the_points_of_bed_g() -> None:
@@ -165,7 +165,7 @@ def test_g32_of_reprapfirmware_with_the_points_of_bed_g() -> None:
     )
     bed = [f"G30 P{i} X{x:.3f} Y{y:.3f} Z-99999 ; point" for i, (x, y) in enumerate(POINTS)]
     Path("bed.g").write_text("M561\n" + "\n".join(bed) + " S6\n")
-    calibrate_with("config.g --probes report.txt --probes bed.g", truth)
+    check_calibration("config.g --probes report.txt --probes bed.g", truth)
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_a_height_map_of_reprapfirmware() -> None:
     ):
         stated = f"{first}-60.00,60.00,-60.00,60.00,75.00,30.00,30.00,5,5"
         Path("heightmap.csv").write_text("\n".join([head, titles, stated, *rows]) + "\n")
-        calibrate_with("config.g --probes heightmap.csv", truth)
+        check_calibration("config.g --probes heightmap.csv", truth)
         assert lc.load_run("run").result["fit"]["dof"] > 0
     Path("heightmap.csv").write_text("\n".join([head, titles, stated, *rows[:-1]]))
     assert run("import config.g --probes heightmap.csv -o p.yaml --data h.csv") == 1
@@ -193,7 +193,7 @@ def test_a_probe_beside_the_nozzle_is_taken_into_account() -> None:
     Path("m503.gcode").write_text(MARLIN + "M851 X20.00 Y-10.00 Z-1.50\n")
     robot, truth = make_truth("m503.gcode")
     write_g30(POINTS, probe(robot, truth, POINTS, offset))
-    calibrate_with("m503.gcode --probes report.txt", truth)
+    check_calibration("m503.gcode --probes report.txt", truth)
 
 
 def test_the_offset_of_a_probe_may_be_in_another_file() -> None:
@@ -204,7 +204,7 @@ def test_the_offset_of_a_probe_may_be_in_another_file() -> None:
     bed = [f"g30p{i}x{x:.3f}y{y:.3f}z-99999" for i, (x, y) in enumerate(POINTS)]
     Path("bed.g").write_text("\n".join(bed))
     Path("probe.g").write_text("G31 P500 X15 Y5 Z2.5 ; inductive probe\n")
-    calibrate_with("config.g --probes report.txt --probes bed.g --probes probe.g", truth)
+    check_calibration("config.g --probes report.txt --probes bed.g --probes probe.g", truth)
 
 
 @pytest.mark.parametrize(
