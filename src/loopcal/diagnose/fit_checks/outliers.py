@@ -26,6 +26,7 @@ import numpy as np
 
 from loopcal.diagnose.fit_checks.influence import Influence
 from loopcal.diagnose.fit_checks.outlier_search import (
+    PartialFit,
     find_rivals,
     fit_without,
     list_suspected_in_turn,
@@ -44,7 +45,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.presentation import TableResult
-from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 MOST_ROBUST = 20_000
 """Blocks that a robust fit is made from: it is where the others are compared, not a result."""
@@ -203,19 +204,10 @@ def find_outliers(
     else:
         groups = list_suspected_in_turn(search.fits)
     fits, end, tested = search.fits, search.end, search.whole.tested
-    always = np.all([partial.excluded for partial in fits], axis=0)
+    always = np.all([each.excluded for each in fits], axis=0)
     ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
-    p_value, ratio, influence = end.p_value(), np.sqrt(search.whole.ratio), end.influence
-    outliers = tuple(
-        Outlier(
-            labels[i],
-            float(end.ratio[i] * influence.degrees[i]),
-            int(influence.degrees[i]),
-            float(p_value[i]),
-        )
-        for i in np.argsort(p_value, kind="stable")
-        if always[i] and not ambiguous[i]
-    )
+    outliers = _list_outliers(end, labels, always & ~ambiguous)
+    ratio = np.sqrt(search.whole.ratio)
     conflicts = tuple(
         Conflict(tuple(labels[i] for i in np.flatnonzero(group)), float(ratio[group].max()))
         for group in groups
@@ -234,7 +226,7 @@ def find_outliers(
         level,
         tested,
         labels,
-        influence,
+        end.influence,
         end.scale,
         summary,
     )
@@ -257,6 +249,18 @@ def _refit_robustly(
     except LoopcalError:
         return fit
     return robust if robust.converged else fit
+
+
+def _list_outliers(
+    end: PartialFit, labels: tuple[tuple[str, ...], ...], is_outlier: BoolArray
+) -> tuple[Outlier, ...]:
+    """Return the outliers among the blocks (u,) of a fit without them, the least probable first."""
+    p_value, degrees = end.p_value(), end.influence.degrees
+    return tuple(
+        Outlier(labels[i], float(end.ratio[i] * degrees[i]), int(degrees[i]), float(p_value[i]))
+        for i in np.argsort(p_value, kind="stable")
+        if is_outlier[i]
+    )
 
 
 def _weigh_blocks(problem: Problem, z: FloatArray, start: Start, member: IntArray) -> FloatArray:

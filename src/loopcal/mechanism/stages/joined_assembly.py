@@ -124,6 +124,51 @@ def join_stages(
     StageError
         A stage without actuators, or an actuator of two stages.
     """
+    _refuse_wrong_drives(stages)
+    assemblies = [(stage.name, stage.assembly) for stage in stages]
+    return Assembly(
+        name,
+        tuple(_rename_limb(prefix, limb) for prefix, part in assemblies for limb in part.limbs),
+        tuple(actuator for _, part in assemblies for actuator in part.actuators),
+        AXES,
+        controlled,
+        stages[-1].mount,
+        tuple(
+            replace(parameter, name=f"{prefix}.{parameter.name}")
+            for prefix, part in assemblies
+            for parameter in part.parameters
+        ),
+        tuple(
+            _rename_map(prefix, part, entry) for prefix, part in assemblies for entry in part.maps
+        ),
+        tuple(
+            StageMap(
+                tuple(f"{prefix}.{name}" for name in shared.inputs),
+                tuple(_rename_address(prefix, part, address) for address in shared.outputs),
+                shared,
+            )
+            for prefix, part in assemblies
+            for shared in part.shared
+        ),
+        tool,
+        workspace,
+        source,
+        tuple(f"{prefix}.{name}" for prefix, part in assemblies for name in part.stored_parameters),
+        tuple(
+            CommonError(
+                f"{prefix}.{error.name}",
+                tuple(f"{prefix}.{name}" for name in error.parameters),
+                error.tolerance,
+            )
+            for prefix, part in assemblies
+            for error in part.common_errors
+        ),
+        tuple(stages),
+    )
+
+
+def _refuse_wrong_drives(stages: Sequence[AttachedStage]) -> None:
+    """Raise StageError for a stage without actuators, and for an actuator of two stages."""
     owner: dict[str, str] = {}
     for i, stage in enumerate(stages):
         if not stage.assembly.actuators:
@@ -141,44 +186,6 @@ def join_stages(
                     i,
                 )
         owner |= dict.fromkeys(own, stage.name)
-    parts = [(stage.name, stage.assembly) for stage in stages]
-    return Assembly(
-        name,
-        tuple(_rename_limb(prefix, limb) for prefix, part in parts for limb in part.limbs),
-        tuple(actuator for _, part in parts for actuator in part.actuators),
-        AXES,
-        controlled,
-        stages[-1].mount,
-        tuple(
-            replace(parameter, name=f"{prefix}.{parameter.name}")
-            for prefix, part in parts
-            for parameter in part.parameters
-        ),
-        tuple(_rename_map(prefix, part, entry) for prefix, part in parts for entry in part.maps),
-        tuple(
-            StageMap(
-                tuple(f"{prefix}.{name}" for name in shared.inputs),
-                tuple(_rename_address(prefix, part, address) for address in shared.outputs),
-                shared,
-            )
-            for prefix, part in parts
-            for shared in part.shared
-        ),
-        tool,
-        workspace,
-        source,
-        tuple(f"{prefix}.{name}" for prefix, part in parts for name in part.stored_parameters),
-        tuple(
-            CommonError(
-                f"{prefix}.{error.name}",
-                tuple(f"{prefix}.{name}" for name in error.parameters),
-                error.tolerance,
-            )
-            for prefix, part in parts
-            for error in part.common_errors
-        ),
-        tuple(stages),
-    )
 
 
 def _rename_limb(prefix: str, limb: Limb) -> Limb:
