@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine import numpy_engine
+from loopcal.engine.memory import keep_freed_memory
 from loopcal.engine.program import (
     ClosureBlocks,
     ParameterMap,
@@ -117,6 +118,7 @@ def _find_loader(choice: str, name: str) -> Callable[[], Callable[[str], Engine]
 @cache
 def get_current_engine() -> Engine:
     """Return the engine that LOOPCAL_ENGINE names, chosen once in a process."""
+    keep_freed_memory()
     return select_engine(os.environ.get(VARIABLE, ""))
 
 

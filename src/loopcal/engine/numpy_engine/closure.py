@@ -18,6 +18,11 @@ from loopcal.engine.numpy_engine.householder import SMALLEST, triangularize
 from loopcal.engine.program import LENGTH, PITCH, Block, ClosureBlocks, Group, Program, Slot, State
 from loopcal.typing import FloatArray
 
+CHUNK = 5120
+"""Rows computed together: few enough for the cache of a processor, many enough that Python's share
+is small.
+"""
+
 
 def linearize(
     program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
@@ -253,6 +258,12 @@ def list_coordinates(
             if columns[0] >= 0:
                 values[j] = q[:, :, columns].transpose(2, 0, 1)
     return flat
+
+
+def divide_rows(count: int) -> list[slice]:
+    """Return parts of rows that are computed together, at most CHUNK of them and equally many."""
+    step = -(-count // max(-(-count // CHUNK), 1))
+    return [slice(first, first + step) for first in range(0, count, max(step, 1))]
 
 
 def split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:

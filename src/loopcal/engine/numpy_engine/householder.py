@@ -18,13 +18,13 @@ PART = 8
 """Rows of a part of many rows that are folded, over their columns."""
 
 
-def triangularize(matrix: FloatArray, columns: int) -> FloatArray:
+def triangularize(matrix: FloatArray, columns: int, *, overwrite: bool = False) -> FloatArray:
     """Return Q' matrix (r, c, batch), upper triangular in its first columns, by reflections.
 
     Each reflects a column x to alpha e0 by v = x - alpha e0, and another one y to
-    y + v (x'y - alpha y0) / (alpha v0).
+    y + v (x'y - alpha y0) / (alpha v0). With `overwrite` the result takes the matrix's memory.
     """
-    m = matrix.copy()
+    m = matrix if overwrite else matrix.copy()
     for j in range(count_reflections(len(m), columns)):
         v, right = m[j:, j], m[j:, j + 1 :]
         products = np.einsum("i...,ij...->j...", v, m[j:, j:])

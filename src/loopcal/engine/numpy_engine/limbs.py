@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.engine.numpy_engine.closure import Chain, PlacedLinks, dot, place_links
+from loopcal.engine.numpy_engine.closure import Chain, PlacedLinks, divide_rows, dot, place_links
 from loopcal.engine.program import CONVERGED, NOT_FINITE, STALLED, Group, Program, State
 from loopcal.typing import FloatArray
 
@@ -28,8 +28,8 @@ def have_closed_form(program: Program) -> bool:
     )
 
 
-def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State, chunk: int) -> State:
-    """Return the state (t, n) with the platform of the start, `chunk` rows at a time.
+def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State) -> State:
+    """Return the state (t, n) with the platform of the start.
 
     A prismatic joint stays on the side of the start's value where the distance increases, or
     decreases.
@@ -43,8 +43,7 @@ def close_limbs(program: Program, e: FloatArray, q: FloatArray, start: State, ch
             links, shape = place_links(group, e), (t, n, *values.shape[2:])
             filled = group.insert_driven(np.broadcast_to(values, shape), q)
             flat = filled.reshape(t * n, *shape[2:])  # a copy where the start is broadcast
-            for first in range(0, t * n, chunk):
-                part = slice(first, first + chunk)
+            for part in divide_rows(t * n):
                 platform = T[part, :3].transpose(1, 2, 0).copy()
                 theta = flat[part].transpose(2, 1, 0).copy()
                 placed = links.select(np.arange(t * n)[part] // n)

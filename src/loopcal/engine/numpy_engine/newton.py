@@ -19,6 +19,7 @@ from loopcal.engine.numpy_engine.certificate import has_driven_rods
 from loopcal.engine.numpy_engine.closure import (
     Chain,
     PlacedLinks,
+    divide_rows,
     dot,
     exponential,
     list_coordinates,
@@ -44,8 +45,6 @@ from loopcal.engine.program import (
 )
 from loopcal.typing import BoolArray, FloatArray
 
-CHUNK = 2048
-"""Rows solved together: few enough for the cache, many enough that Python's share is small."""
 RESIDUAL, STEP = 1e-13, 1e-7
 """Residual and last step of a converged row, relative to the robot's size."""
 NEAR, NEARER = 1e-2, 0.1
@@ -87,32 +86,6 @@ class Iterate(NamedTuple):
         return Iterate(*(np.where(better, b, a) for a, b in zip(self, trial, strict=True)))
 
 
-class Reduced(NamedTuple):
-    """Closure of N rows at coordinates (.., N), the joints of the limbs eliminated.
-
-    tops : for each group the rows (u, u + m + 1, k, N) that determine its joints. low : (r, m + 1,
-        N) the other rows, or (r, m + N, 1) where all rows have one Jacobian. inner : (N,) square of
-        the residual in `tops`. norm : (N,) of the whole residual [m]. sign, pivot : (N,) as in
-        `Iterate`, of the limbs.
-    """
-
-    coordinates: FloatArray
-    tops: list[FloatArray]
-    low: FloatArray
-    inner: FloatArray
-    norm: FloatArray
-    sign: FloatArray
-    pivot: FloatArray
-
-    def select(self, keep: np.ndarray) -> Reduced:
-        """Return these rows."""
-        tops = [top.take(keep, axis=-1) for top in self.tops]
-        taken = {
-            name: getattr(self, name).take(keep, axis=-1) for name in self._fields if name != "tops"
-        }
-        return Reduced(tops=tops, **taken)
-
-
 class Solved(NamedTuple):
     """The last iterates of N rows with their status and their numbers of steps."""
 
@@ -135,7 +108,7 @@ def solve(
 ) -> State:
     """Find the pose and the joints that close every loop; see `loopcal.engine.solve`."""
     if not program.freedoms and free and have_closed_form(program):
-        return close_limbs(program, e, q, start, CHUNK)
+        return close_limbs(program, e, q, start)
     t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
     links = [place_links(g, e) for g in program.groups]
     unknown = [g.unknown_joints(free) for g in program.groups]
@@ -145,8 +118,7 @@ def solve(
     together = has_one_start and has_driven_rods(program) and not free and task is None
     goals = None if goal is None else goal.T.reshape(t * n, 4, 4)[:, :3].transpose(1, 2, 0)
     chunks = []
-    for first in range(0, max(t * n, 1), CHUNK):
-        part = slice(first, first + CHUNK)
+    for part in divide_rows(t * n) or [slice(0)]:
         rows = np.arange(t * n)[part]
         placed = [p.select(rows // n) for p in links]
         equations = _Equations(program, unknown, redundant, placed, task, rows)
@@ -163,12 +135,12 @@ def _iterate(
     goal: FloatArray | None,
     together: bool,
 ) -> Solved:
-    """Iterate one chunk until every row has converged, is near its goal (3, 4, N), or failed.
+    """Iterate rows until each has converged, is near its goal (3, 4, N), or failed.
 
     together : whether all rows begin with one Jacobian.
     """
-    size, N = equations.program.size, coordinates.shape[1]
-    program = equations.program
+    program, N = equations.program, coordinates.shape[1]
+    size = program.size
     closed_gap, short_step = RESIDUAL * size, STEP * size
     may_stay_open = program.may_stay_open or program.sigma is not None
     status, steps = np.full(N, EXHAUSTED, np.int8), np.full(N, max_iterations)
@@ -198,21 +170,22 @@ def _iterate(
                 equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
                 share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
             fraction = share * np.minimum(1.0, 0.5 * size / np.maximum(now.length, 1e-300))
-            length = fraction * now.length
-            reduced = equations.reduce(equations.move(now, fraction))
-            # the next step of such rows would be below rounding
-            end = (length <= short_step) & (reduced.norm <= closed_gap)
-            if end.any() and step + 1 < max_iterations:
-                last = now._replace(coordinates=reduced.coordinates, residual=reduced.norm)
-                last = last if end.all() else last.select(np.flatnonzero(end))
-                _store(done, alive[end], last, CONVERGED, step + 1)
+            length, coordinates = fraction * now.length, equations.move(now, fraction)
+            # where the loops are closed after such a step, the next one would be below rounding
+            is_short = length <= short_step
+            if is_short.any() and step + 1 < max_iterations:
+                residual = equations.measure(coordinates, np.flatnonzero(is_short))
+                end = residual <= closed_gap
+                last = now._replace(coordinates=coordinates, residual=residual)
+                _store(done, alive[end], last.select(np.flatnonzero(end)), CONVERGED, step + 1)
                 if end.all():
                     return done
                 keep = np.flatnonzero(~end)
                 equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
                 share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
-                fraction, length, reduced = fraction[keep], length[keep], reduced.select(keep)
-            trial = equations.complete(reduced)
+                fraction, length = fraction[keep], length[keep]
+                coordinates = coordinates.take(keep, axis=1)
+            trial = equations.evaluate(coordinates)
             low = trial.reducible <= closed_gap
             better = low | (trial.residual <= (1 - 1e-4 * fraction) * now.residual)
             better |= trial.reducible <= 0.5 * now.reducible
@@ -257,10 +230,6 @@ class _Equations:
 
         together : all rows have the Jacobian of the first one.
         """
-        return self.complete(self.reduce(coordinates, together))
-
-    def reduce(self, coordinates: FloatArray, together: bool = False) -> Reduced:
-        """Return closure at these coordinates, the joints of each limb eliminated."""
         program, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
         T, limbs = coordinates[:12].reshape(3, 4, N), split_joints(program, coordinates)
         if together:
@@ -280,20 +249,14 @@ class _Equations:
                 inner += np.add.reduce(np.add.reduce(top[:, -1] ** 2, axis=0), axis=0)
         norm = np.sqrt(inner + np.add.reduce(low[:, m:] ** 2, axis=0).reshape(N))
         sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
-        return Reduced(coordinates, tops, low, inner, norm, sign, pivot)
-
-    def complete(self, reduced: Reduced) -> Iterate:
-        """Return the Newton step of reduced closure and its measures."""
-        coordinates, tops, low, inner, norm, sign, pivot = reduced
-        m, N = len(self.program.freedoms), len(norm)
         count = count_reflections(len(low), m)
-        low = triangularize(low, m)
+        low = triangularize(low, m, overwrite=True)
         diagonal = np.diagonal(low[:m, :m])
         sign = sign * (-1.0) ** count * np.multiply.reduce(np.sign(diagonal), axis=-1)
         y = back_substitute(low[:m, :m], -low[:m, m:]).reshape(m, N)
         reducible = np.sqrt(inner + np.add.reduce(low[:m, m:] ** 2, axis=0).reshape(N))
         twist = np.zeros((6, N))
-        twist[list(self.program.freedoms)] = y
+        twist[list(program.freedoms)] = y
         turns = [top[:, -1] for top in tops]
         for i, top in enumerate(tops):
             if u := len(top):
@@ -302,6 +265,26 @@ class _Equations:
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
         length = self._length(twist, turns)
         return Iterate(coordinates, step, norm, reducible, length, sign, pivot)
+
+    def measure(self, coordinates: FloatArray, of: np.ndarray) -> FloatArray:
+        """Return the norm of the residual (N,) [m] of some rows; infinite elsewhere, and where
+        redundant actuators weigh it.
+        """
+        program, out = self.program, np.full(coordinates.shape[1], np.inf)
+        if self.redundant:
+            return out
+        equations, coordinates = self.select(of), coordinates.take(of, axis=1)
+        T, square = coordinates[:12].reshape(3, 4, len(of)), np.zeros(len(of))
+        values = split_joints(program, coordinates)
+        limbs = zip(program.groups, equations.links, values, strict=True)
+        for group, links, theta in limbs:
+            residual = Chain(group, links, T, theta, program.size).residual()
+            square += np.add.reduce(np.add.reduce(residual**2, axis=0), axis=0)
+        if self.task is not None:
+            residual, _ = self.task(T.transpose(2, 0, 1), equations.rows)
+            square += np.add.reduce(residual**2, axis=1)
+        out[of] = np.sqrt(square)
+        return out
 
     def _eliminate(
         self, i: int, T: FloatArray, theta: FloatArray, together: bool
@@ -327,7 +310,7 @@ class _Equations:
         sign = pivot = np.ones(residual.shape[-1])
         if u:
             count = count_reflections(len(rows), u) * len(group.limbs)
-            rows = triangularize(rows, u)
+            rows = triangularize(rows, u, overwrite=True)
             diagonal = np.diagonal(rows[:u, :u])
             sign = (-1.0) ** count * np.prod(np.sign(diagonal), axis=(0, 2))
             largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Temporary arrays of the NumPy engine find the memory of earlier ones."""
+
+import subprocess
+import sys
+
+import pytest
+
+COUNT_FAULTS = """
+import resource
+import numpy as np
+import loopcal as lc
+
+robot = lc.load_robot("hexapod-42")
+q = np.random.default_rng(0).uniform(-0.01, 0.01, (10_000, 6))
+lc.forward(robot, q)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(5):
+    lc.forward(robot, q)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems count differently")
+def test_further_calls_cause_few_page_faults(monkeypatch):
+    monkeypatch.setenv("LOOPCAL_ENGINE", "numpy")
+    words = [sys.executable, "-c", COUNT_FAULTS]
+    faults = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    assert int(faults) < 5000  # 20,000 where each call takes its memory from the system
