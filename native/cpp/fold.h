@@ -189,6 +189,9 @@ inline void fold_trial(const double *factor, const double *rows, double *out, in
 
 // --- by parts ---------------------------------------------------------------------------------
 
+// Rows of a part of m: whole blocks.
+inline int64_t part_height(int64_t m) { return (m + PARTS * ROWS - 1) / (PARTS * ROWS) * ROWS; }
+
 inline size_t need_by_parts(int64_t p) { return Arena::need<double>(PARTS * p * p); }
 
 // Fold many rows of one trial; false without memory.
@@ -197,7 +200,7 @@ inline bool fold_parts(const double *factor, const double *rows, double *out, in
     if (!memory.ok()) return false;
     double *factors = memory.take<double>(PARTS * p * p);
     std::memset(factors, 0, sizeof(double) * (size_t)(PARTS * p * p));
-    int64_t height = (m + PARTS * ROWS - 1) / (PARTS * ROWS) * ROWS;  // whole blocks
+    int64_t height = part_height(m);
     for (int64_t first = 0; first < PARTS; first += W) {
         int64_t count = PARTS - first < W ? PARTS - first : W, begin = first * height;
         if (begin >= m) break;

@@ -3,8 +3,10 @@
 // made. G are the derivatives of whitened residuals r by the platform's twist.
 //
 // By trials, neither D nor the rows are written to memory: a lane makes and folds those of its
-// trial. A trial alone has its poses in lanes, and its rows are written for `fold`. Both compute
-// the same operations in the same order, so that they give the same bits.
+// trial. Many poses of one trial are divided into the PARTS of `fold`, of which a lane makes and
+// folds one. Where parts cannot go pose by pose at the same time, and for few poses of a trial
+// alone, neighboring poses share lanes, and their rows are written for `fold`. All compute the same
+// operations in the same order, so that they give the same bits.
 #pragma once
 
 #include "fold.h"
@@ -29,9 +31,9 @@ struct PoseRows {
 
 // Where any derivative of a lane is infinite or NaN, all become zero. Returns which lanes were finite.
 INLINE Mask clear_infinite(Lanes *derivatives, int64_t count) {
-    Lanes sum{};
-    for (int64_t i = 0; i < count; i++) sum = sum + derivatives[i] * 0.0;
-    Mask finite = sum == 0.0;
+    Lanes sum[4] = {};  // that do not wait for each other; all of them are 0 or NaN
+    for (int64_t i = 0; i < count; i++) sum[i % 4] = sum[i % 4] + derivatives[i] * 0.0;
+    Mask finite = (sum[0] + sum[1]) + (sum[2] + sum[3]) == 0.0;
     if (any(~finite))
         for (int64_t i = 0; i < count; i++) derivatives[i] = select(finite, derivatives[i], Lanes{});
     return finite;
@@ -84,6 +86,73 @@ inline void fold_poses_by_trials(const PoseRows &in, Differentiator &at, int64_t
         fold_block(R, block, width);
     }
     store_factors(R, count, width, out);
+}
+
+// --- by parts ---------------------------------------------------------------------------------
+
+// Whether the rows of all parts, `height` each, change to another pose at the same time.
+inline bool parts_agree(const loopcal::TwistRows &rows, int64_t height) {
+    for (int64_t first = height; first < rows.count; first += height)
+        for (int64_t i = 1; i < height && first + i < rows.count; i++)
+            if ((rows.pose[i] == rows.pose[i - 1]) != (rows.pose[first + i] == rows.pose[first + i - 1]))
+                return false;
+    return true;
+}
+
+// The factors of parts `part` to `part` + W of a trial, one in each lane.
+inline void fold_poses_of_parts(const PoseRows &in, Differentiator &at, int64_t trial, int64_t part,
+                                int64_t height, double *factors, Arena &arena) {
+    int64_t p = in.parameters(), width = in.width(), m = in.rows.count, row[W], pose[W];
+    int64_t count = PARTS - part < W ? PARTS - part : W;
+    Lanes *R = arena.take<Lanes>(packed(width, width)), *block = arena.take<Lanes>(width * ROWS);
+    for (int64_t i = 0; i < packed(width, width); i++) R[i] = Lanes{};
+    int filled = 0;
+    Mask finite{};
+    for (int64_t i = 0; i < height; i++) {
+        const double *by_twist[W], *residual[W];
+        Mask is_row{};
+        for (int lane = 0; lane < W; lane++) {  // lanes without a part repeat the last one
+            row[lane] = (part + (lane < count ? lane : count - 1)) * height + i;
+            is_row[lane] = row[lane] < m ? -1 : 0;
+            if (!is_row[lane]) row[lane] = m - 1;
+            pose[lane] = in.rows.pose[row[lane]];
+            by_twist[lane] = in.by_twist(trial) + 6 * row[lane];
+            residual[lane] = in.residual(trial) + row[lane];
+        }
+        if (!i || in.rows.pose[i] != in.rows.pose[i - 1]) {
+            at.differentiate_poses(trial, pose);
+            finite = clear_infinite(at.by_parameter, 6 * p);
+            note_finite(in, at, finite);
+        }
+        Lanes g[6], *column = block + filled;
+        for (int f = 0; f < 6; f++) g[f] = gather(by_twist, f);
+        for (int64_t j = 0; j < p; j++, column += ROWS)
+            *column = select(is_row, multiply_twist(g, at.by_parameter + j, p), Lanes{});
+        *column = select(is_row & finite, gather(residual, 0), Lanes{});
+        if (++filled < ROWS) continue;
+        fold_block(R, block, width);
+        filled = 0;
+    }
+    store_factors(R, count, width, factors + part * width * width);
+}
+
+// Fold many rows of one trial as `fold` does; false without memory.
+inline bool fold_poses_by_parts(const PoseRows &in, Differentiator &at, int64_t trial, int64_t height,
+                                const double *factor, double *out) {
+    int64_t width = in.width(), size = width * width;
+    Arena memory(need_by_parts(width));
+    if (!memory.ok()) return false;
+    double *factors = memory.take<double>(PARTS * size);
+    std::memset(factors, 0, sizeof(double) * (size_t)(PARTS * size));
+    for (int64_t part = 0; part < PARTS && part * height < in.rows.count; part += W) {
+        Arena arena(need_by_trials(width));
+        if (!arena.ok()) return false;
+        fold_poses_of_parts(in, at, trial, part, height, factors, arena);
+    }
+    Arena arena(need_by_columns(width));
+    if (!arena.ok()) return false;
+    fold_trial(factor, factors, out, PARTS * width, width, arena);
+    return true;
 }
 
 // --- a trial alone ----------------------------------------------------------------------------
@@ -146,6 +215,14 @@ inline int fold_poses(const int64_t *structure, const double *numbers, const int
         }
     }
     if (alone == t) return 0;
+    if (are_many && parts_agree(*rows, part_height(m))) {
+        Arena arena(Differentiator::need(program, map));
+        if (!arena.ok()) return 1;
+        Differentiator at(program, map, by_poses, arrays, joints, arena);
+        for (int64_t i = 0; i < t; i++)
+            if (!fold_poses_by_parts(in, at, i, part_height(m), factor + i * size, out + i * size)) return 1;
+        return 0;
+    }
     size_t vectors = (size_t)(padded(in.parameters()) / W);
     Arena arena(Differentiator::need(program, map) + Arena::need<Lanes>(7 * vectors) +
                 Arena::need<double>(m * width));

@@ -162,7 +162,19 @@ class Differentiator {
 
     void differentiate(int64_t block) {
         used = division_.locate(block, trial, pose);
-        placed_.place(block / division_.blocks_of_unit(), arrays_[0]);
+        differentiate_located(block / division_.blocks_of_unit());
+    }
+
+    // Any poses of one trial, where trials do not share lanes.
+    void differentiate_poses(int64_t of_trial, const int64_t *poses) {
+        used = W;
+        for (int lane = 0; lane < W; lane++) trial[lane] = of_trial, pose[lane] = poses[lane];
+        differentiate_located(of_trial);
+    }
+
+  private:
+    void differentiate_located(int64_t unit) {
+        placed_.place(unit, arrays_[0]);
         gather_joints(program_, joints_, arrays_[1], trial, pose, theta_);
         gather_platform(arrays_[2], trial, pose, platform_);
         numbers_.locate_lanes(map_, trial, pose, !division_.by_trials);
@@ -174,7 +186,6 @@ class Differentiator {
         multiply();
     }
 
-  private:
     struct Sizes {  // of what a block needs
         int joints = 0;
         size_t closed = 0, values = 0, triangle = 1;
