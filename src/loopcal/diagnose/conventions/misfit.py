@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from loopcal import engine, measure
-from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.identification import identify
@@ -30,8 +29,19 @@ from loopcal.mechanism import Mechanism, find_directly_reachable, forward, forwa
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
 
+if TYPE_CHECKING:
+    from loopcal.diagnose.conventions.interpretations import Interpretation
+
 FEWEST = 3
 """Smallest number of equations beyond those of unknown frames that gives a misfit."""
+
+ALLOWED = 4.0
+"""Misfit up to which tolerances and noise explain a residual."""
+
+EQUALLY = 1.2
+"""Ratio of misfits up to which two interpretations fit equally well; the first in the list is
+reported, the others as alternatives.
+"""
 
 FAR, MOST_EXCLUDED = 5.0, 0.25
 """Rows this many times the median row away are excluded, up to this share of the rows; the check

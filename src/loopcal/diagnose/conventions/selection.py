@@ -23,6 +23,8 @@ from loopcal.diagnose.conventions.judgement import (
     judge_data,
 )
 from loopcal.diagnose.conventions.misfit import (
+    ALLOWED,
+    EQUALLY,
     MOST_EXCLUDED,
     QUICK,
     THOROUGH,
@@ -53,9 +55,6 @@ GROSS = 100.0
 beyond their tolerances look the same, and it is a warning.
 """
 
-ALLOWED = 4.0
-"""Misfit up to which tolerances and noise explain a residual."""
-
 LARGEST = 10.0
 """Misfit up to which another interpretation is accepted if the robot reaches too few poses of the
 data as written, which then have no misfit to compare.
@@ -77,11 +76,6 @@ parameters change.
 LOWERED, MOST_BASES = 0.7, 3
 """Share of the misfit below which an interpretation is a base of pairs, and largest number of bases
 among the values, and among the readings.
-"""
-
-EQUALLY = 1.2
-"""Ratio of misfits up to which two interpretations fit equally well; the first in the list is
-reported, the others as alternatives.
 """
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from loopcal.diagnose.conventions.misfit import Comparison, compare_with_robot, exclude_far_rows
-from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
 
@@ -125,6 +124,8 @@ def find_moved_setups(
 
 def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:
     """Compare the measurements with some stated parameters estimated."""
+    from loopcal.diagnose.conventions.refinement import refine_misfit
+
     free, data = stated.problem.free, stated.data
     remaining = tuple(value for value in data.stated_values if value.name not in names)
     freed = replace(data, stated_values=remaining)
