@@ -19,7 +19,6 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.engine import numpy_engine
 from loopcal.engine.memory import keep_freed_memory
 from loopcal.engine.program import (
     ClosureBlocks,
@@ -78,9 +77,7 @@ def select_engine(choice: str = "") -> Engine:
     choice = choice.strip() or (NATIVE if _is_native_installed() else NUMPY)
     name, _, variant = choice.partition(":")
     if choice == NUMPY:
-        own = numpy_engine
-        functions = own.solve, own.certify, own.reach, own.linearize, own.fold
-        return Engine(NUMPY, np.__version__, *functions, own.differentiate, own.fold_poses)
+        return _make_numpy_engine()
     load = _find_loader(choice, name)
     try:
         engine = load()(variant)
@@ -93,6 +90,20 @@ def select_engine(choice: str = "") -> Engine:
         finding = report_finding("engine.not-usable", engine=choice, reason=reason)
         raise MissingPackageError(finding) from cause
     return engine
+
+
+def _make_numpy_engine() -> Engine:
+    """Return the engine in NumPy, whose modules are imported for it alone."""
+    from loopcal.engine.numpy_engine.certificate import certify
+    from loopcal.engine.numpy_engine.closure import linearize
+    from loopcal.engine.numpy_engine.householder import fold
+    from loopcal.engine.numpy_engine.newton import solve
+    from loopcal.engine.numpy_engine.pose_rows import fold_poses
+    from loopcal.engine.numpy_engine.sensitivity import differentiate
+    from loopcal.engine.numpy_engine.targets import reach
+
+    functions = solve, certify, reach, linearize, fold, differentiate, fold_poses
+    return Engine(NUMPY, np.__version__, *functions)
 
 
 def _is_native_installed() -> bool:

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from loopcal import engine, geometry
 from loopcal.diagnose import identifiability
-from loopcal.engine import numpy_engine
+from loopcal.engine.numpy_engine import newton
 from loopcal.errors import MechanismError
 from loopcal.io import load_robot
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
@@ -159,7 +159,7 @@ def test_engines_agree_on_the_least_squares_closure(text: str, tmp_path: Path) -
     values, q = draw(robot, 7)
     e, _ = robot.slots(values)
     joints = q + robot.slots(values)[1][:, None, :, 0]  # the offset is the first term
-    own = numpy_engine.solve(robot.program, e, joints, robot.home_state)
+    own = newton.solve(robot.program, e, joints, robot.home_state)
     other = engine.solve(robot.program, e, joints, robot.home_state)
     assert (own.status == engine.CONVERGED).all()
     assert (other.status == engine.CONVERGED).all()

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from loopcal.engine.numpy_engine.certificate import certify
 from loopcal.engine.numpy_engine.closure import stack
-from loopcal.engine.numpy_engine.newton import solve
 from loopcal.engine.program import CONVERGED, NEAR_GOAL, Program, Reached, State, Target
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 def reach(program: Program, e: FloatArray, target: Target, start: State) -> Reached:
     """Close the loops at target poses; see `loopcal.engine.reach`."""
+    from loopcal.engine.numpy_engine.newton import solve
+
     return reach_by(solve, certify, program, e, target, start)
 
 
