@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.diagnose import Blunder, PredictionComparison, check_held_out_rows, name_blunders
-from loopcal.estimate.inference.fit_uncertainty import FitUncertainty
+from loopcal.diagnose import check_held_out_rows
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
     from loopcal.apply.validation import Validation
+    from loopcal.diagnose import Blunder, PredictionComparison
+    from loopcal.estimate.inference.fit_uncertainty import FitUncertainty
+    from loopcal.mechanism import Mechanism
 
 DOMINATES = 2.0
 """Factor by which an rms error must fall without the blunders to be called dominated by them."""
@@ -33,7 +34,11 @@ def find_blunders(
     data, after = compared.data.take(compared.usable), compared.after
     values = dict(zip(after.setup.table.names, after.values[0].tolist(), strict=True))
     check = check_held_out_rows(robot, data, values, after.kept, uncertainty)
-    return () if check is None else name_blunders(check, data)
+    if check is None:
+        return ()
+    from loopcal.diagnose import name_blunders
+
+    return name_blunders(check, data)
 
 
 def report_blunders(

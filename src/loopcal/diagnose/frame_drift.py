@@ -22,7 +22,6 @@ import numpy as np
 
 from loopcal import engine, geometry, measure
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.geometry.alignment import FLATNESS, align_point_sets
 from loopcal.measure import Measurements, Observations
 from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import decompose, empty_factor
@@ -279,6 +278,8 @@ def _order_rows(rows: Observations) -> IntArray:
 
 def _spans_plane(points: FloatArray) -> bool:
     """Return whether at least three of points (k, 3) are measured and not collinear."""
+    from loopcal.geometry.alignment import FLATNESS
+
     measured = points[np.isfinite(points).all(axis=1)]
     if len(measured) < 3:
         return False
@@ -288,6 +289,8 @@ def _spans_plane(points: FloatArray) -> bool:
 
 def _align_each(repeats: _Repeats) -> _Repeats:
     """Return the measurements, each moved to the first one with which it shares enough targets."""
+    from loopcal.geometry.alignment import align_point_sets
+
     points, whitener = repeats.points.copy(), repeats.whitener.copy()
     for i in range(1, len(points)):
         for first in points[:i]:

@@ -13,7 +13,6 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.minimization.closure_start import descend_from_closure
 from loopcal.estimate.minimization.descent import Descent, descend
 from loopcal.estimate.minimization.part_start import descend_in_parts
 from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
@@ -41,6 +40,8 @@ def descend_once(
     with_prior = problem if options.prior is None else options.prior.added(problem)
     if options.begin == "kinematics":
         return descend(with_prior, z, method, control, tolerance, start, progress)
+    from loopcal.estimate.minimization.closure_start import descend_from_closure
+
     z, first = descend_from_closure(problem, z, method, control, tolerance)
     fit = descend(with_prior, z, method, control, tolerance, start, progress)
     if first is None:

@@ -42,11 +42,9 @@ from loopcal.estimate.inference.prior import (
 )
 from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.loss_uncertainty import add_loss_uncertainty
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.regularization import describe_regularization
-from loopcal.estimate.minimization.closure_start import report_unused_closure
 from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.nuisance.baseline import fit_setup_before
 from loopcal.estimate.nuisance.estimate import (
@@ -128,6 +126,8 @@ def identify(
     result = _assemble(robot, free, options, data, fit, weights, problem, weighted)
     result = add_factor_uncertainty(result, fit)
     if options.loss is not None:
+        from loopcal.estimate.loss_uncertainty import add_loss_uncertainty
+
         result = add_loss_uncertainty(result, fit, problem, weighted, linked_blocks(data))
     findings = [*result.findings, *report_unknown_rows(options.prior)]
     if open_poses.poses:
@@ -284,7 +284,11 @@ def _report_closure(problem: Problem, options: FitOptions, fit: Descent) -> list
     """
     if fit.is_start_exhausted:
         return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
-    unused = report_unused_closure(problem) if options.begin == "closure" else None
+    if options.begin != "closure":
+        return []
+    from loopcal.estimate.minimization.closure_start import report_unused_closure
+
+    unused = report_unused_closure(problem)
     return [] if unused is None else [unused]
 
 

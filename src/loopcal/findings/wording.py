@@ -25,10 +25,14 @@ import math
 import string
 from collections.abc import Iterator, Mapping, Sequence, Sized
 from functools import cache
+from importlib import import_module
 from typing import Any, NamedTuple
 
 SHOWN_NAMES = 10
 """Names that a sentence lists before it counts the others."""
+
+PHRASES = ("phrases", "conformity_phrases", "mechanism_phrases")
+"""Modules of the catalog with the phrases of templates, those that are used most first."""
 
 _PYTHON = string.Formatter()
 
@@ -136,12 +140,12 @@ def _look_up(name: str, data: Mapping[str, Any]) -> Any:
     """Return the value of a field: data, a phrase, or the text of another finding."""
     if not name.endswith("()"):
         return _PYTHON.get_field(name, (), data)[0]
-    from loopcal.findings.catalog import conformity_phrases, find_entry, mechanism_phrases, phrases
+    from loopcal.findings.catalog import find_entry
 
     name = name.removesuffix("()")
     if "." in name:
         return find_entry(name).word(data)
-    modules = phrases, conformity_phrases, mechanism_phrases
+    modules = (import_module(f"loopcal.findings.catalog.{module}") for module in PHRASES)
     module = next(m for m in modules if hasattr(m, name))
     return getattr(module, name)(data)
 

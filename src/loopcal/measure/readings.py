@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Actuator readings of commanded poses, and values of joints that kinds sense."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,9 +12,12 @@ from numpy.typing import ArrayLike
 from loopcal import mechanism
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
-from loopcal.measure.kinds import ActuatorReadings, Kind
+from loopcal.measure.kinds import Kind
 from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.typing import FloatArray
+
+if TYPE_CHECKING:
+    from loopcal.measure.kinds import ActuatorReadings
 
 # --- commanded poses
 
@@ -132,4 +138,6 @@ def make_readings_kind(robot: Mechanism) -> ActuatorReadings:
 
     An uncertain reading is a measurement of the true one, by this kind.
     """
+    from loopcal.measure.kinds import ActuatorReadings
+
     return ActuatorReadings({actuator.name: actuator.dimension for actuator in robot.actuators})

@@ -12,7 +12,6 @@ from loopcal.estimate.result import LAST_DIGITS
 from loopcal.findings import Finding
 from loopcal.findings.wording import list_names
 from loopcal.mechanism import Mechanism
-from loopcal.report.budget_view import build_budget_table
 from loopcal.report.height_view import view_heights
 from loopcal.report.numbers import (
     format_exact_beside,
@@ -104,6 +103,8 @@ def _view_errors(report: CalibrationReport, verbose: bool) -> list[Block]:
 
 def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Block]:
     """Return everything that the summary leaves out."""
+    from loopcal.report.budget_view import build_budget_table
+
     fit = report.identification
     blocks: list[Block] = []
     if rows["local"] and fit.converged:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
@@ -99,6 +98,8 @@ class Table:
 
         Headings have a scope. So have the cells of the first column where it contains words.
         """
+        from html import escape as escape_html
+
         classes = [
             ("words" if column.align == "left" else "numbers") + " wraps" * column.wraps
             for column in self.columns
@@ -106,7 +107,7 @@ class Table:
 
         def cell(i: int, text: str, scope: str) -> str:
             tag = f'th scope="{scope}"' if scope else "td"
-            shown = html.escape(escape(text, "\n"))
+            shown = escape_html(escape(text, "\n"))
             return f'<{tag} class="{classes[i]}">{shown}</{tag[:2]}>'
 
         def row(cells: Sequence[str], scopes: Sequence[str]) -> str:
@@ -115,7 +116,7 @@ class Table:
 
         n = len(self.columns)
         scopes = ["row" if i == 0 and self.columns[0].align == "left" else "" for i in range(n)]
-        caption = f"<caption>{html.escape(escape(self.caption))}</caption>" if self.caption else ""
+        caption = f"<caption>{escape_html(escape(self.caption))}</caption>" if self.caption else ""
         head = row([column.heading for column in self.columns], ["col"] * n)
         body = "\n".join(row(cells, scopes) for cells in self.rows)
         return f"<table>{caption}\n<thead>{head}</thead>\n<tbody>\n{body}\n</tbody>\n</table>"

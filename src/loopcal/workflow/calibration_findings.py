@@ -15,8 +15,6 @@ from loopcal.findings import Finding, Severity, report_finding
 from loopcal.measure import Measurements, check_instruments
 from loopcal.units import Dimension
 from loopcal.workflow.data_split import DataSplit
-from loopcal.workflow.open_freedoms import sort_open_freedoms
-from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 from loopcal.workflow.verdict import BASE_MOVED
 
 NO_GAIN = "model.no-expected-gain"
@@ -119,6 +117,9 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     """Return whether open combinations only move frames, or change poses."""
     if not fit.converged or not fit.unidentifiable:
         return []
+    from loopcal.workflow.open_freedoms import sort_open_freedoms
+    from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
+
     freedoms = sort_open_freedoms(fit.posterior, fit.unidentifiable, len(fit.names) - fit.rank)
     motions, count = freedoms.motions, freedoms.changing_count
     findings = [report_readings_gauge(motions, freedoms.count)] if is_readings_alone(data) else []

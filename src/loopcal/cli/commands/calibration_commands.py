@@ -130,20 +130,19 @@ def calibrate(
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
       loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
     """  # noqa: D301
-    from loopcal import workflow
-    from loopcal.io import load_robot, load_stored_values
+    from loopcal import io, workflow
     from loopcal.io.runs.run_folder import build_document, load_run, refuse_run_folder, save_run
     from loopcal.io.runs.run_verdict import name_robot_file
     from loopcal.report.calibration_view import view_calibration
 
     inputs = _list_inputs(robot, data, prior, compare)
-    machine = load_robot(robot)
+    machine = io.load_robot(robot)
     settings = workflow.CalibrationOptions(
         make_fit_options(options),
         hold_out,
         seed=seed,
         prior=None if prior is None else load_run(prior).load_posterior(),
-        compare_with=None if compare is None else load_stored_values(compare, machine),
+        compare_with=None if compare is None else io.load_stored_values(compare, machine),
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},
     )

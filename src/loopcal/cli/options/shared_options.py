@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.shell_completion import CompletionItem
 
 from loopcal.errors import DataError, UnitError
 from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
     from loopcal.diagnose import ConventionCheck
     from loopcal.findings import Finding
     from loopcal.measure import Measurements
@@ -29,6 +30,8 @@ def complete_robot(
     _context: click.Context, _argument: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
     """Return the shipped robots that begin as a word; files where there is none."""
+    from click.shell_completion import CompletionItem
+
     from loopcal.io.robot.robot_file import list_shipped_robots
 
     names = [name for name in list_shipped_robots() if name.startswith(incomplete)]

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.diagnose.error_frames import FITTED
-from loopcal.diagnose.residuals.correlated_errors import estimate_correlated_errors
 from loopcal.diagnose.residuals.model_discrepancy import add_slow_errors, find_slow_errors
 from loopcal.diagnose.residuals.residual_effects import READING, SESSION, TEMPERATURE, TIME
 from loopcal.diagnose.residuals.residual_patterns import (
@@ -121,6 +120,8 @@ def _add_correlation(
     Where residuals are too small and no test shows a correlation, it is added if it matters: the
     parameters may have taken up errors that are too slow for the tests.
     """
+    from loopcal.diagnose.residuals.correlated_errors import estimate_correlated_errors
+
     rows = patterns.rows
     errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
     independent = np.zeros_like(errors.covariance)

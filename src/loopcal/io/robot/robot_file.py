@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +52,7 @@ HEADER = ("format", "units", "family", TABLE)
 KEY = "stages"
 """The key of the list of stages, and the name of the family of chains."""
 WHAT = "robot file"
+SHIPPED_ROBOTS = Path(__file__).parents[2] / "robots"
 
 PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
 """Ending of a printer's configuration -> its firmware."""
@@ -222,8 +222,7 @@ def _refuse_file_of_program(path: Path) -> None:
 
 def list_shipped_robots() -> dict[str, Path]:
     """Return name -> file of the robots that come with loopcal."""
-    folder = Path(str(resources.files("loopcal"))) / "robots"
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(SHIPPED_ROBOTS.glob("*.yaml"))}
 
 
 def check_format(file: YamlFile, newest: int) -> None:

@@ -14,7 +14,6 @@ from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.mechanism.kinematics.link_frames import compute_limb_frames
 from loopcal.mechanism.kinematics.pose_solutions import Solution, check_arguments, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import HtmlResult
@@ -102,6 +101,8 @@ def _report_exceeded(robot: Mechanism, limit: Limit, reached: float) -> Finding:
 
 def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
     """Return the angles between rods and the axes of their cones."""
+    from loopcal.mechanism.kinematics.link_frames import compute_limb_frames
+
     limits = []
     all_frames = compute_limb_frames(robot, values, state)
     for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):

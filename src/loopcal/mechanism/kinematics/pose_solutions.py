@@ -21,7 +21,6 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.closure.limb_rows import name_passive_joints
 from loopcal.mechanism.kinematics.batch_kinematics import compute_readings, forward_trials
-from loopcal.mechanism.kinematics.nearest_pose import controls_all, find_nearest_reachable
 from loopcal.mechanism.kinematics.solution_modes import reach_coordinates, solve_in_mode
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
@@ -272,6 +271,8 @@ def _reach_pose(
     robot: Mechanism, T: FloatArray, start: State | None
 ) -> tuple[State, BoolArray | None]:
     """Return what `reach_coordinates` returns, for poses (n, 4, 4)."""
+    from loopcal.mechanism.kinematics.nearest_pose import controls_all, find_nearest_reachable
+
     if controls_all(robot):
         return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
     return find_nearest_reachable(robot, robot.values[None], T[None], start), None
