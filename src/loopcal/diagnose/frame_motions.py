@@ -29,7 +29,6 @@ from loopcal.mechanism import (
     differentiate_pose,
     find_directly_reachable,
     forward_trials,
-    solve_at_pose,
 )
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
@@ -212,6 +211,8 @@ def _probe_redundant(robot: Mechanism) -> FloatArray:
     Drawn readings would contradict each other, and those of home do so where the values are not
     those that home was computed with.
     """
+    from loopcal.mechanism import solve_at_pose
+
     scale = np.array([SPREAD_ANGLE] * 3 + [SPREAD_LENGTH * robot.size] * 3)
     twists = np.zeros((1, PROBES, 6))
     places = list(robot.program.freedoms)

@@ -13,7 +13,6 @@ import numpy as np
 from loopcal.geometry.rigid_transforms import make_pose
 from loopcal.geometry.rotations import exp_so3, hat, left_jacobian_so3, project_to_rotations
 from loopcal.numerics.decomposition import are_nonzero
-from loopcal.numerics.multistart import minimize_from_starts
 from loopcal.typing import FloatArray, IntArray
 
 _SIGNED_PERMUTATIONS = [
@@ -77,6 +76,8 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> Flo
     H : (9, 9), positive semidefinite. g : (9,)
     count : largest number of different rotations to return.
     """
+    from loopcal.numerics.multistart import minimize_from_starts
+
     unconstrained = project_to_rotations(solve_least_squares(H, g).reshape(3, 3))
     start = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
     root = _square_root(H)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.measure.kinds import Closure, Kind
+from loopcal.measure.kinds import CLOSURE, Kind
 from loopcal.measure.reading_sigma import resolve_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -27,7 +27,7 @@ def check_closure(
         `resolve_reading_sigma`.
     """
     check_redundancy(robot, kinds)
-    is_closure = any(isinstance(kind, Closure) for kind in kinds)
+    is_closure = any(kind.name == CLOSURE for kind in kinds)
     if is_closure and resolve_reading_sigma(robot, reading_sigma, n_poses) is None:
         raise DataError(report_finding("data.closure-without-sigma", robot=robot.name))
 
@@ -40,7 +40,7 @@ def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
     DataError
         `data.closure-without-redundancy`.
     """
-    if robot.program.sigma is None and any(isinstance(kind, Closure) for kind in kinds):
+    if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
         raise DataError(
             report_finding(
                 "data.closure-without-redundancy",

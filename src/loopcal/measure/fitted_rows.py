@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.measure.kinds import ActuatorReadings
+from loopcal.measure.kinds import READINGS
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.row_agreement import ComparedRows, find_agreeing
@@ -78,7 +78,7 @@ class FittedRows:
         """
         count = 0
         for kind, content in self.groups:
-            width = 0 if kind == ActuatorReadings.name else readings
+            width = 0 if kind == READINGS else readings
             sd = np.zeros(content.shape[1])
             if kind in noise and len(noise[kind]) == len(sd) - width:
                 sd[width:] = noise[kind]
@@ -101,7 +101,7 @@ class FittedRows:
         labels: list[str] = []
         total, kinds = 0, {kind for kind, _ in self.groups}
         for rows in _list_rows(data):
-            if rows.kind == ActuatorReadings.name and rows.kind not in kinds:
+            if rows.kind == READINGS and rows.kind not in kinds:
                 continue
             reused = np.zeros(len(rows.content), dtype=bool)
             for kind, content in self.groups:
@@ -123,10 +123,10 @@ def collect_fitted_rows(data: Measurements, are_readings_fitted: bool = False) -
     groups = [
         (o.kind.name, _take_content(o, data.readings)[1])
         for o in data.observations
-        if are_readings_fitted or o.kind.name != ActuatorReadings.name
+        if are_readings_fitted or o.kind.name != READINGS
     ]
     if are_readings_fitted:
-        groups.append((ActuatorReadings.name, data.readings[_find_lonely_readings(data)]))
+        groups.append((READINGS, data.readings[_find_lonely_readings(data)]))
     return FittedRows(tuple(groups))
 
 
@@ -148,7 +148,7 @@ def _list_rows(data: Measurements) -> list[ComparedRows]:
         result.append(ComparedRows(o.kind.name, width, content, noise, poses))
     is_alone = _find_lonely_readings(data)
     alone, poses = data.readings[is_alone], np.flatnonzero(is_alone)[:, None]
-    return [*result, ComparedRows(ActuatorReadings.name, 0, alone, np.zeros(alone.shape), poses)]
+    return [*result, ComparedRows(READINGS, 0, alone, np.zeros(alone.shape), poses)]
 
 
 def _take_content(

@@ -14,17 +14,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from loopcal import engine
-from loopcal.numerics.column_elimination import Elimination, eliminate_from_triangle
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination_tree import EliminationTree, Structure
 from loopcal.numerics.sorted_values import find_distinct
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from loopcal.numerics.column_elimination import Elimination
 
 SHORTEST_DIRECTION = 0.5
 """Unobservable directions have at least length one when they are carried inwards. Shorter ones are
@@ -215,6 +217,8 @@ def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
 
 def _eliminate_nodes(factor: FloatArray, length: FloatArray, structure: Structure) -> Elimination:
     """Eliminate the own columns, of length (a, n, u) over all rows, of factors (a, n, h, ..)."""
+    from loopcal.numerics.column_elimination import eliminate_from_triangle
+
     u = structure.unknowns.shape[1]
     if factor.shape[2] < u:
         factor = _with_height(factor, u)

@@ -14,9 +14,8 @@ A loaded robot keeps the text of its file, so that writing it back changes only 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,8 +57,7 @@ PROGRAMS = {".cfg": "Klipper", ".g": "RepRapFirmware", ".gcode": "Marlin"}
 """Ending of a printer's configuration -> its firmware."""
 
 
-@dataclass(frozen=True)
-class RobotSource:
+class RobotSource(NamedTuple):
     """The origin of a loaded robot, kept as its `record`.
 
     Parameters
@@ -271,11 +269,12 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     that cannot be, are refused at their line.
     """
     try:
-        parameters = record.expand().parameters
+        expanded = record.expand()
     except stages.StageError as error:
         raise file.error(str(error), (KEY, error.index)) from None
     except SumError as error:
         raise file.error(str(error), ("actuators", error.actuator)) from None
+    parameters = expanded.parameters
     names = [parameter.name for parameter in parameters]
     for key in ("fixed", "stored_parameters"):
         for i, pattern in enumerate(getattr(record, key)):
@@ -288,4 +287,4 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
             common.resolve(parameters)
         except MechanismError as error:
             raise file.error(str(error), ("common_errors", i)) from None
-    return record.assembly()
+    return record.assembly(expanded)

@@ -54,6 +54,11 @@ else:
         },
     )
 
+READINGS, CLOSURE = "readings", "closure"
+"""Names of the kinds that contain actuator readings alone: uncertain ones, and those of poses
+without a measured value.
+"""
+
 KINDS: LazyRegistry[type[Kind]] = LazyRegistry(
     {
         "pose": "loopcal.measure.kinds.poses.pose:Pose",

@@ -15,9 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, LinearMap, SharedMap
 from loopcal.mechanism.families.limb_placement import PlacedLimb, map_displacement
 from loopcal.parameters import Parameter
@@ -79,8 +81,7 @@ def join_errors(models: Iterable[ErrorModel]) -> ErrorModel:
     )
 
 
-@dataclass(frozen=True)
-class ErrorTolerances:
+class ErrorTolerances(NamedTuple):
     """Standard deviations of lengths and angles [m, rad]; None where none is stated."""
 
     length: float | None = None
@@ -186,3 +187,12 @@ def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = T
 def get_axis_dimension(axis: str) -> Dimension:
     """Return the dimension of a displacement along or about one of AXES."""
     return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
+
+
+def check_spherical(name: str, spherical: str, error_model: str) -> None:
+    """Refuse balls of three axes without errors; raises MechanismError."""
+    if spherical == "axes" and error_model == "ideal":
+        raise MechanismError(
+            f"{name} states spherical: axes with error_model: ideal, whose parameters describe "
+            "perfect points; state error_model: complete, or spherical: point"
+        )

@@ -17,6 +17,7 @@ from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
+    check_spherical,
     complete_errors,
     offset_error,
     point_errors,
@@ -24,7 +25,6 @@ from loopcal.mechanism.families.error_models import (
 )
 from loopcal.mechanism.families.hexapod_legs import Screw, build_screw_leg, build_ups_leg
 from loopcal.mechanism.families.limb_placement import PlacedLimb, place_limb, translate
-from loopcal.mechanism.families.prs import check_spherical
 from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,

@@ -12,6 +12,7 @@ revolute joint on it. Derivation: docs/theory/tripods.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,8 +59,7 @@ class TripodTolerances:
         )
 
 
-@dataclass(frozen=True)
-class ChainFrames:
+class ChainFrames(NamedTuple):
     """The frames in which a limb with a guide begins and ends.
 
     Attributes
@@ -177,12 +177,3 @@ def carriage_errors(
         displacement_error(f"thC{number}{axis}", limb, "joint", f"r{axis}", angle) for axis in joint
     )
     return join_errors(errors)
-
-
-def check_spherical(name: str, spherical: str, error_model: str) -> None:
-    """Refuse balls of three axes without errors; raises MechanismError."""
-    if spherical == "axes" and error_model == "ideal":
-        raise MechanismError(
-            f"{name} states spherical: axes with error_model: ideal, whose parameters describe "
-            "perfect points; state error_model: complete, or spherical: point"
-        )

@@ -246,16 +246,20 @@ class RobotRecord:
             self.source,
         )
 
-    def assembly(self) -> Assembly:
+    def assembly(self, expanded: Assembly | None = None) -> Assembly:
         """Return the expanded robot, with the parameters of `fixed` kept at their nominal values,
         the names of those that the controller stores, and the common errors of the others.
+
+        Parameters
+        ----------
+        expanded : result of `expand`, where it is known.
 
         Raises
         ------
         MechanismError
             A name or pattern that matches no parameter, or a common error that cannot be.
         """
-        expanded = self.expand()
+        expanded = self.expand() if expanded is None else expanded
         names = [parameter.name for parameter in expanded.parameters]
         fixed = _match_all(self.fixed, names, "fixed")
         stored = _match_all(self.stored_parameters, names, "stored_parameters")

@@ -26,6 +26,7 @@ from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Joint
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
+    check_spherical,
     complete_errors,
     displacement_error,
     join_errors,
@@ -44,7 +45,6 @@ from loopcal.mechanism.families.prs import (
     build_prs_limb,
     build_pus_limb,
     carriage_errors,
-    check_spherical,
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length

@@ -17,14 +17,13 @@ from typing import Literal
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
-from loopcal.mechanism.families.error_models import ErrorModel, complete_errors
+from loopcal.mechanism.families.error_models import ErrorModel, check_spherical, complete_errors
 from loopcal.mechanism.families.limb_placement import PlacedLimb, rotate_about, translate
 from loopcal.mechanism.families.prs import (
     ChainFrames,
     TripodTolerances,
     build_prs_limb,
     carriage_errors,
-    check_spherical,
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length

@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from loopcal.measure.kinds import READINGS
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
@@ -27,7 +28,7 @@ class ActuatorReadings(Kind):
     actuators : name -> dimension, in the order of the readings.
     """
 
-    name: ClassVar[str] = "readings"
+    name: ClassVar[str] = READINGS
     description: ClassVar[str] = "the readings of the actuators"
     wraps_angles: ClassVar[bool] = False
     actuators: Mapping[str, Dimension]

@@ -12,6 +12,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from loopcal.measure.kinds import CLOSURE
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
@@ -31,7 +32,7 @@ class Closure(Kind):
     ()
     """
 
-    name: ClassVar[str] = "closure"
+    name: ClassVar[str] = CLOSURE
     description: ClassVar[str] = "the readings of redundant actuators"
     changes_with_pose: ClassVar[bool] = False
 

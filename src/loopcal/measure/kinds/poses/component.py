@@ -17,16 +17,11 @@ from loopcal.geometry import OrientationForm
 from loopcal.geometry.alignment import align_point_sets
 from loopcal.measure.array_checks import check_names, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.poses.tool_kind import ToolKind
+from loopcal.measure.kinds.poses.tool_kind import SMALL_TILT, ToolKind
 from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, list_rows
 from loopcal.measure.kinds.setup_parameters import POSITION_AXES
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-SMALL_TILT = 0.05
-"""Measured tilt [rad] below which the normal replaces phi and theta; the noise of phi is twenty
-times that of theta there.
-"""
 
 SINGULAR_RATES = 1e-3
 """Smallest |det E| of measured angles [1]; below it a and c are the same rotation to

@@ -11,8 +11,7 @@ from loopcal import engine, geometry
 from loopcal.geometry import OrientationForm
 from loopcal.geometry.alignment import solve_hand_eye
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.poses.component import SMALL_TILT
-from loopcal.measure.kinds.poses.tool_kind import ToolKind
+from loopcal.measure.kinds.poses.tool_kind import SMALL_TILT, ToolKind
 from loopcal.measure.kinds.rows import (
     POSITION_COLUMNS,
     Column,

@@ -16,6 +16,11 @@ from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
 from loopcal.typing import FloatArray
 
+SMALL_TILT = 0.05
+"""Measured tilt [rad] below which the normal replaces phi and theta; the noise of phi is twenty
+times that of theta there.
+"""
+
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ToolKind(Kind):
