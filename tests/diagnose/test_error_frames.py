@@ -340,5 +340,5 @@ def test_frames_that_are_determined_need_no_reference_poses(frame):
     assert motions.shape == (12, 0)
     chosen = choose_error_frame(posterior, frame)
     fitted = refer_errors(posterior.robot, frame, reference_poses(posterior), motions)
-    for name, value in vars(fitted).items():
+    for name, value in fitted._asdict().items():
         np.testing.assert_array_equal(getattr(chosen, name), value, err_msg=name)

@@ -16,7 +16,7 @@ order; only the setup comes first. A source never has a negative part.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -57,8 +57,7 @@ class Source(NamedTuple):
     degrees: float
 
 
-@dataclass(frozen=True, eq=False)
-class CovarianceSplit:
+class CovarianceSplit(NamedTuple):
     """The covariance of the parameters of a fit, by source.
 
     Attributes

@@ -53,8 +53,7 @@ move the reference poses, or the errors do not contain it: the square root of do
 """
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorFrame:
+class ErrorFrame(NamedTuple):
     """A frame in which errors of poses are stated.
 
     Attributes
@@ -108,8 +107,7 @@ class ReferencePoses(NamedTuple):
     over: Over
 
 
-@dataclass(frozen=True, eq=False)
-class FrameFit:
+class FrameFit(NamedTuple):
     """The best rigid fit of some motions of frames over m reference poses.
 
     Attributes

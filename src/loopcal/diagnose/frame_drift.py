@@ -70,8 +70,7 @@ class FrameDrift:
     p_value: float
 
 
-@dataclass(frozen=True, eq=False)
-class ShapeTest:
+class ShapeTest(NamedTuple):
     """The test whether targets on the base kept their distances in all measurements.
 
     Attributes

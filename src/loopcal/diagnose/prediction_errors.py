@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -214,8 +215,7 @@ def compare_predictions(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _LocatedPoses:
+class _LocatedPoses(NamedTuple):
     """Poses of a geometry: from readings, or where `estimated` (n,) together with their rows.
 
     `readings` is the fit of redundant readings alone; None where they are not redundant.

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,7 @@ Task = Callable[[FloatArray, np.ndarray], tuple[FloatArray, FloatArray]]
 """Conditions on the pose: T (N, 3, 4), rows (N,) -> residual (N, c) [m], its slopes (N, c, 6)."""
 
 
-@dataclass(frozen=True)
-class Slot:
+class Slot(NamedTuple):
     """A displacement that parameters can move, in every limb of a group.
 
     element : the links 0..J, J + 1 for the attachment. axis : 0..5 for (rx, ry, rz, x, y, z) in
@@ -52,7 +52,7 @@ def _as_slice(columns: IntArray) -> IntArray | slice:
     return slice(first, first + len(columns)) if is_run else columns
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Group:
     """Limbs of one structure: k limbs with J joints each.
 
@@ -99,7 +99,7 @@ class Group:
         return out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Program:
     """A mechanism in the form that the engine computes with.
 
@@ -193,7 +193,7 @@ class Program:
         return sum(len(g.limbs) * (len(g.rows) - len(g.unknown_joints(free))) for g in self.groups)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """Positions of a mechanism for t trials and n poses.
 
@@ -226,7 +226,7 @@ class State:
         return State(T, tuple(chosen(a) for a in self.joints), *rest)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Target:
     """Poses of the platform, stated by coordinates: a position and R = Rz(a) Ry(b) Rx(c).
 
@@ -248,7 +248,7 @@ class Target:
         return max(self.columns[3:]) >= 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reached:
     """Closed loops at target poses.
 
@@ -261,7 +261,7 @@ class Reached:
     arrives: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Block:
     """Linearized closure of a group, c' rows of each limb: U dtheta + A y + E de + Q dq.
 
@@ -275,7 +275,7 @@ class Block:
     Q: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClosureBlocks:
     """Linearized closure of all groups, the joints of each limb eliminated.
 
@@ -288,7 +288,7 @@ class ClosureBlocks:
     joints: tuple[tuple[int, ...], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapPattern:
     """Which of p parameters move which displacements and actuated joints.
 
@@ -301,7 +301,7 @@ class MapPattern:
     joints: IntArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ParameterMap:
     """Derivatives of displacements e and actuated joints q by parameters and by readings.
 
@@ -319,7 +319,7 @@ class ParameterMap:
     readings: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TwistRows:
     """Whitened rows of poses, m of each of r measurements, as the platform's twist changes them.
 

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +22,7 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class FitLinearization:
+class FitLinearization(NamedTuple):
     """The problem of a fit at its estimate, weighted as in the fit (t = 1).
 
     Attributes

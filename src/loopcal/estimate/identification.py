@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -137,8 +137,7 @@ def identify(
     return replace(result, posterior=posterior, findings=tuple(findings))
 
 
-@dataclass(frozen=True, eq=False)
-class _Estimate:
+class _Estimate(NamedTuple):
     """The rows of a fit at its estimate.
 
     Attributes

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,7 +31,7 @@ MOST_COPIES = 100
 """Largest number of copies of one limb."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Link:
     """A link transform, from coordinates behind the link to those before it.
 
@@ -70,8 +70,7 @@ class Joint:
         return Dimension.ANGLE if self.kind == "R" else Dimension.LENGTH
 
 
-@dataclass(frozen=True)
-class Cone:
+class Cone(NamedTuple):
     """Allowed inclination of a rod at one of its ends: at most `angle` [rad] from `axis` (3,).
 
     `end` is `tip` (axis in the frame of the chain's tip, rod pointing to the platform) or
@@ -83,7 +82,7 @@ class Cone:
     angle: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Limb:
     """A serial chain from base to platform: link, joint, link, ..., link, ending, attachment.
 
@@ -194,7 +193,7 @@ class Actuator:
         return "side" in self.terms
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Assembly:
     """A mechanism as the `expand` method of a family returns it.
 
@@ -264,7 +263,7 @@ class Assembly:
         return {name: limb for name, limb in single.items() if limb}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AttachedStage:
     """A stage of a chain: an assembly whose base is attached to the platform of another stage.
 

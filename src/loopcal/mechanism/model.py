@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,7 +31,7 @@ SHOWN_ACTUATORS = 8
 Columns = slice | IntArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SlotMap:
     """Map of parameter values onto displacements e and transmission terms tau.
 
@@ -119,8 +119,7 @@ class SlotMap:
         return J
 
 
-@dataclass(frozen=True)
-class LimbMap:
+class LimbMap(NamedTuple):
     """The parameters and readings in the equations of one limb.
 
     Attributes
@@ -140,7 +139,7 @@ class LimbMap:
     readings: Columns
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """A stage of a chain: a mechanism whose base is attached to the platform of another stage.
 
@@ -161,7 +160,7 @@ class Stage:
     groups: slice
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mechanism(TableResult):
     """A robot with closed loops, ready to compute.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism.model import SlotMap
 
 
-@dataclass(frozen=True, eq=False)
-class MovedSlots:
+class MovedSlots(NamedTuple):
     """Which slots of a mechanism some parameters move.
 
     Attributes

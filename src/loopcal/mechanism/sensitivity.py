@@ -13,7 +13,7 @@ Failed rows have NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ from loopcal.mechanism.transmission.terms import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
 
 
-@dataclass(frozen=True)
-class PoseSensitivity:
+class PoseSensitivity(NamedTuple):
     """Derivatives of the platform pose.
 
     Attributes
@@ -108,8 +107,7 @@ def fold_pose_rows(
     return fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 
-@dataclass(frozen=True)
-class PassiveSensitivity:
+class PassiveSensitivity(NamedTuple):
     """Derivatives of the passive joints.
 
     Attributes

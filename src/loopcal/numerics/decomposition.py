@@ -51,7 +51,7 @@ def are_nonzero(singular_values: np.ndarray, tolerance: float = RANK_TOLERANCE) 
     return np.asarray(singular_values > tolerance * singular_values[..., :1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Decomposition(TrialBatch):
     """Singular value decomposition A diag(scale) = U diag(s) V' of folded rows [A | b].
 

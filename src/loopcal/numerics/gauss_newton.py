@@ -17,9 +17,8 @@ stated share of their norm (the relative offset of Bates and Watts, Technometric
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -107,8 +106,7 @@ class Model(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Minimum:
+class Minimum(NamedTuple):
     """Where an iteration ended.
 
     Attributes
@@ -247,8 +245,7 @@ def minimize(
     return Minimum(run.point, run.status, run.taken)
 
 
-@dataclass(frozen=True)
-class Halving:
+class Halving(NamedTuple):
     """Settings of `minimize_by_halving`.
 
     Parameters

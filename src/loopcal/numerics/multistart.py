@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,8 +76,7 @@ class _Step(TrialBatch):
     damping: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class _Descent:
+class _Descent(NamedTuple):
     """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
 
     linearize: Linearize

@@ -15,7 +15,7 @@ turn), any of them may have been moved.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from loopcal.diagnose.conventions.misfit import Comparison, compare_with_robot, exclude_far_rows
@@ -52,8 +52,7 @@ class Contradiction(NamedTuple):
     values: tuple[dict[str, Any], ...]
 
 
-@dataclass(frozen=True, eq=False)
-class MovedSetups:
+class MovedSetups(NamedTuple):
     """Frames, targets and surfaces that are no longer where a fit located them.
 
     Attributes

@@ -153,8 +153,7 @@ def check_clusters(
     return next(judged, _not_compared("residuals.clusters-not-judged"))
 
 
-@dataclass(frozen=True, eq=False)
-class RobustSpread:
+class RobustSpread(NamedTuple):
     """The cluster-robust covariance C_robust = L (I + spread) L' of a fit with C = L L'.
 
     With the scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for

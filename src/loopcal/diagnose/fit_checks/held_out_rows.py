@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,8 +50,7 @@ ANYWHERE = 1e3
 """Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians."""
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOutBlocks:
+class HeldOutBlocks(NamedTuple):
     """Rows of held-out blocks with what predicts them.
 
     Attributes
@@ -141,8 +141,7 @@ class HeldOutCheck:
         return p_value
 
 
-@dataclass(frozen=True, eq=False)
-class Predictor:
+class Predictor(NamedTuple):
     """What predicts held-out rows: a robot, the values of its nuisance parameters, and what is
     known of both.
 

@@ -16,7 +16,7 @@ The leverage is the trace of w G. See docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,8 +41,7 @@ UNDETERMINED = 1e6
 """Standard deviation in tolerances that stands in G for a direction that the fit does not use."""
 
 
-@dataclass(frozen=True, eq=False)
-class Influence:
+class Influence(NamedTuple):
     """One entry for each of u blocks.
 
     Attributes

@@ -58,8 +58,7 @@ class JudgingNoise(NamedTuple):
     degrees: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class PartialFit:
+class PartialFit(NamedTuple):
     """A linear fit without some of u blocks, and its influence on every block.
 
     Attributes

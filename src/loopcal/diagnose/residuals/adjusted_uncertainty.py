@@ -10,7 +10,8 @@ larger. See docs/theory/uncertainty.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -143,8 +144,7 @@ def _add_correlation(
     return add_covariance(fit, root, errors.degrees, finding)
 
 
-@dataclass(frozen=True, eq=False)
-class ToolUncertainty:
+class ToolUncertainty(NamedTuple):
     """The uncertainty of the measured poses as a fit states it.
 
     Attributes

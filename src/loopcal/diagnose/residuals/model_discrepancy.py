@@ -16,7 +16,8 @@ docs/theory/uncertainty.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,8 +69,7 @@ ROTATION, PLACE = 0, 1
 """Number of the errors of rotation and of place."""
 
 
-@dataclass(frozen=True, eq=False)
-class SlowErrorRows:
+class SlowErrorRows(NamedTuple):
     """What the elimination of the parameters leaves of residuals and slow errors.
 
     Attributes
@@ -84,8 +84,7 @@ class SlowErrorRows:
     residuals: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class SlowErrors:
+class SlowErrors(NamedTuple):
     """Slow errors that residuals show.
 
     Attributes

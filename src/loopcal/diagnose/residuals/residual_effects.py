@@ -9,7 +9,6 @@ of one function and component are one column; its size is the range of the effec
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +25,7 @@ ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "se
 """What residuals may depend on."""
 
 
-@dataclass(frozen=True)
-class EffectColumn:
+class EffectColumn(NamedTuple):
     """One function of the quantity, for one measured component.
 
     Attributes
@@ -39,8 +37,7 @@ class EffectColumn:
     dimension: Dimension
 
 
-@dataclass(frozen=True, eq=False)
-class Effect:
+class Effect(NamedTuple):
     """A dependence of the measured values on one quantity.
 
     Attributes

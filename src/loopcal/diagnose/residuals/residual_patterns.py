@@ -17,7 +17,7 @@ Source: Durbin and Watson, Testing for serial correlation in least squares regre
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,8 +41,7 @@ FEWEST_LEFT = 3.0
 """Degrees of freedom of the residuals for each size of an effect that is tested, at least."""
 
 
-@dataclass(frozen=True, eq=False)
-class EffectSizes:
+class EffectSizes(NamedTuple):
     """The sizes of a significant effect, and how they act on the residuals.
 
     Attributes
@@ -60,8 +59,7 @@ class EffectSizes:
     moments: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualPatterns:
+class ResidualPatterns(NamedTuple):
     """What the residuals of a fit show.
 
     Attributes

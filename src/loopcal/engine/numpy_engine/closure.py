@@ -9,8 +9,8 @@ N). Formulas: docs/theory/engine.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ def linearize(
     return ClosureBlocks(tuple(closure), tuple(passive), tuple(eliminated))
 
 
-@dataclass(frozen=True)
-class PlacedLinks:
+class PlacedLinks(NamedTuple):
     """The J + 2 displaced links of a group: placed = nominal . translation(d) . rotation(exp(w)).
 
     Shapes end in (k, t), or in (k, 1) where all trials are the same. nominal : rotations without

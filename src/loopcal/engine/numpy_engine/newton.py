@@ -206,7 +206,7 @@ def _store(
     done.status[rows], done.steps[rows] = status, steps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Equations:
     """The closure equations of N rows as a function of their coordinates.
 

@@ -10,7 +10,7 @@ known only together with the machine; then neither is certain, but their combina
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,7 @@ SLOPE, ROOT = "local_slope", "local_root"
 """Arrays of a run folder."""
 
 
-@dataclass(frozen=True, eq=False)
-class FitUncertainty:
+class FitUncertainty(NamedTuple):
     """Free parameters and nuisance parameters of a fit with their joint uncertainty.
 
     Attributes

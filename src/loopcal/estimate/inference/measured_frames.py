@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +18,7 @@ COMMON = 1.0 - 1e-9
 """Cosine of the angle above which motions of two sets are the same motion."""
 
 
-@dataclass(frozen=True, eq=False)
-class InstrumentFrame:
+class InstrumentFrame(NamedTuple):
     """The frame of an instrument after a fit.
 
     Its error is a twist (rotation about base axes [rad], displacement of its origin [m]):

@@ -24,7 +24,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,8 +60,7 @@ VARIANCES = np.expm1(2.0 * np.linspace(0.0, np.log(WIDEST), 41)[1:])
 """Variances over which the evidence is integrated: factors uniform in their logarithm."""
 
 
-@dataclass(frozen=True)
-class PredictedData:
+class PredictedData(NamedTuple):
     """Data as a prior predicts them, in the parameters.
 
     Attributes
@@ -162,8 +162,7 @@ def estimate_variance_spread(
     return float(np.sqrt((weight * (grid - center) ** 2).sum() / weight.sum()))
 
 
-@dataclass(frozen=True)
-class ComponentSearch:
+class ComponentSearch(NamedTuple):
     """The search for the components of one prior (t = 1).
 
     Attributes

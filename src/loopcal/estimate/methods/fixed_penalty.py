@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, Ridge
 from loopcal.typing import FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class FixedPenalty:
+class FixedPenalty(NamedTuple):
     """The penalty of a method that does not depend on the rows: |P z|^2 is added to their sum of
     squares.
 

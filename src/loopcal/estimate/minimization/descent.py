@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -144,7 +144,7 @@ class StepControl:
             raise EstimationError(f"damping is {self.damping}; give 0 or a finite number above it")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Descent:
     """Where the descent ended.
 
@@ -307,8 +307,7 @@ class _Point(TrialBatch):
         return 1.0 + np.linalg.norm(self.z, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
+class _Candidate(NamedTuple):
     """The linearization at proposed deviations; its linear model is made where it is needed."""
 
     model: _FilteredDescent
@@ -326,8 +325,7 @@ class _Candidate:
         return self.model.locate(needed.take(trials), self.arrival[trials])
 
 
-@dataclass(frozen=True, eq=False)
-class _FilteredDescent:
+class _FilteredDescent(NamedTuple):
     """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
 
     problem: LeastSquaresProblem

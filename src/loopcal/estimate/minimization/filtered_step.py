@@ -18,7 +18,7 @@ from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FilteredStep(TrialBatch):
     """A step of some trials towards the filtered solution.
 

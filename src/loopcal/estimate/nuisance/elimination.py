@@ -297,8 +297,7 @@ def fold_node_rows(
     return factor
 
 
-@dataclass(frozen=True, eq=False)
-class _NuisancePoint:
+class _NuisancePoint(NamedTuple):
     """Values (a, U), the factors of rows [F | r] there, and their sums of squares (a,)."""
 
     values: FloatArray

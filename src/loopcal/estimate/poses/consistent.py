@@ -12,8 +12,8 @@ docs/theory/identification.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -55,8 +55,7 @@ def _without_noise(rows: ObservationRows) -> ObservationRows:
     return replace(rows, measured=cleared)
 
 
-@dataclass(frozen=True, eq=False)
-class ConsistentPoses:
+class ConsistentPoses(NamedTuple):
     """Finds poses, near given ones, at which rows have no residual.
 
     Attributes

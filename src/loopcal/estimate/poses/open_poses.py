@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ MOST = 0.5
 MM = 1e3
 
 
-@dataclass(frozen=True, eq=False)
-class OpenPoses:
+class OpenPoses(NamedTuple):
     """Poses at which the loops do not close with their readings.
 
     Attributes

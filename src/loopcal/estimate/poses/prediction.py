@@ -9,7 +9,8 @@ docs/theory/uncertain-readings.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,8 +57,7 @@ def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solutio
     return located.solution, located.is_determined
 
 
-@dataclass(frozen=True, eq=False)
-class PoseFit:
+class PoseFit(NamedTuple):
     """Poses of a robot where readings and rows fit best.
 
     Attributes

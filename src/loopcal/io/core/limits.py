@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
@@ -272,8 +273,7 @@ LIMITS: tuple[FileLimit, ...] = (
 """All limits, in the order of docs/files.md."""
 
 
-@dataclass(frozen=True)
-class CountLimit:
+class CountLimit(NamedTuple):
     """The largest number that an option takes.
 
     Parameters

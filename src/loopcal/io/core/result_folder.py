@@ -11,10 +11,9 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
@@ -30,8 +29,7 @@ _BLANK = "0" * 64
 """Stands for the document's own digest where this is computed."""
 
 
-@dataclass(frozen=True)
-class FolderKind:
+class FolderKind(NamedTuple):
     """What a command writes as a folder, and by what it is recognized.
 
     Parameters

@@ -68,7 +68,7 @@ POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
 """Settings of a file without measured values."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KindRows:
     """A kind in a file: its noise [SI] by column, its rows, and the place of its settings.
 

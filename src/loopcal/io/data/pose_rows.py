@@ -14,7 +14,7 @@ otherwise it is refused.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,7 @@ RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
 """Differences [1] and [m or rad] up to which readings in different units are the same."""
 
 
-@dataclass(frozen=True)
-class PoseRows:
+class PoseRows(NamedTuple):
     """The n poses of some files.
 
     Parameters
@@ -55,8 +54,7 @@ class PoseRows:
     members: tuple[tuple[tuple[int, ...], ...], ...]
 
 
-@dataclass(frozen=True)
-class _FilePoses:
+class _FilePoses(NamedTuple):
     """The poses of one file.
 
     `names` of each row; `first` row of each pose; `readings` and `sigma` (rows, a), NaN where a row

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from loopcal.measure import FittedRows, Measurements
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run(HtmlResult):
     """A calibration read from its run folder, or a robot file as if it were one.
 

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,8 +24,7 @@ from loopcal.io.runs.run_result import report_damage
 Test = Callable[[np.ndarray], Any]
 
 
-@dataclass(frozen=True)
-class Values:
+class Values(NamedTuple):
     """What the entries of an array may be: letters of their types of numpy, words, and a test."""
 
     types: str
@@ -53,8 +51,7 @@ def _is_text(array: np.ndarray) -> bool:
 TEXT = Values("U", "text", _is_text)
 
 
-@dataclass(frozen=True)
-class ArrayRule:
+class ArrayRule(NamedTuple):
     """Form of an array: its sizes, in words, and its values."""
 
     sizes: str

@@ -38,14 +38,14 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 """Half a character: part of a file name that is not UTF-8."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Part:
     """A mapping in result.json, of which only the fields are read."""
 
     OTHER_KEYS: ClassVar[bool] = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredParameter(_Part):
     """An entry of `fit.parameters` or, for setup parameters, of `fit.local`."""
 
@@ -55,7 +55,7 @@ class StoredParameter(_Part):
     unit: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredFit(_Part):
     """The identification under `fit`."""
 
@@ -66,14 +66,14 @@ class StoredFit(_Part):
     sigma_scale: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredSplit(_Part):
     """The held-out poses under `split`."""
 
     held_out: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredInput(_Part):
     """An input file under `made_by.inputs`."""
 
@@ -81,7 +81,7 @@ class StoredInput(_Part):
     sha256: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredOrigin(_Part):
     """The provenance under `made_by`."""
 
@@ -89,14 +89,14 @@ class StoredOrigin(_Part):
     inputs: dict[str, StoredInput]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredErrors(_Part):
     """The errors of poses under `expected_error.position` and `.orientation`."""
 
     rms: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredHalf(_Part):
     """What half the sigma of a source leaves, under `halved`."""
 
@@ -105,7 +105,7 @@ class StoredHalf(_Part):
     worst_parameter_sd: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredSource(_Part):
     """A source of errors under `expected_error.sources`."""
 
@@ -119,14 +119,14 @@ class StoredSource(_Part):
     halved: StoredHalf | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredSentence(_Part):
     """A finding, of which the sentence is read."""
 
     text: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredBudget(_Part):
     """The uncertainty budget under `expected_error`; earlier versions state no `sources`."""
 
@@ -140,7 +140,7 @@ class StoredBudget(_Part):
     sources: tuple[StoredSource, ...] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredResult(_Part):
     """What loopcal reads back from result.json."""
 

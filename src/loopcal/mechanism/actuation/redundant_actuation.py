@@ -10,7 +10,8 @@ docs/theory/uncertain-readings.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,7 @@ from loopcal.mechanism.transmission.terms import readings_from_joints
 from loopcal.typing import FloatArray
 
 
-@dataclass(frozen=True)
-class PoseDrivenSensitivity:
+class PoseDrivenSensitivity(NamedTuple):
     """Derivatives by parameters (.., p) at constant pose, and by the platform's freedoms (.., m).
 
     Attributes

@@ -43,7 +43,7 @@ SCALES = (0.1, 1.0)
 """Range of the distance of starting positions from the middle of the base points, per size."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Modes(HtmlResult):
     """Solutions found from random starts.
 
@@ -75,7 +75,7 @@ class Modes(HtmlResult):
         return f"<Modes: {self}>"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Problem:
     """A search for modes.
 

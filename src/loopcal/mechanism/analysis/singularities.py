@@ -52,7 +52,7 @@ SAMPLE_SIZE = 400
 """Positions of the workspace from which the median margins are taken."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Singularity(HtmlResult):
     """Distance of n poses from singularities.
 

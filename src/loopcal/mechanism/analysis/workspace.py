@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,8 +27,7 @@ MIN_REACHABLE_SHARE = 1e-2
 """Share of them that must be reachable: drawing n positions tries at most 100 n."""
 
 
-@dataclass(frozen=True)
-class Limit:
+class Limit(NamedTuple):
     """A quantity that must stay between two bounds.
 
     Attributes
@@ -118,7 +118,7 @@ def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[
     return limits
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WorkspaceSample(HtmlResult):
     """Positions drawn at random from a workspace.
 

@@ -9,7 +9,6 @@ joint values in place of readings. Derivation: docs/theory/engine.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -110,8 +109,7 @@ def _select(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
     return array[tuple(s if length > 1 else slice(None) for s, length in pairs)]
 
 
-@dataclass(frozen=True)
-class LinearizedLimbs:
+class LinearizedLimbs(NamedTuple):
     """Linearized closure of a block of t trials and n poses, limb by limb.
 
     Attributes

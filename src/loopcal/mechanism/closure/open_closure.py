@@ -42,7 +42,7 @@ SINGULAR = 1e-13
 """Smallest diagonal of R, relative to its largest one, of a pose that has derivatives."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """N rows: displacements e (N, d), platforms T (N, 1, 4, 4), joints of groups (N, 1, k, J + 1).
 
@@ -186,7 +186,7 @@ def fold_open_poses(
     return factor, np.broadcast_to(is_finite, shape)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _InputMap:
     """Derivatives by p parameters and a readings: of displacements (N, d, p + a), and of driven
     joints (N, a, p + a).
@@ -226,7 +226,7 @@ def _map_inputs(
     return _InputMap(displacements, joints)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Places:
     """Where the rows of one limb have their unknowns.
 

@@ -11,9 +11,9 @@ and no reading can close them again. Derivation: docs/theory/over-constraint.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,8 +45,7 @@ share of the robot's size, or this many radians. Home alone may be a special pos
 """
 
 
-@dataclass(frozen=True)
-class RepeatedDirection:
+class RepeatedDirection(NamedTuple):
     """A direction that a limb constrains although other limbs do.
 
     turns : whether it is a rotation about `axis`, else a translation along it. axis : (3,) in base
@@ -64,8 +63,7 @@ class RepeatedDirection:
         return {"turns": self.turns, "name": name, "vector": () if name else vector}
 
 
-@dataclass(frozen=True)
-class _Rows:
+class _Rows(NamedTuple):
     """The closure equations at one pose with the passive joints eliminated.
 
     A : (c, m) by the platform's freedoms, rotations over the robot's size. Q : (c, a) by driven

@@ -55,7 +55,7 @@ Term = tuple[Dimension, float, Tolerance, str, float]
 """Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlacedDrive:
     """A drive and the joint that it moves; of several joints, the first.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from loopcal.typing import FloatArray
 EX, EY, EZ = np.eye(3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointPlacement:
     """A joint of a limb, and where it is; the link before it has its name.
 
@@ -37,8 +38,7 @@ class JointPlacement:
     axis: FloatArray
 
 
-@dataclass(frozen=True)
-class PlacedLimb:
+class PlacedLimb(NamedTuple):
     """A limb for the engine, with the frames in which its file is written.
 
     Attributes

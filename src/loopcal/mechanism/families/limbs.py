@@ -193,7 +193,7 @@ class _Member:
     suffix: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _DrivenJoint:
     """A joint or rod under the name of its drive.
 

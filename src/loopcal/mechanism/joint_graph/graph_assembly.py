@@ -36,7 +36,7 @@ class Weld:
     T_b: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bodies:
     """The rigid bodies that welds make: link -> its body and T_body_link (4, 4)."""
 

@@ -26,7 +26,7 @@ MOTION = 1e-9
 Path = tuple[GraphJoint, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LimbPaths:
     """A mechanism as limbs.
 

@@ -31,7 +31,7 @@ STEPS, LARGEST_STEP = 40, 0.6
 """Newton steps, and the largest change of a joint value in one of them [rad, sizes]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Placement:
     """Places of a tree at n joint values.
 

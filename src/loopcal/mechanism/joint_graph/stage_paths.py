@@ -50,7 +50,7 @@ PARALLEL, ALONG = 1e-9, 1e-12
 """Largest sine between axes that count as parallel, and component across an axis of a frame [1]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClosedStage:
     """A stage with closed loops.
 
@@ -72,7 +72,7 @@ class ClosedStage:
         return self.paths.platform
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SerialStage:
     """A driven joint in no loop.
 
@@ -92,7 +92,7 @@ class SerialStage:
         return self.joint.body_b
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StagePaths:
     """A mechanism as stages.
 

@@ -46,7 +46,7 @@ REACHED = 1e-3
 """Distance below which a target counts as reachable, relative to the robot's size."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Point:
     """States (1, n), their differences (n, 6) from the targets in lengths [m], and the sums of
     their squares (n,) [m^2], infinite where the loops are open.
@@ -57,7 +57,7 @@ class _Point:
     cost: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Step:
     """Twists (n, 6) [rad, m], their squared change (n,) of the differences to first order [m^2],
     and the share (n, 1) that is no longer than the longest step.

@@ -36,7 +36,7 @@ ROTATION = 1e-6
 """Largest deviation of R'R from the identity: the rounding of a file with seven digits."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution(TableResult):
     """Poses and joints of n rows.
 
@@ -202,7 +202,7 @@ def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
     )
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Jacobian(TableResult):
     """Derivatives of n poses in parameters and readings, labeled.
 

@@ -7,7 +7,8 @@ in equal steps. Source: docs/theory/kinematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,8 +58,7 @@ def find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
     return failed | closed & beyond
 
 
-@dataclass(frozen=True)
-class Loops:
+class Loops(NamedTuple):
     """The loops of trials, closed at values of driven joints, or with `weights` at their sums.
 
     e : (t | 1, d). weights : (t | 1, a, n_joints).

@@ -82,7 +82,7 @@ class Proposal(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Iterate:
     """Readings of R rows and what follows from them.
 
@@ -97,7 +97,7 @@ class _Iterate:
     sign: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """R rows of a robot: the parameter values of each, and their targets.
 

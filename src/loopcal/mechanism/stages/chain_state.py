@@ -19,7 +19,7 @@ SEVERITY = (CONVERGED, EXHAUSTED, STALLED, NOT_FINITE)
 such as that of another mode, is less severe than an open loop."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ChainState(State):
     """Positions of a chain for t trials and n poses.
 

@@ -45,7 +45,7 @@ VIEWS = {(0, 1): "from above", (0, 2): "from the side", (1, 2): "from the front"
 """Directions of the second view, by the axes that it shows."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stroke:
     """A line or points (n, 3) [m] of the picture, with the arguments of matplotlib's `plot`."""
 

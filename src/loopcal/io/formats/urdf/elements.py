@@ -32,7 +32,7 @@ CONSTRAINTS = {
 """Types of a constraint -> the joint that it is; "" for none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UrdfJoint:
     """A joint.
 
@@ -59,7 +59,7 @@ class UrdfJoint:
     rounding: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UrdfConstraint:
     """A constraint between two links.
 
