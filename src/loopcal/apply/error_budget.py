@@ -228,7 +228,7 @@ def compute_error_budget(
     lines = _list_sources(fit, split, effects, is_relative=frame == RELATIVE)
     sd = np.sqrt(sum(line.parameters for line in lines))
     sd = np.where(split.undetermined, np.inf, sd)
-    places = _Places(solution, frame)
+    places = _Places(solution, frame, effects)
     lines = [replace(each, halved=_halve(fit, data, linear, each, lines, places)) for each in lines]
     position, orientation = _add_kinds(lines)
     n = len(solution.q)
@@ -282,10 +282,11 @@ def _list_sources(
 
 
 class _Places(NamedTuple):
-    """Poses, and the frame in which their errors are stated."""
+    """Poses, the frame in which their errors are stated, and these errors by the parameters."""
 
     solution: Solution
     frame: str
+    effects: ToolErrors
 
 
 def _select_discrepancy(twists: FloatArray, name: str) -> FloatArray:
@@ -306,7 +307,7 @@ def _halve(
     places: _Places,
 ) -> HalvedErrors | None:
     """Return the errors from all sources with half the sigma of one."""
-    solution, frame = places
+    solution, frame, effects = places
     position, orientation = (sum(getattr(each, name) for each in lines) for name in _LENGTHS)
     parameters = sum(each.parameters for each in lines)
     if line.source.kind in _OF_ROWS:
@@ -314,7 +315,6 @@ def _halve(
         if halved is None:
             return None
         root, linearization, problem = halved
-        posterior = replace(fit.posterior, discrepancy=None)
         if frame not in (FITTED, BASE, RELATIVE):
             frames = find_measured_frames(
                 problem,
@@ -325,9 +325,9 @@ def _halve(
                 linearization,
                 fit.residual_test.sigma_scale**2,
             )
-            posterior = replace(posterior, frames=frames)
-        effects = linearize_tool_errors(posterior, solution, frame)
-        D, own = effects.by_parameters / posterior.unit, effects.by_frame
+            posterior = replace(fit.posterior, discrepancy=None, frames=frames)
+            effects = linearize_tool_errors(posterior, solution, frame)
+        D, own = effects.by_parameters / fit.posterior.unit, effects.by_frame
         own = own[..., :0] if frame == RELATIVE else own
         angle, place = _mean_squares(np.concatenate([D @ root, own], axis=2))
         kept = [each for each in lines if each.source.kind not in _OF_ROWS]

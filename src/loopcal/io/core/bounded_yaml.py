@@ -55,20 +55,28 @@ def make_bounded_composer(loader: Any) -> Any:
         def __init__(self) -> None:
             super().__init__(loader)
             self._level = self._count = 0
+            self._parser: Any = None
             self._sizes: dict[str, int] = {}
+
+        @property
+        def parser(self) -> Any:
+            """The parser of the loader, kept because it is asked for a dozen times in a value."""
+            if self._parser is None:
+                self._parser = super().parser
+            return self._parser
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             """Return the next node; check that a key is a scalar."""
-            line = self.parser.peek_event().start_mark.line
-            node = self._compose_counted(parent, index)
+            event = self.parser.peek_event()
+            line = event.start_mark.line
+            node = self._compose_counted(parent, index, event)
             is_key = parent is not None and index is None
             if is_key and not isinstance(node, ScalarNode):
                 raise KeyTypeError(line)
             return node
 
-        def _compose_counted(self, parent: Any, index: Any) -> Any:
-            """Return the next node; count its values."""
-            event = self.parser.peek_event()
+        def _compose_counted(self, parent: Any, index: Any, event: Any) -> Any:
+            """Return the next node, whose event is the next one; count its values."""
             if isinstance(event, AliasEvent):
                 if event.anchor in self.anchors and event.anchor not in self._sizes:
                     problem = f"alias {event.anchor!r} stands for a value that contains the alias"

@@ -184,7 +184,9 @@ def read_result(path: Path) -> dict[str, Any]:
     for key in NEEDED if number == FORMAT else ():
         if key not in content or (key in NEVER_NULL and content[key] is None):
             raise report_damage(path, f"it states no {key!r}")
-    plain = json.loads(_SURROGATE.sub("?", json.dumps(content, ensure_ascii=False)))
+    text, plain = json.dumps(content, ensure_ascii=False), content
+    if _SURROGATE.search(text):
+        plain = json.loads(_SURROGATE.sub("?", text))
     stated = read_record(
         YamlFile(path, "", {}, plain), plain, StoredResult, None, word=report_damage
     )
