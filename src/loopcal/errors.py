@@ -7,6 +7,7 @@ prints it and exits with 1. Any other exception is a defect of loopcal.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
@@ -104,7 +105,5 @@ def suggest_names(name: str, allowed: Iterable[str], n: int = 3) -> str:
     names = list(islice(allowed, MOST_NAMES + 1))
     if len(names) > MOST_NAMES:
         return ""
-    from difflib import get_close_matches
-
-    close = get_close_matches(name, names, n=n, cutoff=0.6)
+    close = difflib.get_close_matches(name, names, n=n, cutoff=0.6)
     return f" (did you mean {' or '.join(repr(c) for c in close)}?)" if close else ""
