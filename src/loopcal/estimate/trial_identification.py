@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identify the free parameters of many simulated machines at once.
 
-Trials are fitted in parts of a fixed size, so that what a part computes with fits the cache and
+Trials are fitted in parts of limited size, so that what a part computes with fits the cache and
 memory holds little more than the results, however many trials there are. Parts are independent of
 each other: threads compute them in any order, with the same numbers to the last bit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from numbers import Integral
@@ -144,7 +143,7 @@ def _fit_parts(
         fit = repeat_trials(own, first, options, free)
         return _Part(fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
 
-    batches = list(_divide(problem))
+    batches = _divide(problem, threads)
     if threads == 1 or len(batches) == 1:
         return [fit(batch) for batch in batches]
     with ThreadPoolExecutor(threads) as pool:
@@ -174,11 +173,10 @@ def _descend_from_chords(
     return usual if len(again) == len(z) else fit.put(again, usual)
 
 
-def _divide(problem: Problem) -> Iterator[IntArray]:
-    """Yield the numbers of the trials of each part."""
-    size, total = problem.part_size, len(problem)
-    for first in range(0, total, size):
-        yield np.arange(first, min(first + size, total))
+def _divide(problem: Problem, threads: int) -> list[IntArray]:
+    """Return the numbers of the trials of each part: equal parts, equally many for each thread."""
+    count = -(-len(problem) // (problem.part_size * threads)) * threads
+    return np.array_split(np.arange(len(problem)), min(count, len(problem)))
 
 
 def _cut_problem(problem: Problem, trials: IntArray) -> Problem:

@@ -93,10 +93,12 @@ class Pose(ToolKind):
 
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return which residuals exist: the orientation as a whole, x y z one by one."""
-        complete = ~np.any(np.isnan(measured[..., :-3]), axis=-1, keepdims=True)
-        return np.concatenate(
-            [np.repeat(complete, 3, axis=-1), ~np.isnan(measured[..., -3:])], axis=-1
-        )
+        is_missing = np.isnan(measured)
+        present = np.ones((*measured.shape[:-1], 6), dtype=bool)
+        if is_missing.any():  # rarely, and several times as long
+            present[..., :3] = ~is_missing[..., :-3].any(axis=-1, keepdims=True)
+            present[..., 3:] = ~is_missing[..., -3:]
+        return present
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows with an incomplete orientation or a quaternion whose length is not 1."""
