@@ -48,6 +48,8 @@ from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
 DELTA = load_robot("linear-delta")
 MANY = FEWEST_POSES
 PART = MANY // SHARE
+FEW = MANY // 8
+"""Poses where `FEWEST_POSES` is changed to this."""
 SIGMA = 1e-5  # [m]
 
 
@@ -292,13 +294,17 @@ def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot
 
 
 @pytest.mark.slow
-def test_a_start_out_of_reach_is_refused_as_without_a_part(data):
+def test_a_start_out_of_reach_is_refused_as_without_a_part(monkeypatch):
+    monkeypatch.setattr(part_start, "FEWEST_POSES", FEW)  # a pose out of reach takes milliseconds
+    measured = measure(list_poses(FEW))
+    options = FitOptions(method=LeastSquares(), start=3.0 * DELTA.values)
     with pytest.raises(EstimationError, match="poses"):
-        identify(DELTA, data, options=FitOptions(method=LeastSquares(), start=3.0 * DELTA.values))
+        identify(DELTA, measured, options=options)
 
 
 @pytest.mark.slow
 def test_poses_out_of_reach_that_are_not_in_the_part_are_refused_as_without_it(monkeypatch):
+    monkeypatch.setattr(part_start, "FEWEST_POSES", FEW)
     poses, values = sample_workspace(DELTA, 500, 1).coordinates, DELTA.values.copy()
     lengths = [i for i, name in enumerate(DELTA.parameters.names) if "length" in name]
     readings, reached = measure(poses, truth=DELTA).readings, np.ones(len(poses), dtype=bool)
@@ -306,8 +312,8 @@ def test_poses_out_of_reach_that_are_not_in_the_part_are_refused_as_without_it(m
         values[lengths] *= 0.99
         reached = forward(DELTA.with_values(values), readings).converged
     assert reached.any()
-    others = np.setdiff1d(np.arange(MANY), spread_poses(MANY, PART))[:5]
-    mixed = np.resize(poses[reached], (MANY, 3))
+    others = np.setdiff1d(np.arange(FEW), spread_poses(FEW, FEW // SHARE))[:5]
+    mixed = np.resize(poses[reached], (FEW, 3))
     mixed[others] = np.resize(poses[~reached], (5, 3))
     measured, options = measure(mixed, truth=DELTA), FitOptions(LeastSquares(), start=values)
     with pytest.raises(EstimationError, match="5 of") as refused:
