@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check a wheel of loopcal-native: `python -m tools.check_wheel WHEEL FOLDER`.
 
-It contains the package, its license and one library; the library offers the C interface only, and
-names no file of the machine that built it, such as FOLDER.
+It contains the package, its license and one library. The library offers the C interface only,
+starts no threads, and names no file of the machine that built it, such as FOLDER.
 """
 
 import re
@@ -13,6 +13,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 LIBRARY = re.compile(r"loopcal_native/libloopcal\.(so|dylib|dll)")
+PARALLEL = re.compile(r"pthread_create|thrd_create|_M_start_thread|fork|clone|GOMP")
+"""Functions that start threads or processes."""
 
 
 def list_expected(names: list[str]) -> set[str]:
@@ -42,17 +44,25 @@ def find_faults(wheel: Path, folder: str) -> list[str]:
 
 
 def find_foreign_symbols(content: bytes, folder: Path) -> list[str]:
-    """List symbols that the library offers beside the C interface; by `nm`, on Linux."""
+    """List symbols that the library offers beside the C interface, and functions of threads and
+    processes that it calls; by `nm`, on Linux.
+    """
     if not content.startswith(b"\x7fELF"):
         return []
     copy = folder / "checked-library"
     copy.write_bytes(content)
-    command = ["nm", "--dynamic", "--defined-only", "--format=posix", str(copy)]
-    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    offered, called = (list_symbols(copy, kind) for kind in ("--defined-only", "--undefined-only"))
     copy.unlink()
-    offered = {line.split()[0] for line in lines}
-    faults = [f"the library offers {name}" for name in sorted(offered) if name[:8] != "loopcal_"]
+    faults = [f"the library offers {name}" for name in offered if name[:8] != "loopcal_"]
+    faults += [f"the library calls {name}" for name in called if PARALLEL.search(name)]
     return faults if offered else ["the library offers no function"]
+
+
+def list_symbols(library: Path, kind: str) -> list[str]:
+    """Return the sorted names of the dynamic symbols of a kind, an option of `nm`."""
+    command = ["nm", "--dynamic", kind, "--format=posix", str(library)]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    return sorted(line.split()[0] for line in lines)
 
 
 def main() -> int:

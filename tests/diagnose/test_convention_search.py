@@ -14,8 +14,8 @@ from loopcal.diagnose.conventions import (
     list_interpretations,
     list_reading_interpretations,
 )
-from loopcal.diagnose.conventions.actuator_orders import select_measured
-from loopcal.diagnose.conventions.reading_interpretations import list_orders
+from loopcal.diagnose.conventions.interpretations.actuator_orders import select_measured
+from loopcal.diagnose.conventions.interpretations.reading_interpretations import list_orders
 from loopcal.diagnose.conventions.selection import ALLOWED
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.measure import Component, Gaussian, Instrument, Measurements, Pose, Position, Sensor

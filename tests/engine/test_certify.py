@@ -107,3 +107,8 @@ def test_proofs_of_trials_are_those_of_single_trials(engine):
         alone = replace(goal, T=goal.T[i : i + 1, 7:9])
         sign = engine.certify(case.program, case.e[i : i + 1], case.home, alone)
         assert_array_equal(together[i, 7:9], sign[0])
+    case, goal = draw_goals(engine, load_robot("hexapod-42"), 0.4, t=1, n=6000)
+    together = engine.certify(case.program, case.e, case.home, goal)
+    for row in (0, 2999, 3000, 5999):  # NumPy tests two parts of 3000
+        alone = replace(goal, T=goal.T[:, [row]])
+        assert engine.certify(case.program, case.e, case.home, alone)[0, 0] == together[0, row]

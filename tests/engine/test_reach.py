@@ -99,7 +99,7 @@ def test_rows_of_another_sign_are_not_followed(engine):
     assert_array_equal(reached.arrives, proven != 0)
 
 
-def test_rows_do_not_depend_on_their_neighbors_nor_on_the_poses_of_the_start(engine):
+def test_rows_do_not_depend_on_their_neighbors(engine):
     robot = load_robot("hexapod-42")
     case, target = make_case(robot, t=3, n=37), draw_target(robot, ALL, 0.5, t=3, n=37)
     whole = engine.reach(case.program, case.e, target, case.home)
@@ -111,6 +111,20 @@ def test_rows_do_not_depend_on_their_neighbors_nor_on_the_poses_of_the_start(eng
         assert_array_equal(alone.state.joints[0][0], whole.state.joints[0][i, rows])
         assert_array_equal(alone.state.closure_sign[0], whole.state.closure_sign[i, rows])
         assert_array_equal(alone.arrives[0], whole.arrives[i, rows])
+    many = draw_target(robot, ALL, 0.5, t=1, n=6000)  # NumPy closes two parts of 3000
+    whole = engine.reach(case.program, case.e[:1], many, case.home)
+    for row in (0, 2999, 3000, 5999):
+        part = replace(many, values=many.values[:, [row]])
+        alone = engine.reach(case.program, case.e[:1], part, case.home)
+        assert_array_equal(alone.state.T[0, 0], whole.state.T[0, row])
+        assert_array_equal(alone.state.joints[0][0, 0], whole.state.joints[0][0, row])
+        assert alone.arrives[0, 0] == whole.arrives[0, row]
+
+
+def test_poses_of_the_start_change_joints_by_rounding_only(engine):
+    robot = load_robot("hexapod-42")
+    case, target = make_case(robot, t=3, n=37), draw_target(robot, ALL, 0.5, t=3, n=37)
+    whole = engine.reach(case.program, case.e, target, case.home)
     each = replace(case.home, T=np.repeat(case.home.T, 37, axis=1))
     own = engine.reach(case.program, case.e, target, each)
     assert_allclose(own.state.joints[0], whole.state.joints[0], atol=1e-15)  # [m] rounding

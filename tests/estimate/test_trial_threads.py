@@ -10,7 +10,10 @@ import pytest
 from loopcal.errors import ArgumentTypeError, EstimationError
 from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify_trials
 from loopcal.estimate import problem as problem_module
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.observation_rows import BLOCK
+from loopcal.estimate.problem_construction import problem_of_trials
+from loopcal.estimate.trial_identification import divide_trials
 from loopcal.io import load_robot
 from loopcal.measure import (
     Gaussian,
@@ -73,6 +76,23 @@ def test_a_trial_that_fails_in_a_thread_stops_no_other():
     options = FitOptions(method=MAP(), start=start)
     result = identify_trials(DELTA, trials, options=options, threads=2)
     assert np.flatnonzero(~result.converged).tolist() == [5]
+
+
+@pytest.mark.parametrize(
+    ("trials", "threads", "sizes"),
+    [
+        (3, 2, [3]),  # too few for two parts
+        (4, 2, [4]),
+        (9, 1, [3, 3, 3]),
+        (9, 2, [3, 2, 2, 2]),  # four parts, so that both threads have two
+        (9, 64, [3, 3, 3]),
+        (41, 4, [4] * 5 + [3] * 7),
+    ],
+)
+def test_parts_are_equal_and_equally_many_for_each_thread(trials, threads, sizes):
+    problem = problem_of_trials(select_free_parameters(DELTA), simulate(trials))
+    assert problem.part_size == 4
+    assert [len(part) for part in divide_trials(problem, threads)] == sizes
 
 
 @pytest.mark.parametrize("threads", [0, -1])

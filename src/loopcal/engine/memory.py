@@ -4,7 +4,9 @@
 import numpy as np
 
 LARGE = 3_900_000
-"""Numbers of an array just below the largest (32 MB) that glibc adapts itself to."""
+"""Length of an array of float64 that takes 31 MB, just below the 32 MB up to which glibc adapts its
+limits.
+"""
 
 
 def keep_freed_memory() -> None:

@@ -199,5 +199,5 @@ def repeat_trial(start: Start, count: int) -> Start:
 
 
 def join_fits(batches: Sequence[ResampleFits]) -> ResampleFits:
-    """Return the fits of all parts."""
+    """Return the fits of all batches."""
     return TrialBatch.join(batches)

@@ -89,7 +89,7 @@ def identify_trials(
     method = adapt_method(options.method, free.assumed, options.noise, free.correlation)
     options = replace(options, method=method)
     shared = None
-    if chord_start and options.begin == "kinematics" and len(values) == 1 and len(z):
+    if chord_start and options.begin == "kinematics" and len(values) == 1:
         shared = share_factor(problem, z[:1], method, options.rank_tolerance)
     fits = _fit_parts(problem, z, options, free, threads, shared)
     return IdentifiedTrials(
@@ -143,10 +143,10 @@ def _fit_parts(
         fit = repeat_trials(own, first, options, free)
         return _Part(fit.deviation, fit.status, fit.iterations, fit.cost, fit.linear_model)
 
-    batches = _divide(problem, threads)
+    batches = divide_trials(problem, threads)
     if threads == 1 or len(batches) == 1:
         return [fit(batch) for batch in batches]
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(min(threads, len(batches))) as pool:
         return list(pool.map(fit, batches))
 
 
@@ -173,10 +173,15 @@ def _descend_from_chords(
     return usual if len(again) == len(z) else fit.put(again, usual)
 
 
-def _divide(problem: Problem, threads: int) -> list[IntArray]:
-    """Return the numbers of the trials of each part: equal parts, equally many for each thread."""
-    count = -(-len(problem) // (problem.part_size * threads)) * threads
-    return np.array_split(np.arange(len(problem)), min(count, len(problem)))
+def divide_trials(problem: Problem, threads: int) -> list[IntArray]:
+    """Return the numbers of the trials of each part: equal parts, and equally many for each thread
+    unless they were too small.
+    """
+    least = -(-len(problem) // problem.part_size)
+    count = -(-least // threads) * threads
+    if 2 * count > 3 * least:  # a part takes milliseconds of Python, which runs in one thread
+        count = least
+    return np.array_split(np.arange(len(problem)), count)
 
 
 def _cut_problem(problem: Problem, trials: IntArray) -> Problem:

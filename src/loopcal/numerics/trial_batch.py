@@ -87,7 +87,7 @@ class TrialBatch:
 
     @staticmethod
     def join(batches: Sequence[Value]) -> Value:
-        """Return the trials of all parts, one after the other."""
+        """Return the trials of all batches, one after the other."""
         if len(batches) == 1:
             return batches[0]
         return map_arrays(lambda *arrays: np.concatenate(arrays), *batches)

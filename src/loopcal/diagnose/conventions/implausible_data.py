@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose.conventions.convention_check import IMPLAUSIBLE, ConventionCheck
-from loopcal.diagnose.conventions.equal_interpretations import report_equals
+from loopcal.diagnose.conventions.convention_result import IMPLAUSIBLE, ConventionCheck
+from loopcal.diagnose.conventions.interpretations.equal_interpretations import report_equals
+from loopcal.diagnose.conventions.interpretations.setup_interpretations import SetupInterpretation
 from loopcal.diagnose.conventions.judgement import BETTER, list_rms_residuals
 from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
@@ -27,7 +28,6 @@ from loopcal.diagnose.conventions.selection import (
     search_interpretations,
     shares_poses,
 )
-from loopcal.diagnose.conventions.setup_interpretations import SetupInterpretation
 from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_contradiction
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, Severity, report_finding

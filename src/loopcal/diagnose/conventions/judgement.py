@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal import measure
-from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation
 from loopcal.diagnose.conventions.misfit import (
     QUICK,
     THOROUGH,

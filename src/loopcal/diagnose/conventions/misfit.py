@@ -30,7 +30,7 @@ from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from loopcal.diagnose.conventions.interpretations import Interpretation
+    from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation
 
 FEWEST = 3
 """Smallest number of equations beyond those of unknown frames that gives a misfit."""

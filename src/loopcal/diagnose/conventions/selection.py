@@ -14,7 +14,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations import Interpretation, combine
+from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation, combine
+from loopcal.diagnose.conventions.interpretations.reading_interpretations import (
+    list_reading_interpretations,
+)
+from loopcal.diagnose.conventions.interpretations.setup_interpretations import (
+    list_setup_interpretations,
+)
+from loopcal.diagnose.conventions.interpretations.value_interpretations import list_interpretations
+from loopcal.diagnose.conventions.interpretations.zero_interpretations import (
+    find_zero_interpretations,
+)
 from loopcal.diagnose.conventions.judgement import (
     BETTER,
     compute_rms_residuals,
@@ -34,11 +44,7 @@ from loopcal.diagnose.conventions.misfit import (
     exclude_far_rows,
     select_reached,
 )
-from loopcal.diagnose.conventions.reading_interpretations import list_reading_interpretations
 from loopcal.diagnose.conventions.refinement import explains_after_fit, refine_misfit
-from loopcal.diagnose.conventions.setup_interpretations import list_setup_interpretations
-from loopcal.diagnose.conventions.value_interpretations import list_interpretations
-from loopcal.diagnose.conventions.zero_interpretations import find_zero_interpretations
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.measure import Measurements
 from loopcal.mechanism import compute_readings, find_directly_reachable

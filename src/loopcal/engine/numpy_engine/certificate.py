@@ -55,10 +55,10 @@ def certify(program: Program, e: FloatArray, start: State, goal: State) -> NDArr
     with np.errstate(all="ignore"):
         begin = Begin.prepare(program, e, start)
         for i in range(t):
-            one = begin.select(min(i, len(e) - 1))
+            of_trial = begin.select(min(i, len(e) - 1))
             for rows in divide_rows(n):
                 goals = _repeat_single(goal.T[i, rows, :3].transpose(1, 2, 0))
-                out[i, rows] = np.where(one.reaches(goals), one.sign, 0)[: n - rows.start]
+                out[i, rows] = np.where(of_trial.reaches(goals), of_trial.sign, 0)[: n - rows.start]
     return out
 
 
@@ -135,8 +135,8 @@ class Begin(NamedTuple):
         bend = self.bend[0] + (self.bend[1] + self.bend[2] * h) * h
         off = np.einsum("ij,fjn->fin", inverse, rows)
         off[range(6), range(6)] -= 1.0
-        # the spectral norm of `off` is below its Frobenius norm, and below the root of that of
-        # off' off, which is smaller: it is computed where the first one proves nothing
+        # two bounds of the spectral norm of `off`: its Frobenius norm, and where that is too large
+        # to prove anything, the root of the Frobenius norm of off' off, which is smaller
         change, deviation = np.sqrt(bend) * error, np.sqrt(_sum_squares(off))
         contracts = change <= CONTRACTION * (1 - deviation)
         if not contracts.all():
@@ -157,7 +157,7 @@ def _sum_squares(matrix: FloatArray) -> FloatArray:
 
 
 def _bound_norm(matrix: FloatArray) -> FloatArray:
-    """Return the root of the Frobenius norm of A A' (N,) for a transposed matrix A (c, r, N)."""
+    """Return the root of the Frobenius norm (N,) of A A', from A' as an array (c, r, N)."""
     square = np.zeros(matrix.shape[-1])
     for f, column in enumerate(matrix):
         products = np.einsum("in,gin->gn", column, matrix[f:])

@@ -276,6 +276,16 @@ def split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
     return out
 
 
+def add_terms(terms: FloatArray) -> FloatArray:
+    """Return the sums (..) of terms (k, ..), always added in their order.
+
+    NumPy adds eight or more numbers of a single row in pairs, so that its sum would have other bits
+    than beside other rows.
+    """
+    is_single = terms.size == len(terms)
+    return np.add.accumulate(terms)[-1] if is_single and terms.size else np.add.reduce(terms)
+
+
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """Multiply (3, 3, ..) by (3, 3, ..)."""
     return a[:, 0, None] * b[None, 0] + a[:, 1, None] * b[None, 1] + a[:, 2, None] * b[None, 2]

@@ -19,6 +19,7 @@ from loopcal.engine.numpy_engine.certificate import has_driven_rods
 from loopcal.engine.numpy_engine.closure import (
     Chain,
     PlacedLinks,
+    add_terms,
     divide_rows,
     dot,
     exponential,
@@ -246,15 +247,15 @@ class _Equations:
         inner = np.zeros(N)
         for top in tops:
             if len(top):
-                inner += np.add.reduce(np.add.reduce(top[:, -1] ** 2, axis=0), axis=0)
-        norm = np.sqrt(inner + np.add.reduce(low[:, m:] ** 2, axis=0).reshape(N))
+                inner += add_terms(add_terms(top[:, -1] ** 2))
+        norm = np.sqrt(inner + add_terms(low[:, m:] ** 2).reshape(N))
         sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
         count = count_reflections(len(low), m)
         low = triangularize(low, m, overwrite=True)
         diagonal = np.diagonal(low[:m, :m])
         sign = sign * (-1.0) ** count * np.multiply.reduce(np.sign(diagonal), axis=-1)
         y = back_substitute(low[:m, :m], -low[:m, m:]).reshape(m, N)
-        reducible = np.sqrt(inner + np.add.reduce(low[:m, m:] ** 2, axis=0).reshape(N))
+        reducible = np.sqrt(inner + add_terms(low[:m, m:] ** 2).reshape(N))
         twist = np.zeros((6, N))
         twist[list(program.freedoms)] = y
         turns = [top[:, -1] for top in tops]
@@ -279,7 +280,7 @@ class _Equations:
         limbs = zip(program.groups, equations.links, values, strict=True)
         for group, links, theta in limbs:
             residual = Chain(group, links, T, theta, program.size).residual()
-            square += np.add.reduce(np.add.reduce(residual**2, axis=0), axis=0)
+            square += add_terms(add_terms(residual**2))
         if self.task is not None:
             residual, _ = self.task(T.transpose(2, 0, 1), equations.rows)
             square += np.add.reduce(residual**2, axis=1)

@@ -38,7 +38,7 @@ class PoseStates(TrialBatch):
 
     @staticmethod
     def join_poses(states: Sequence[PoseStates], order: IntArray) -> PoseStates:
-        """Return the poses of all parts side by side, then in an order."""
+        """Return the poses of all states side by side, then in an order."""
         return map_arrays(lambda *arrays: np.concatenate(arrays, axis=1)[:, order], *states)
 
 

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation
+from loopcal.diagnose.conventions.interpretations.reading_interpretations import (
+    list_reading_interpretations,
+)
 from loopcal.diagnose.conventions.judgement import judge_data
 from loopcal.diagnose.conventions.misfit import ALLOWED, is_redundant
-from loopcal.diagnose.conventions.reading_interpretations import list_reading_interpretations
 from loopcal.diagnose.conventions.refinement import refine_misfit
 from loopcal.diagnose.conventions.selection import FEWEST_POSES
 from loopcal.estimate.free_parameters import FreeParameters

@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation
 from loopcal.measure import Kind, Measurements
 
 DECLARED = ("frame", "targets", "tool", "anchor")

@@ -10,8 +10,15 @@ from itertools import combinations, permutations
 import numpy as np
 
 from loopcal.diagnose.conventions.changes import permute_columns, scale_chosen, scale_columns
-from loopcal.diagnose.conventions.interpretations import Interpretation, Slip, name_source
-from loopcal.diagnose.conventions.value_interpretations import FACTORS, describe_unit
+from loopcal.diagnose.conventions.interpretations.interpretation import (
+    Interpretation,
+    Slip,
+    name_source,
+)
+from loopcal.diagnose.conventions.interpretations.value_interpretations import (
+    FACTORS,
+    describe_unit,
+)
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism import Actuator
 from loopcal.typing import BoolArray, FloatArray

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation
 from loopcal.diagnose.conventions.judgement import guess_frames
 from loopcal.diagnose.conventions.misfit import MOST_EXCLUDED
 from loopcal.estimate.free_parameters import FreeParameters

@@ -34,7 +34,7 @@ def report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Fi
         )
     if not is_redundant(free):
         return None
-    from loopcal.diagnose.conventions.actuator_orders import find_equal_orders
+    from loopcal.diagnose.conventions.interpretations.actuator_orders import find_equal_orders
 
     orders = find_equal_orders(free, data)
     if not orders:

@@ -15,7 +15,11 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.diagnose.conventions.changes import Change, permute_columns, scale_columns
-from loopcal.diagnose.conventions.interpretations import Interpretation, Slip, name_source
+from loopcal.diagnose.conventions.interpretations.interpretation import (
+    Interpretation,
+    Slip,
+    name_source,
+)
 from loopcal.geometry.orientation_forms import OrientationForm, parse_orientation
 from loopcal.measure.kinds import Bearing, Component, Kind, Pose
 from loopcal.measure.measurements import Measurements
