@@ -288,7 +288,7 @@ def compute_row_errors(
             )
             errors_by_quantity.setdefault(group.quantity, []).append(errors)
         first_row += len(o)
-    joined = {name: _join(of_kinds) for name, of_kinds in errors_by_quantity.items()}
+    joined = {name: _join(errors_by_kind) for name, errors_by_kind in errors_by_quantity.items()}
     return PoseErrors({name: errors for name, errors in joined.items() if len(errors.rows)})
 
 
@@ -361,13 +361,13 @@ def _median_of_largest(variances: FloatArray) -> float:
     return float(np.sqrt(high))
 
 
-def _join(errors_of_kinds: Sequence[QuantityErrors]) -> QuantityErrors:
+def _join(errors_by_kind: Sequence[QuantityErrors]) -> QuantityErrors:
     """Return the errors of one quantity of several kinds or sets as one."""
-    names = dict.fromkeys(name for part in errors_of_kinds for name in part.measured)
+    names = dict.fromkeys(name for errors in errors_by_kind for name in errors.measured)
     return QuantityErrors(
-        errors_of_kinds[0].dimension,
-        np.concatenate([part.components for part in errors_of_kinds]),
-        np.concatenate([part.rows for part in errors_of_kinds]),
-        tuple(target for part in errors_of_kinds for target in part.targets),
+        errors_by_kind[0].dimension,
+        np.concatenate([errors.components for errors in errors_by_kind]),
+        np.concatenate([errors.rows for errors in errors_by_kind]),
+        tuple(target for errors in errors_by_kind for target in errors.targets),
         tuple(names),
     )

@@ -310,11 +310,11 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def stack(parts: Sequence[FloatArray]) -> FloatArray:
-    """Return arrays as one, (parts, ..), each as large as the largest; faster than `np.stack`."""
-    out = np.empty((len(parts), *max(parts, key=np.size).shape))
-    for i, part in enumerate(parts):
-        out[i] = part
+def stack(arrays: Sequence[FloatArray]) -> FloatArray:
+    """Return arrays as one, (arrays, ..), each as large as the largest; faster than `np.stack`."""
+    out = np.empty((len(arrays), *max(arrays, key=np.size).shape))
+    for i, array in enumerate(arrays):
+        out[i] = array
     return out
 
 

@@ -71,8 +71,8 @@ def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     height = PART * p
     count = rows.shape[1] // height
     if count > 1:
-        parts = stack[-1][:, : count * height].reshape(t, count, height, p)
-        factors = np.asarray(np.linalg.qr(parts, mode="r"))
+        divided = stack[-1][:, : count * height].reshape(t, count, height, p)
+        factors = np.asarray(np.linalg.qr(divided, mode="r"))
         stack[-1:] = factors.reshape(t, count * p, p), stack[-1][:, count * height :]
     whole = stack[0] if len(stack) == 1 else np.concatenate(stack, axis=1)
     R = np.asarray(np.linalg.qr(whole, mode="r"))

@@ -326,8 +326,8 @@ class _Equations:
     def _length(self, twist: FloatArray, turns: list[FloatArray]) -> FloatArray:
         """Return the length of a step [m]: its largest part, an angle times the robot's size."""
         size = self.program.size
-        parts = np.maximum.reduce(np.abs(twist).reshape(2, 3, -1), axis=1)
-        length = np.maximum(parts[0] * size, parts[1])
+        turned, moved = np.maximum.reduce(np.abs(twist).reshape(2, 3, -1), axis=1)
+        length = np.maximum(turned * size, moved)
         for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
             for j, part in zip(unknown, turn, strict=True):
                 unit = size if group.joints[j : j + 1] == "R" else 1.0

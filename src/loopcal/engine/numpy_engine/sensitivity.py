@@ -117,15 +117,15 @@ def _select_entries(group: Group, inputs: ParameterMap) -> _Entries:
     own = np.flatnonzero((place >= group.columns.start) & (place < group.columns.stop))
     limb, column = np.divmod(place[own] - group.columns.start, max(slots, 1))
     ones = np.ones((*inputs.basis.shape[:2], len(own)))
-    parts = [(limb, column, parameter[own], inputs.displacements[:, own], ones)]
+    entries = [(limb, column, parameter[own], inputs.displacements[:, own], ones)]
     driven = tuple(np.flatnonzero(group.actuator[:, 0] >= 0).tolist())
     joint, function, parameter = pattern.joints.T
     for i, j in enumerate(driven):
         limb, own = np.nonzero(group.actuator[j][:, None] == joint)
         basis = inputs.basis[:, :, joint[own], function[own]]
         column = np.full(len(own), slots + i)
-        parts.append((limb, column, parameter[own], inputs.joints[:, own], basis))
-    arrays = [np.concatenate(of_all, axis=-1) for of_all in zip(*parts, strict=True)]
+        entries.append((limb, column, parameter[own], inputs.joints[:, own], basis))
+    arrays = [np.concatenate(of_all, axis=-1) for of_all in zip(*entries, strict=True)]
     order = np.lexsort((arrays[2], arrays[0]))
     return _Entries(*(array[..., order] for array in arrays), driven=driven)
 
@@ -163,8 +163,8 @@ def _close(program: Program, chain: Chain, driven: tuple[int, ...]) -> _ClosedRo
         else:
             turns, tip = axis < 3, j != chain.last
             if (j, turns) not in local:
-                at = (bending[j] if tip else moment) if turns else force
-                local[j, turns] = _take_to_link(chain, j, -at if tip else at)
+                wrench = (bending[j] if tip else moment) if turns else force
+                local[j, turns] = _take_to_link(chain, j, -wrench if tip else wrench)
             frame = chain.links.slope[j] if turns else chain.links.nominal[j]
             columns[:, c] = dot(frame[:, axis % 3, None], local[j, turns])
     for c, j in enumerate(driven, len(group.slots)):

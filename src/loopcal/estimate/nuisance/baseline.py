@@ -66,16 +66,16 @@ def fit_setup_alone(
     if not reached.any():
         return unknown
     reached_data = data.take(reached)
-    of_reached = reached_data.nuisance_parameters
+    reached_setup = reached_data.nuisance_parameters
     entries = {entry.name: entry for entry in table.entries}
-    stated = ParameterTable(tuple(entries[name] for name in of_reached.table.names))
+    stated = ParameterTable(tuple(entries[name] for name in reached_setup.table.names))
     nothing = np.zeros(0)
     fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
-    setup, z = replace(of_reached, table=stated), nothing[None]
+    setup, z = replace(reached_setup, table=stated), nothing[None]
     problem = problem_of(fixed, reached_data, setup)
     try:
         fitted = problem.solve(z, problem.start(z)).nuisance
     except DataError:  # too few rows for a closed form
         return unknown
-    values = {} if fitted is None else dict(zip(of_reached.table.names, fitted[0], strict=True))
+    values = {} if fitted is None else dict(zip(reached_setup.table.names, fitted[0], strict=True))
     return np.array([values.get(name, unknown[i]) for i, name in enumerate(table.names)])

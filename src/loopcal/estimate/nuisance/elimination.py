@@ -170,12 +170,12 @@ class NuisanceElimination:
         """Write the start values of one cluster into values (U,): chosen are its rows, the number
         of their kind, and which of its rows (r,) they are.
         """
-        of_kinds = [self.local.indices[i][members] for _, i, members in chosen]
+        places_by_kind = [self.local.indices[i][members] for _, i, members in chosen]
         factors = [(self.local.factor(i), members) for _, i, members in chosen]
-        used = find_distinct(np.concatenate([places.ravel() for places in of_kinds]))
+        used = find_distinct(np.concatenate([places.ravel() for places in places_by_kind]))
         setup = NuisanceParameters(
             ParameterTable(tuple(self.local.table.entries[i] for i in used)),
-            tuple(np.searchsorted(used, places) for places in of_kinds),
+            tuple(np.searchsorted(used, places) for places in places_by_kind),
             tuple(None if factor is None else factor[members] for factor, members in factors),
         )
         part = replace(
