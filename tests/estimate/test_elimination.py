@@ -326,7 +326,7 @@ def test_planes_that_share_a_probe_give_the_joint_solution(held):
 def test_groups_split_over_row_blocks_give_the_same_factor(monkeypatch):
     data = simulate_probed_planes(7)
     whole = linearize_nominal(data)[0]
-    monkeypatch.setattr(problem_module, "BLOCK", 5)
+    monkeypatch.setattr(problem_module, "EXACT_BLOCK", 5)
     parts = linearize_nominal(data)[0]
     assert_allclose(
         parts.T @ parts, whole.T @ whole, rtol=0, atol=1e-10 * np.abs(whole.T @ whole).max()

@@ -15,10 +15,11 @@ import loopcal as lc
 from loopcal.cli import main
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP
+from loopcal.estimate.observation_rows import BLOCK, EXACT_BLOCK
 from loopcal.findings import Quantity, Severity, report_finding
 from loopcal.io import load_run, save_run
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
+from loopcal.measure import Gaussian, Instrument, Pose, Position, Sensor, sample_truth, simulate
 from loopcal.workflow import CalibrationOptions, Verdict, calibrate, split_data
 from loopcal.workflow.verdict import choose_next_step, decide_verdict
 from tests.estimate.problems import hexapod, hexapod_data
@@ -401,3 +402,18 @@ def test_next_step_after_an_exceeded_limit_names_repeatability_that_no_calibrati
         assert step((failure,), shares).code == "workflow.next-measure-more"
     grown = report_finding("gates.errors-grew", quantity="position", times=1.4)
     assert step((failure, grown), {"position": 0.83}).code == "workflow.next-measure-more"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Position(), Position(unknown=("frame",))], ids=repr)
+@pytest.mark.parametrize("n", [BLOCK + 1, EXACT_BLOCK + 1])
+def test_poses_of_several_blocks_are_calibrated_with_all_findings(kind, n):
+    """Poses that one problem solved serve others with further parameters, in the same blocks."""
+    robot = lc.load_robot("linear-delta")
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    poses = np.resize(lc.sample_workspace(robot, 400, seed=1).coordinates, (n, 3))
+    noise = Gaussian(np.full(3, 1e-5))  # [m]
+    report = calibrate(robot, simulate(truth, poses, Instrument((Sensor(kind, noise),)), 0))
+    assert report.identification.converged
+    assert report.identification.residual_test.p_value > 1e-3
+    assert report.failures == ()

@@ -24,11 +24,12 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 BLOCK = 2048
 """Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
 enough for the cache."""
-PLAIN_BLOCK = 8192
-"""The same of rows that the engine folds as it makes them, so that less of them is in memory."""
+EXACT_BLOCK = 4096
+"""The same of poses that exact readings determine. All problems of the same poses have the same
+blocks, so that poses that one of them solved serve another one."""
 TRIAL_BLOCK = 16384
-"""The same where the poses are those of many trials: larger parts leave less time to Python, which
-runs in one thread at a time."""
+"""The same for many trials whose rows the engine folds as it makes them, so that less of them is in
+memory: larger parts leave less time to Python, which runs in one thread at a time."""
 
 
 def _no_nuisance() -> IntArray:

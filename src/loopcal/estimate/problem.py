@@ -29,7 +29,7 @@ from loopcal.estimate.linearization import LeverageRows, Linearization, Start
 from loopcal.estimate.nuisance.elimination import NuisanceElimination, fold_node_rows
 from loopcal.estimate.observation_rows import (
     BLOCK,
-    PLAIN_BLOCK,
+    EXACT_BLOCK,
     TRIAL_BLOCK,
     ObservationRows,
     Residuals,
@@ -94,8 +94,7 @@ class Problem:
         """Rows at the poses, which readings determine or which are estimated."""
         observed = self.free, self.readings[0], self.rows, self.nuisance
         if self.coordinates is None:
-            size = PLAIN_BLOCK if self.folds_plain_rows else BLOCK
-            return divide_exact_poses(*observed, self.located, size)
+            return divide_exact_poses(*observed, self.located, EXACT_BLOCK)
         from loopcal.estimate.poses.uncertain_division import divide_uncertain_poses
 
         assert self.member is not None
