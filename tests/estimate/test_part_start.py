@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import loopcal.estimate.problem as problem_module
 from loopcal.diagnose import check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import (
@@ -272,6 +273,7 @@ def test_parts_are_not_of_chains_of_stages_or_open_sums(monkeypatch, name):
     ("robot", "kind", "count"), [(DELTA, Position(), 6), (load_robot("hexapod-42"), Pose(), 0)]
 )
 def test_motions_of_frames_are_those_that_all_rows_leave_open(monkeypatch, robot, kind, count):
+    monkeypatch.setattr(problem_module, "EXACT_BLOCK", BLOCK)  # two blocks of poses
     poses = np.resize(sample_workspace(robot, 500, 1).coordinates, (3000, len(robot.controlled)))
     noise = Gaussian(np.full(len(kind.noise_columns), SIGMA))
     measured = simulate(robot, poses, Instrument((Sensor(kind, noise),)), 0)
