@@ -260,7 +260,7 @@ def list_coordinates(
 
 
 def divide_rows(count: int) -> list[slice]:
-    """Return parts of rows that are computed together, at most CHUNK in each, of almost equal size."""
+    """Return parts of almost equal size, at most CHUNK rows each, that are computed together."""
     step = -(-count // max(-(-count // CHUNK), 1))
     return [slice(first, first + step) for first in range(0, count, max(step, 1))]
 
