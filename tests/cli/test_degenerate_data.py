@@ -60,7 +60,7 @@ def test_no_command_shows_or_writes_what_is_not_finite(case, tmp_path, monkeypat
         "budget run",
         "compensate run targets.csv -o q.csv --force",
         "identifiability linear-delta data.csv",
-        "region run",
+        "sample run --region",
     ):
         check_output(words, capsys)
     for path in [*tmp_path.glob("run/*.yaml"), *tmp_path.glob("run/*.json"), *tmp_path.glob("q*")]:

@@ -317,5 +317,5 @@ def test_run_of_a_chosen_set_of_parameters_is_read_back_and_exported(tmp_path, r
     posterior = load_run(run).load_posterior()
     table = posterior.robot.parameters
     assert [table.names[i] for i in posterior.places] == [row["name"] for row in stated]
-    assert main(f"region {run}".split()) == 0
+    assert main(f"sample {run} --region".split()) == 0
     assert main(f"export {run} -o {tmp_path / 'printer.cfg'}".split()) == 0

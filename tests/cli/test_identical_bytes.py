@@ -29,7 +29,7 @@ budget run --json
 compensate run targets.csv -o commands.csv
 bootstrap run --count 20 --json
 sample run --json
-region run -p west.motor.* --json
+sample run --region -p west.motor.* --json
 plan five-bar -o plan --kind position --candidates 40 --accuracy 0.3mm
 plan linear-delta -o surfaces --measure plane-line --groups 4 --points 4
 import {{root}}/examples/cable-robot/samples.json --format hangprinter -o cable.yaml

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal bootstrap`, `loopcal sample` and `loopcal region` from a run folder and from files."""
+"""`loopcal bootstrap` and `loopcal sample` from a run folder and from files."""
 
 import csv
 import json
@@ -94,7 +94,7 @@ def test_files_give_the_same_fit_as_a_run(folder, capsys) -> None:
 
 def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, capsys) -> None:
     run = str(folder / "run")
-    words = ["region", run, "-p", "leg1.base.x", "-p", "leg1.base.y", "--level", "0.9"]
+    words = ["sample", run, "--region", "-p", "leg1.base.x", "-p", "leg1.base.y", "--level", "0.9"]
     document = run_json(capsys, *words)
     run_arrays = lc.load_run(run).arrays
     region = document["region"]
@@ -106,9 +106,9 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, cap
     assert "+/- all at once" in text
     assert "Joint 90 % region" in text
     assert "degrees of freedom)" in " ".join(text.split())
-    assert main(["region", run, "-p", "leg1.base.x"]) == 0
+    assert main(["sample", run, "--region", "-p", "leg1.base.x"]) == 0
     assert "95 % intervals that hold for 1 parameter\n" in capsys.readouterr().out
-    assert main(["region", run, "--rule", "scheffe"]) == 0
+    assert main(["sample", run, "--region", "--rule", "scheffe"]) == 0
     assert "all 42 parameters at once" in capsys.readouterr().out
 
 
@@ -120,8 +120,13 @@ def test_region_shows_intervals_for_all_at_once_and_the_joint_region(folder, cap
         (["bootstrap", "RUN", "--unit", "month"], "must be one of pose, block, session, day"),
         (["sample", "RUN", "--count", "5"], "100"),
         (["sample", "hexapod-42", "DATA", "--method", "ridge"], "penalty without a probability"),
-        (["region", "RUN", "-p", "leg9.base.x"], "no free parameter is called 'leg9.base.x'"),
-        (["region", "RUN", "--level", "1.5"], "1.5"),
+        (
+            ["sample", "RUN", "--region", "-p", "leg9.base.x"],
+            "no free parameter is called 'leg9.base.x'",
+        ),
+        (["sample", "RUN", "--region", "--level", "1.5"], "1.5"),
+        (["sample", "RUN", "--region", "--seed", "1"], "--seed has no effect with --region"),
+        (["sample", "RUN", "-p", "leg1.base.x"], "has no effect without --region"),
         (["bootstrap", "hexapod-42"], "run folder"),
         (["sample", "DATA"], "give a run folder, or the files of measurements after"),
     ],

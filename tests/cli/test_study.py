@@ -191,16 +191,6 @@ def test_ctrl_c_leaves_a_folder_that_is_continued(tmp_path) -> None:
     assert "Traceback" not in err
 
 
-@pytest.mark.slow
-def test_time_limit_leaves_a_folder_that_is_continued(run, tmp_path) -> None:
-    file = write_study(tmp_path, 100_000, 5).name
-    code, _, err = run(f"run {file} -o f {ONE} --time-limit 2s")
-    assert code == 4
-    assert "the time limit of 2 s was reached" in err
-    assert "blocks are stored in f, and the study can be continued there" in err
-    assert "no result was written" not in err
-
-
 FULL = """
 import os
 from loopcal.cli import main

@@ -50,13 +50,11 @@ def test_every_option_of_a_command_is_drawn(name) -> None:
     assert {opt for p in command.params for opt in p.opts if opt.startswith("-")} <= drawn
 
 
-@pytest.mark.parametrize(("code", "rules"), [(4, set()), (0, {"warning"})])
-def test_file_that_a_time_limit_left_open_is_no_find(tmp_path, code, rules) -> None:
-    said = "" if code == 0 else "loopcal: the time limit of 0.001 s was reached\n"
-    outcome = answer(code, err=said)
+def test_file_that_is_left_open_is_a_find(tmp_path) -> None:
+    outcome = answer(0)
     outcome.warned = ["ResourceWarning: unclosed file <x> (os:1)"]
-    case = Case(1, "five-bar", ["check", "robot.yaml", "--time-limit", "1s"], {}, [])
-    assert {find.rule for find in judge(case, outcome, tmp_path)} == rules
+    case = Case(1, "five-bar", ["check", "robot.yaml"], {}, [])
+    assert {find.rule for find in judge(case, outcome, tmp_path)} == {"warning"}
 
 
 def answer(code, out="", err="", before=(), after=()) -> Outcome:
@@ -80,7 +78,6 @@ def answer(code, out="", err="", before=(), after=()) -> Outcome:
         (answer(1, err="loopcal: a gap of unknown mm stays open\n"), ["no-number"]),
         (answer(1, err="loopcal: a.csv:1: '-inf um' is not finite\n"), []),
         (answer(0, out='{"text": "it is -inf deg"}\n'), ["no-number", "non-finite"]),
-        (answer(4, err="loopcal: the time limit was reached\n"), ["exit-code"]),
         (answer(0, after={"a.csv": b"x\ninf\n"}), ["non-finite"]),
         (answer(0, after={"a.json": b"{"}), ["unreadable"]),
         (answer(0, after={"a.csv": b"\xff"}), ["unreadable"]),
@@ -90,19 +87,6 @@ def answer(code, out="", err="", before=(), after=()) -> Outcome:
 def test_answers_that_break_a_rule_are_finds(tmp_path, outcome, rules) -> None:
     case = Case(1, "five-bar", ["check", "robot.yaml"], {})
     assert [find.rule for find in judge(case, outcome, tmp_path)] == rules
-
-
-def test_reached_time_limit_leaves_no_output(tmp_path) -> None:
-    case = Case(1, "five-bar", ["check", "robot.yaml", "--time-limit", "1s"], {})
-    said = "loopcal: the time limit was reached\n"
-    assert judge(case, answer(4, err=said), tmp_path) == []
-    (find,) = judge(case, answer(4, err=said, after={"out": b"1"}), tmp_path)
-    assert find.rule == "left-output"
-
-
-def test_options_that_the_command_line_adds_are_drawn_too() -> None:
-    for command in list_commands().values():
-        assert "--time-limit" in {opt for p in command.params for opt in p.opts}
 
 
 def test_traceback_is_known_by_its_innermost_function_of_loopcal(tmp_path) -> None:

@@ -44,8 +44,8 @@ class Machine:
     words: list[str] = field(default_factory=list)
     trees: dict[str, Any] = field(default_factory=dict)
     """Files by name, parsed: YAML and JSON."""
-    left_out: frozenset[str] = frozenset({"--live"})
-    """Options that are not added to its command lines; `view --live` runs until it is stopped."""
+    left_out: frozenset[str] = frozenset()
+    """Options that are not added to its command lines."""
 
 
 @dataclass(frozen=True)
@@ -246,8 +246,8 @@ def _list_lines(recipe: Recipe) -> Iterator[Line]:
         1 bootstrap run --count 6
         0.5 bootstrap robot.yaml data.csv --count 6 -o out.csv
         0.5 sample run --count 100 -o out.csv
-        2 region run -p {name}
-        1 region robot.yaml data.csv
+        2 sample run --region -p {name}
+        1 sample robot.yaml data.csv --region
         0.3 plan robot.yaml -o out {few} {plan}
         0.2 plan robot.yaml -o out {few} --like data.csv --measured more.csv
         0.3 plan robot.yaml -o plan {few} --allowed targets.csv --force

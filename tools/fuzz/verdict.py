@@ -14,7 +14,6 @@ from itertools import pairwise
 from pathlib import Path
 from xml.parsers import expat
 
-from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
 from tools.fuzz.cases import Case
 from tools.fuzz.execution import CPU_LIMIT, Outcome
 
@@ -45,12 +44,6 @@ class Find:
         return f"{self.rule}: {self.place}"
 
 
-ABANDONED_FILE = "ResourceWarning: unclosed file"
-"""A time limit that strikes between the opening of a file and the next instruction leaves the file
-to Python, which closes it; no code can prevent that.
-"""
-
-
 def judge(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     """Return every rule that the answer to an input breaks."""
     return list({find.signature: find for find in _list_finds(case, outcome, folder)}.values())
@@ -60,11 +53,7 @@ def _list_finds(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
     finds = [
         Find("traceback", f"{kind} at {find_place(text)}", text) for kind, text in outcome.failures
     ]
-    finds += [
-        Find("warning", text.split("(")[-1].rstrip(")"), text)
-        for text in outcome.warned
-        if not (outcome.code == TIME_LIMIT_CODE and text.startswith(ABANDONED_FILE))
-    ]
+    finds += [Find("warning", text.split("(")[-1].rstrip(")"), text) for text in outcome.warned]
     finds += [Find("escape", text.split(" ")[0], text) for text in outcome.escapes]
     if outcome.cpu > CPU_LIMIT and not outcome.failures:
         finds.append(Find("slow", case.words[0], f"{outcome.cpu:.1f} s of processor time"))
@@ -72,9 +61,7 @@ def _list_finds(case: Case, outcome: Outcome, folder: Path) -> list[Find]:
         return finds
     finds += _judge_message(case, outcome)
     finds += (
-        _judge_files(case, outcome)
-        if outcome.code in (1, TIME_LIMIT_CODE)
-        else _judge_success(case, outcome, folder)
+        _judge_files(case, outcome) if outcome.code == 1 else _judge_success(case, outcome, folder)
     )
     return finds
 
@@ -88,8 +75,7 @@ def find_place(text: str) -> str:
 def _judge_message(case: Case, outcome: Outcome) -> Iterator[Find]:
     """Check the exit code, and that messages are plain lines of the known form."""
     command = case.words[0] if case.words else ""
-    allowed = (0, 1, 2, TIME_LIMIT_CODE) if "--time-limit" in case.words else (0, 1, 2)
-    if outcome.code not in allowed:
+    if outcome.code not in (0, 1, 2):
         yield Find("exit-code", f"{command} {outcome.code}", outcome.err[-300:])
     lines = outcome.err.splitlines()
     if outcome.code and not lines:

@@ -2,8 +2,8 @@
 """The command `loopcal`: its groups of commands, and the one place where an error becomes a
 sentence and an exit code.
 
-Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met, 3 a defect of loopcal,
-4 the time limit was reached. Nothing heavier than click is imported before a command runs, so that
+Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met, 3 a defect of loopcal.
+Nothing heavier than click is imported before a command runs, so that
 `loopcal --help` answers at once.
 """
 
@@ -22,8 +22,6 @@ from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.hints import find_hint, word_hint
 from loopcal.cli.interrupts import repeat_lost_interrupts
-from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
-from loopcal.cli.time_limit import TimeLimitError
 from loopcal.errors import LoopcalError
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
@@ -58,7 +56,6 @@ SECTIONS = {
     "Examine the uncertainty": {
         "bootstrap": "Resample a calibration and compare the scatter with its intervals.",
         "sample": "Draw from the exact posterior of a calibration.",
-        "region": "Show intervals that hold for several parameters at once.",
     },
     "Simulate many calibrations": {
         "study": "Compare instruments, numbers of poses and methods by simulation."
@@ -87,7 +84,7 @@ MODULES = {
     "report_command": ("report",),
     "view_command": ("view",),
     "regularize_command": ("regularize",),
-    "sampling_commands": ("bootstrap", "sample", "region"),
+    "sampling_commands": ("bootstrap", "sample"),
     "study_commands": ("study",),
     "paper_commands": ("reproduce", "per-leg"),
     "help_commands": ("example", "completion"),
@@ -107,9 +104,9 @@ class SectionedGroup(CommandGroup):
         """Return the names of all commands."""
         return [name for members in SECTIONS.values() for name in members]
 
-    def find_command(self, name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command; None where there is none of this name."""
-        return find_command(name)
+        return find_command(cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections."""
@@ -167,7 +164,6 @@ def command_line() -> None:
       1  wrong use, or input that is refused
       2  a quality gate is not met (see calibrate, validate, compensate, import and export)
       3  a defect of loopcal; the message names a report to send to the developers
-      4  the time limit (--time-limit) was reached; no result was written
     """  # noqa: D301
 
 
@@ -206,7 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:  # the reader of our output stopped (`loopcal ... | head`)
             terminal.silence_output()
             return 1
-        except (Exception, KeyboardInterrupt, TimeLimitError) as error:  # noqa: BLE001 the one place for all of them
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 the one place for all of them
             return _report(error, command, words, list_outputs())
 
 
@@ -251,9 +247,6 @@ def _report(
             )
         case KeyboardInterrupt() | click.exceptions.Abort():
             return _refuse(f"stopped before the end{unwritten}.")
-        case TimeLimitError():
-            _refuse(f"{error}{unwritten}.")
-            return TIME_LIMIT_CODE
         case OSError():
             place = f"{error.filename}: " if error.filename else ""
             reason = (error.strerror or str(error)).lower()

@@ -16,24 +16,19 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from loopcal.cli.time_limit import TimeLimitError
-
 DELAY = 0.01
 """From a lost interrupt to its repetition [s]; by then the callback has ended."""
 
 
 @contextmanager
 def repeat_lost_interrupts() -> Iterator[None]:
-    """Raise an interrupt that a callback lost again, a moment after the callback.
-
-    A time limit that was lost is not printed either; its timer raises it again.
-    """
+    """Raise an interrupt that a callback lost again, a moment after the callback."""
     report = sys.unraisablehook
 
     def repeat_or_report(lost: sys.UnraisableHookArgs) -> None:
         if issubclass(lost.exc_type, KeyboardInterrupt):
             _thread.start_new_thread(_interrupt, ())  # raised here, it is lost again
-        elif not issubclass(lost.exc_type, TimeLimitError):
+        else:
             report(lost)
 
     sys.unraisablehook = repeat_or_report

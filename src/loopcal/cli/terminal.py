@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
-from loopcal.cli.time_limit import TimeLimitError
 from loopcal.errors import FileError
 from loopcal.plain_text import escape
 
@@ -167,8 +166,6 @@ class ProgressBar:
     ) -> None:
         self._timer.cancel()
         with self._lock:
-            if isinstance(error, TimeLimitError) and self._state is not None:
-                error.step = self._state[2]
             self._state = None
             if self._bar is not None:
                 self._bar.stop()

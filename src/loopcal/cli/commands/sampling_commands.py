@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal bootstrap`, `loopcal sample`, `loopcal region`: uncertainty beyond linear intervals."""
+"""`loopcal bootstrap` and `loopcal sample`: uncertainty beyond linear intervals."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from loopcal.cli.options.shared_options import (
     data_argument,
     data_options,
     file_option,
+    flag_option,
     force_option,
     json_option,
+    refuse_given,
     seed_option,
 )
 
@@ -32,21 +34,19 @@ if TYPE_CHECKING:
 MOST_DIGITS = 10
 """Digits of a number of poses; a longer text is no unit of resampling."""
 
-level_option = click.option(
-    "--level",
-    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-    default=0.95,
-    metavar="SHARE",
-    help="Coverage of the intervals.",
-)
-
 source_options = add_options(
     click.argument("source", metavar="RUN|ROBOT"), data_argument("[DATA...]", required=False)
 )
 """Decorator of a command that takes a run folder, or a robot and its measurements."""
 
 draw_options = add_options(
-    level_option,
+    click.option(
+        "--level",
+        type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+        default=0.95,
+        metavar="SHARE",
+        help="Coverage of the intervals.",
+    ),
     seed_option("the random draws"),
     file_option("-o", "--output", help="CSV file for the draws, one row each.", metavar="CSV"),
     force_option("the output file"),
@@ -130,6 +130,26 @@ def bootstrap(
 @click.option(
     "--count", type=Count("DRAWS", 100), default=4000, metavar="N", help="Number of draws."
 )
+@flag_option(
+    "--region",
+    help="Instead of drawing, show linear intervals that hold for several parameters at once; "
+    "of parameters that -p selects, also their joint region.",
+)
+@click.option(
+    "-p",
+    "--parameter",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="Parameter for --region, or a pattern such as 'leg1.*'. May be given several times.  "
+    "[default: all]",
+)
+@click.option(
+    "--rule",
+    type=click.Choice(("maximum", "sidak", "bonferroni", "scheffe")),
+    default="maximum",
+    help="How --region makes intervals that hold together; maximum gives the narrowest.",
+)
 @draw_options
 @fit_options
 @data_options
@@ -138,6 +158,9 @@ def sample(
     source: str,
     data: tuple[Path, ...],
     count: int,
+    region: bool,
+    names: tuple[str, ...],
+    rule: Literal["maximum", "sidak", "bonferroni", "scheffe"],
     level: float,
     seed: int,
     output: Path | None,
@@ -146,7 +169,7 @@ def sample(
     **options: Any,
 ) -> None:
     """Draw parameters from the exact posterior of a calibration, and compare its intervals with the
-    linear ones.
+    linear ones. With --region, show intervals that hold for all selected parameters at once.
 
     RUN is a run folder, whose fit is repeated from its files. Or give a ROBOT and DATA, and the
     options of the fit.
@@ -156,10 +179,16 @@ def sample(
       loopcal sample run
       loopcal sample run --count 20000 -o draws.csv
       loopcal sample linear-delta measurements.csv --method map
+      loopcal sample run --region -p radius -p 'tower*.angle'
     """  # noqa: D301
     from loopcal.report.sampling_view import view_posterior
     from loopcal.sampling import sample_posterior
 
+    if region:
+        refuse_given(("count", "seed", "output", "force"), "with --region")
+        _show_region(source, data, options, names, rule, level, as_json)
+        return
+    refuse_given(("names", "rule"), "without --region")
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
     with terminal.ProgressBar() as progress:
@@ -169,46 +198,16 @@ def sample(
     _finish(result, intervals, page, output, as_json, result.weight)
 
 
-@click.command()
-@source_options
-@click.option(
-    "-p",
-    "--parameter",
-    "names",
-    multiple=True,
-    metavar="NAME",
-    help="Parameter, or a pattern such as 'leg1.*'. May be given several times.  [default: all]",
-)
-@click.option(
-    "--rule",
-    type=click.Choice(("maximum", "sidak", "bonferroni", "scheffe")),
-    default="maximum",
-    help="How intervals are made that hold together; maximum gives the narrowest.",
-)
-@level_option
-@fit_options
-@data_options
-@json_option
-def region(
+def _show_region(
     source: str,
     data: tuple[Path, ...],
+    options: dict[str, Any],
     names: tuple[str, ...],
     rule: Literal["maximum", "sidak", "bonferroni", "scheffe"],
     level: float,
     as_json: bool,
-    **options: Any,
 ) -> None:
-    """Show intervals that hold for all selected parameters at once, and their joint region.
-
-    RUN is a run folder. Or give a ROBOT and DATA, and the options of the fit.
-
-    \b
-    Examples:
-      loopcal region run
-      loopcal region run -p radius -p 'tower*.angle'
-      loopcal region run -p 'leg1.*' --rule scheffe --json
-    """  # noqa: D301
-    from loopcal.cli.options.shared_options import refuse_given
+    """Print simultaneous intervals, and the joint region of parameters that were named."""
     from loopcal.io.runs.run_folder import load_run
     from loopcal.report.sampling_view import view_region
     from loopcal.sampling import compute_joint_region, compute_simultaneous_intervals
@@ -222,8 +221,8 @@ def region(
     intervals = compute_simultaneous_intervals(posterior, chosen, level, rule)
     joint = compute_joint_region(posterior, chosen, level) if names else None
     if as_json:
-        region_content = None if joint is None else joint.to_dict()
-        terminal.print_json({"intervals": intervals.to_dict(), "region": region_content})
+        content = None if joint is None else joint.to_dict()
+        terminal.print_json({"intervals": intervals.to_dict(), "region": content})
         return
     terminal.print_page(view_region(joint, intervals, posterior.robot))
 

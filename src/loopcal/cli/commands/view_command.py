@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -16,10 +15,6 @@ from loopcal.cli.options.shared_options import (
     force_option,
     json_option,
 )
-from loopcal.errors import DataError
-
-if TYPE_CHECKING:
-    from loopcal.io import Run
 
 OUTPUT = Path("view.html")
 
@@ -30,28 +25,9 @@ OUTPUT = Path("view.html")
     "-o", "--output", help=f"HTML file to write; its name ends in .html. Default: {OUTPUT}."
 )
 @flag_option("--no-browser", help="Do not open the view in the browser.")
-@flag_option(
-    "--live",
-    help="Show the robot with a slider for each actuator until Ctrl-C, by the optional package "
-    "viser; write no file.",
-)
-@click.option(
-    "--port",
-    type=click.IntRange(1024, 65535),
-    metavar="N",
-    help="Port of --live on this computer; if it is taken, the next free one. Default: 8080.",
-)
 @force_option("the output file")
 @json_option
-def view(
-    source: str,
-    output: Path | None,
-    no_browser: bool,
-    live: bool,
-    port: int | None,
-    force: bool,
-    as_json: bool,
-) -> int:
+def view(source: str, output: Path | None, no_browser: bool, force: bool, as_json: bool) -> int:
     """Show RUN, a run folder, or a robot file as an interactive 3-D view in the browser.
 
     The view is one HTML file that needs no network. It shows the robot at home; of a run also at
@@ -64,20 +40,12 @@ def view(
     Examples:
       loopcal view hexapod-42
       loopcal view run -o hexapod.html --no-browser
-      loopcal view five-bar --live
     """  # noqa: D301
     from loopcal.documents.view_writing import open_page, write_view
     from loopcal.documents.writing import check_ending
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.runs.run_folder import load_run_or_robot
 
-    if live:
-        if output is not None or force:
-            raise DataError("--live writes no file; leave out -o and --force")
-        _show_live(load_run_or_robot(source), port, no_browser, as_json)
-        return 0
-    if port is not None:
-        raise DataError("--port is for --live; leave it out, or add --live")
     output = output or OUTPUT
     check_ending(output, "view")
     run = load_run_or_robot(source)
@@ -95,28 +63,3 @@ def view(
         unopened = "" if is_open or no_browser else "; no browser could be started here"
         terminal.print_page([f"Written to {output}{unopened}"])
     return terminal.print_failures(failures)
-
-
-def _show_live(run: Run, port: int | None, no_browser: bool, as_json: bool) -> None:
-    """Show the robot of a run with sliders until Ctrl-C."""
-    from threading import Event
-
-    from loopcal.documents.view_writing import open_page
-    from loopcal.report.scene.live_view import PORT, LiveView
-
-    live_view = LiveView(run.robot, port or PORT)
-    try:
-        if as_json:
-            terminal.print_json({"address": live_view.address})
-        else:
-            terminal.print_page(
-                [f"{run.robot.name} is shown at {live_view.address}; Ctrl-C ends this"]
-            )
-        terminal.flush_output()
-        if not no_browser:
-            open_page(live_view.address)
-        Event().wait()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        live_view.stop()

@@ -15,8 +15,6 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.options.shared_options import Count, add_options, flag_option, refuse_given
-from loopcal.cli.time_limit import CODE as TIME_LIMIT_CODE
-from loopcal.cli.time_limit import TimeLimitError, format_duration
 
 if TYPE_CHECKING:
     from loopcal.studies.driver import RunReport, Share
@@ -113,8 +111,9 @@ def _make_executor(workers: int | None, dask: str | None, ray: bool) -> Executor
 
 
 def round_duration(seconds: float) -> str:
-    """Return a duration to two digits."""
-    return format_duration(seconds, digits=2)
+    """Return a duration to two digits, in the largest unit in which it is at least one."""
+    unit, factor = next((u for u in (("h", 3600.0), ("min", 60.0)) if seconds >= u[1]), ("s", 1.0))
+    return f"{float(f'{seconds / factor:.2g}'):.6g} {unit}"
 
 
 def count_processors() -> int:
@@ -127,7 +126,7 @@ def count_processors() -> int:
 def _keep_when_stopped(
     chosen: Study, store: StudyStore, share: Share, folder: Path
 ) -> Iterator[list[int]]:
-    """Say what is kept where the body is stopped by Ctrl-C or by the time limit.
+    """Say what is kept where the body is stopped by Ctrl-C.
 
     Yields a list that receives the exit code.
     """
@@ -137,14 +136,12 @@ def _keep_when_stopped(
     codes: list[int] = []
     try:
         yield codes
-    except (KeyboardInterrupt, TimeLimitError) as error:
+    except KeyboardInterrupt:
         done, total = count_stored(chosen, store, share), count_blocks(chosen, share)
         finding = report_finding("store.stopped", done=done, total=total, folder=str(folder))
-        is_limit = isinstance(error, TimeLimitError)
-        reason = f"{error}. " if is_limit else ""
-        terminal.print_message(f"loopcal: {reason}{finding}")
+        terminal.print_message(f"loopcal: {finding}")
         terminal.print_message("Hint: use --resume to continue")
-        codes.append(TIME_LIMIT_CODE if is_limit else STOPPED)
+        codes.append(STOPPED)
 
 
 def _print_report(report: RunReport, folder: Path, as_json: bool) -> None:

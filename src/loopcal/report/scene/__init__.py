@@ -3,5 +3,5 @@
 
 `robot_parts.py` has the parts of a robot, `scene.py` the errors at measured poses, and
 `scene_data.py` writes both for the script `viewer.min.js`, which `make viewer` builds from
-tools/viewer. `live_view.py` shows a robot by viser.
+tools/viewer.
 """

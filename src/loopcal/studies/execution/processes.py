@@ -161,15 +161,15 @@ class _Pool(Generic[T, R]):
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Delay Ctrl-C and time limits while a process starts, and keep them from that process.
+    """Delay Ctrl-C while a process starts, and keep it from that process.
 
     A process whose start is interrupted, here or there, prints a traceback. It inherits the blocked
-    signals. Windows cannot block them.
+    signal. Windows cannot block it.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGALRM})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
