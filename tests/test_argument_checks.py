@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
+from tests.estimate.problems import hexapod, hexapod_data
 
 INSTRUMENT = lc.Instrument((lc.Sensor(lc.Pose(), lc.Gaussian(np.full(6, 1e-5))),))
 
@@ -51,8 +52,29 @@ def test_a_stated_value_is_finite(value):
 
 
 @pytest.mark.parametrize(
-    "function", [lc.sample_workspace, lc.find_assembly_modes, lc.find_working_modes]
+    ("call", "words"),
+    [
+        (lambda fit, data: lc.validate(fit, data, limit_angle=-1.0), "limit_angle is -1.0; give"),
+        (lambda fit, data: lc.validate(fit, data, np.nan), "limit_position is nan; give"),
+        (lambda fit, data: lc.CalibrationOptions(hold_out=0.2, seed=-1), "seed is -1; give"),
+        (lambda fit, data: data.split(hold_out=0.2, seed=-1), "seed is -1; give"),
+        (lambda fit, data: lc.sample_truth(fit.robot, 1, -1), "seed is -1; give"),
+        (lambda fit, data: lc.identifiability(fit.robot, data, 2.0), "rank_tolerance is 2.0"),
+        (lambda fit, data: lc.sample_workspace(lc.load_robot("five-bar"), -1), "-1 positions"),
+        (lambda fit, data: lc.find_outliers(fit, hexapod_data(9)), "9 poses, .* made from 12"),
+        (lambda fit, data: lc.examine_fit(fit, hexapod_data(9)), "9 poses, .* made from 12"),
+        (lambda fit, data: lc.compute_joint_region(fit, combinations=[[0.0] * 42]), "zeros"),
+        (lambda fit, data: lc.compute_joint_region(fit, combinations=[[np.inf] * 42]), "finite"),
+        (
+            lambda fit, data: lc.save_robot(fit.robot, "a.yaml", np.ones(1)),
+            r"shape \(1,\); give one unc",
+        ),
+        (lambda fit, data: lc.FitOptions(excluded_poses=(3,)), "excluded_poses: .*'3'"),  # pyright: ignore
+        (lambda fit, data: lc.load_run("a\0b"), "path .* contains a null character"),
+        (lambda fit, data: lc.load_robot("\ud800"), "path .* half of a character"),
+    ],
 )
-def test_a_name_in_place_of_a_robot_is_answered_with_how_to_load_one(function):
-    with pytest.raises(lc.ArgumentTypeError, match=r"loopcal\.load_robot"):
-        function("hexapod-42", np.zeros(6))
+def test_a_value_out_of_range_is_refused_with_what_is_allowed(call, words):
+    data = hexapod_data(12)
+    with pytest.raises(lc.LoopcalError, match=words):
+        call(lc.identify(hexapod(), data, lc.MAP()), data)

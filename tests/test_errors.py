@@ -14,7 +14,7 @@ def test_every_error_class_is_a_loopcal_error() -> None:
     classes = [
         c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, Exception)
     ]
-    assert len(classes) == 9
+    assert len(classes) == 8
     assert all(issubclass(c, LoopcalError) for c in classes)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -54,7 +53,6 @@ if TYPE_CHECKING:
     from loopcal.documents import write_comparison as write_comparison
     from loopcal.documents import write_report as write_report
     from loopcal.documents import write_view as write_view
-    from loopcal.errors import ArgumentTypeError as ArgumentTypeError
     from loopcal.errors import DataError as DataError
     from loopcal.errors import EstimationError as EstimationError
     from loopcal.errors import FileError as FileError
@@ -185,7 +183,7 @@ PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
         """,
         "loopcal.documents": "write_comparison write_report write_view",
         "loopcal.errors": """
-            ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
+            DataError EstimationError FileError LoopcalError MechanismError
             MissingPackageError StudyError UnitError
         """,
         "loopcal.estimate": """
@@ -230,15 +228,13 @@ __all__ = ["__version__", *sorted(_PACKAGES)]  # noqa: PLE0604  # pyright: ignor
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used; functions check their arguments' types."""
+    """Import a public name when it is first used."""
     if name not in _PACKAGES:
         raise AttributeError(
             f"module 'loopcal' has no attribute {name!r}; public names are "
             f"{', '.join(sorted(_PACKAGES))}"
         )
     value = getattr(import_module(_PACKAGES[name]), name)
-    if isinstance(value, FunctionType):
-        value = import_module("loopcal.argument_types").check_call(value)
     globals()[name] = value
     return value
 

@@ -67,10 +67,6 @@ class MissingPackageError(LoopcalError, ImportError):
     """An optional package that is not installed; the text says how to install it."""
 
 
-class ArgumentTypeError(LoopcalError, TypeError):
-    """An argument of the wrong type; the text says what to pass."""
-
-
 class FileError(LoopcalError):
     """A file that cannot be read or written; `str` gives `path:line: sentence`.
 

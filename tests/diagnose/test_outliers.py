@@ -19,7 +19,7 @@ from loopcal.diagnose.fit_checks.outlier_search import (
     search_suspects,
 )
 from loopcal.diagnose.fit_checks.outliers import _summarize
-from loopcal.errors import ArgumentTypeError, DataError, EstimationError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.losses import block_limit
@@ -192,7 +192,7 @@ def test_unknown_excluded_poses_and_nonpositive_loss_constants_are_refused():
     data = hexapod_data(20)
     with pytest.raises(DataError, match="no pose '99' to exclude"):
         identify(hexapod(), data, options=FitOptions(excluded_poses=("99",)))
-    with pytest.raises(ArgumentTypeError, match="give a sequence of labels"):
+    with pytest.raises(DataError, match="give a sequence of labels"):
         identify(hexapod(), data, options=FitOptions(excluded_poses="12"))
     with pytest.raises(EstimationError, match="Huber loss with constant 0"):
         Huber(0.0)

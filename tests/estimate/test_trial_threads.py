@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from loopcal.errors import ArgumentTypeError, EstimationError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify_trials
 from loopcal.estimate import problem as problem_module
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -99,7 +99,7 @@ def test_parts_are_equal_and_equally_many_for_each_thread(trials, threads, sizes
 def test_no_thread_is_refused(threads):
     with pytest.raises(EstimationError, match=f"threads is {threads}; give 1 or more"):
         identify_trials(DELTA, simulate(1, poses=10), threads=threads)
-    with pytest.raises(ArgumentTypeError, match="threads"):
+    with pytest.raises(DataError, match="threads"):
         identify_trials(DELTA, simulate(1, poses=10), threads=1.5)  # pyright: ignore
 
 

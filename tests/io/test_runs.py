@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.errors import FileError
 
 DATA = Path("examples/hexapod-42/measurements.csv").resolve()
 
@@ -49,18 +49,3 @@ def test_changed_or_missing_measurements_of_a_run_are_refused(tmp_path, calibrat
     lc.save_run(tmp_path / "bare", report)
     with pytest.raises(FileError, match="names no measurement files"):
         lc.load_run(tmp_path / "bare").load_measurements()
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lc.load_robot, "path of a robot file .* not Mechanism"),
-        (lambda robot: lc.load_measurements(robot, robot), "path of a measurement file"),
-        (lambda _: lc.load_measurements(DATA, "hexapod-42"), r"robot: got the text .*load_robot"),  # type: ignore
-        (lambda _: lc.save_robot("robot.yaml", "out.yaml"), r"robot: got the text .*load_robot"),  # type: ignore
-        (lc.load_run, "path of a run folder"),
-    ],
-)
-def test_wrong_argument_type_is_refused_with_advice(calibrated, call, words) -> None:
-    with pytest.raises(ArgumentTypeError, match=words):
-        call(calibrated[0])

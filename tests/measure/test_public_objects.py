@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.errors import DataError
 from loopcal.measure import (
     KINDS,
     Gaussian,
@@ -87,12 +87,12 @@ def test_text_of_measurements_counts_poses_and_rows(robot, instrument, poses):
         ),
         (
             lambda: Measurements("r", np.zeros((1, 1)), ("rows.csv",)),  # type: ignore[arg-type]
-            ArgumentTypeError,
+            DataError,
             "observations: got the text 'rows.csv'; give Observations",
         ),
         (
             lambda: Observations("pose", [0], [[0.0]], 1.0),  # type: ignore[arg-type]
-            ArgumentTypeError,
+            DataError,
             "kind: got the text 'pose'; give Kind, such as",
         ),
         (
@@ -102,18 +102,18 @@ def test_text_of_measurements_counts_poses_and_rows(robot, instrument, poses):
         ),
         (
             lambda: Sensor(Pose(), 1e-5),  # type: ignore[arg-type]
-            ArgumentTypeError,
+            DataError,
             "noise: got a float; give Noise, such as",
         ),
         (lambda: Instrument(Sensor(Pose(), Gaussian(np.ones(6)))), DataError, "give a tuple"),  # type: ignore[arg-type]
         (
             lambda: sample_truth("hexapod-42", 1, 0),  # type: ignore[arg-type]
-            ArgumentTypeError,
+            DataError,
             "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot",
         ),
         (
             lambda: simulate(zoo.hexapod(), zoo.make_poses(np.zeros((1, 6))), "pose", 1),  # type: ignore[arg-type]
-            ArgumentTypeError,
+            DataError,
             "instrument: got the text 'pose'; give Instrument",
         ),
         (lambda: Gaussian("1 um"), DataError, "got the text '1 um'; give an array"),  # type: ignore[arg-type]

@@ -25,7 +25,6 @@ from loopcal.diagnose import NO_MOTION, ErrorFrame, choose_error_frame, twist_we
 from loopcal.diagnose.error_frames import FITTED, RELATIVE, list_error_twists
 from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.covariance_parts import NOISE, combine_degrees
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import coverage_factor
@@ -189,7 +188,6 @@ def pose_uncertainty(
             raise EstimationError(
                 f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(allowed)))}"
             )
-    check_argument(fit, "fit", Identification, Posterior)
     posterior = fit.posterior if isinstance(fit, Identification) else fit
     robot = posterior.robot
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)

@@ -22,7 +22,6 @@ from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.diagnose import twist_weights
 from loopcal.diagnose.error_frames import FITTED, fit_unfixed_frames
 from loopcal.errors import DataError
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
@@ -203,7 +202,6 @@ def compensate(
     DataError : unknown mode, no step, targets of another shape.
     EstimationError : no such frame.
     """
-    check_argument(fit, "fit", Identification, Posterior, Mechanism)
     _check_settings(mode, steps)
     source = fit.posterior if isinstance(fit, Identification) else fit
     robot, posterior = (source, None) if isinstance(source, Mechanism) else (source.robot, source)

@@ -49,7 +49,6 @@ from loopcal.diagnose import (
     report_base_targets,
 )
 from loopcal.errors import DataError, suggest_names
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.fit_uncertainty import FitUncertainty, collect_uncertainty
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
@@ -282,11 +281,9 @@ def validate(
 
     Raises
     ------
-    ArgumentTypeError, DataError : an argument of another type, a limit below 0; the data belong to
+    DataError : a limit below 0; the data belong to
         another robot, contain no row, or every pose is unreachable.
     """
-    check_argument(fit, "fit", Identification, Mechanism)
-    check_argument(data, "data", Measurements)
     check_limit("limit_position", limit_position)
     check_limit("limit_angle", limit_angle)
     robot = fit.robot if isinstance(fit, Identification) else fit

@@ -20,7 +20,6 @@ from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import list_names
 from loopcal.measure import Measurements
-from loopcal.measure.array_checks import check_number
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.numerics.sorted_values import find_distinct
@@ -184,10 +183,9 @@ def report_moved_setup(
 
 
 def check_limit(name: str, limit: float | None) -> None:
-    """Refuse a limit that is no number, or below 0: no error could keep it, or exceed it."""
+    """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
     if limit is None:
         return
-    check_number(limit, name, "a number of metres or radians, 0 or more")
     if not limit >= 0.0:
         raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
 

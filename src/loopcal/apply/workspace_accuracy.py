@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from loopcal.apply.accuracy import Axes, PoseUncertainty, pose_uncertainty
 from loopcal.diagnose.error_frames import FITTED, solve_home
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.mechanism import forward, resolve_poses
@@ -116,7 +115,6 @@ def accuracy_map(
     ------
     MechanismError : poses are to be drawn, and the robot states no workspace.
     """
-    check_argument(fit, "fit", Identification, Posterior)
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     coordinates = resolve_poses(robot, poses, seed)
     home = solve_home(robot)

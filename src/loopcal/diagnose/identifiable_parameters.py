@@ -14,7 +14,6 @@ import numpy as np
 from loopcal.diagnose.frame_motions import interpret_combinations
 from loopcal.diagnose.observability import SCALING, Observability, compute_observability
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import (
     Combination,
@@ -275,13 +274,11 @@ def identifiability(
     MechanismError
         Poses are to be drawn, but the robot states no workspace.
     """
-    check_argument(robot, "robot", Mechanism)
     if not 0.0 < rank_tolerance < 1.0:
         raise EstimationError(f"rank_tolerance is {rank_tolerance}; it must be above 0 and below 1")
     if isinstance(data, Instrument):
         coordinates = sample_workspace(robot, poses, seed).coordinates
         data = simulate(robot, coordinates, data, seed=0, controller=robot)
-    check_argument(data, "data", Measurements)
     check_actuators(data, robot)
     free = select_free_parameters(robot)
     if not len(free):

@@ -117,7 +117,7 @@ def choose_identifiable_subset(identifiability: Identifiability) -> Identifiable
 
     Raises
     ------
-    ArgumentTypeError : a robot or measurements in place of an identifiability.
+    DataError : a robot or measurements in place of an identifiability.
 
     Examples
     --------

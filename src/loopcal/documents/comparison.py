@@ -8,7 +8,6 @@ from pathlib import Path
 
 from loopcal.apply import RunComparison
 from loopcal.documents.writing import HTML, check_ending, write_document
-from loopcal.errors import ArgumentTypeError
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.text_file import as_path
 from loopcal.io.runs.comparison_file import save_comparison
@@ -45,10 +44,6 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
     >>> lc.write_comparison("sessions.html", lc.compare_runs(runs))  # doctest: +SKIP
     """
     path = as_path(path, "comparison")
-    if not isinstance(comparison, RunComparison):
-        raise ArgumentTypeError(
-            f"comparison is {type(comparison).__name__}; pass the result of loopcal.compare_runs"
-        )
     ending = check_ending(path, "comparison", ENDINGS)
     if ending in HTML:
         document = build_comparison_document(comparison, f"loopcal {version('loopcal')}")

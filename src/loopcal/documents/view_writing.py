@@ -10,7 +10,6 @@ from pathlib import Path
 
 from loopcal.documents.sources import load_record
 from loopcal.documents.writing import check_ending, write_document
-from loopcal.errors import ArgumentTypeError
 from loopcal.io import Run
 from loopcal.io.core.outputs import refuse_outputs
 from loopcal.io.core.text_file import as_path
@@ -48,11 +47,6 @@ def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) ->
     >>> lc.write_view("view.html", lc.load_robot("hexapod-42"))  # doctest: +SKIP
     """
     path = as_path(path, "page")
-    if not isinstance(source, Mechanism | CalibrationReport | Run):
-        raise ArgumentTypeError(
-            f"source is {type(source).__name__}; pass a robot, the result of loopcal.calibrate, or "
-            "that of loopcal.load_run"
-        )
     check_ending(path, "view")
     refuse_outputs((path,), (), force=True)
     is_robot = isinstance(source, Mechanism)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from loopcal.documents.sources import load_record
-from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io import Run
 from loopcal.io.core.json_text import to_json
@@ -53,11 +53,6 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     >>> lc.write_report("report.html", report)  # doctest: +SKIP
     """
     path = as_path(path, "report")
-    if not isinstance(report, CalibrationReport | Run):
-        raise ArgumentTypeError(
-            f"report is {type(report).__name__}; pass the result of loopcal.calibrate, or of "
-            "loopcal.load_run"
-        )
     _, data = name_files(path)
     refuse_outputs((path, data), (), force=True)
     document = build_document(load_record(report))

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.argument_types import ORIGINS, describe
-from loopcal.errors import ArgumentTypeError, DataError, EstimationError, suggest_names
+from loopcal.errors import DataError, EstimationError, suggest_names
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements, check_actuators
+from loopcal.measure.array_checks import check_type
 from loopcal.measure.reading_sigma import weight_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -23,30 +23,14 @@ HUGE = 1e150
 """Residuals, in units of sigma, whose squares cannot be summed."""
 
 
-def check_argument(value: object, name: str, *allowed: type) -> None:
-    """Raise ArgumentTypeError unless an argument has one of these types, which `ORIGINS` lists."""
-    if not isinstance(value, allowed):
-        wanted = ", or ".join(f"{each.__name__}, {ORIGINS[each.__name__]}" for each in allowed)
-        raise ArgumentTypeError(f"{name}: got {describe(value)}; give {wanted}")
-
-
 def check_types(robot: object, data: object) -> None:
-    """Raise ArgumentTypeError for anything but a robot and measurements, such as file names."""
-    check_argument(robot, "robot", Mechanism)
-    check_argument(data, "data", Measurements)
+    """Refuse anything but a robot and measurements, such as file names."""
+    check_type(robot, Mechanism, "robot", "as from loopcal.load_robot('hexapod-42')")
+    check_type(data, Measurements, "data", "as from load_measurements('data.csv', robot)")
 
 
-def check_fitted_data(fit: object, data: object) -> None:
-    """Refuse anything but a fit and as many poses as it was made from.
-
-    Raises
-    ------
-    ArgumentTypeError, DataError : another type, or another number of poses.
-    """
-    check_argument(fit, "fit", Identification)
-    check_argument(data, "data", Measurements)
-    assert isinstance(fit, Identification)
-    assert isinstance(data, Measurements)
+def check_fitted_data(fit: Identification, data: Measurements) -> None:
+    """Raise DataError unless the data have as many poses as the fit was made from."""
     if data.n_poses != len(fit.pose_weights):
         raise DataError(
             f"the data have {data.n_poses} poses, but the fit was made from "

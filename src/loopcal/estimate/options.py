@@ -10,15 +10,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from loopcal.argument_types import describe
-from loopcal.errors import ArgumentTypeError, EstimationError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.inference.residual_test import SIGMA_UNCERTAINTY
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.descent import StepControl
 from loopcal.measure import NuisanceParameters
-from loopcal.measure.array_checks import check_number, check_type
+from loopcal.measure.array_checks import check_type
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray
 
@@ -84,7 +83,6 @@ class FitOptions:
     def __post_init__(self) -> None:
         _check_choice("noise", self.noise, get_args(Noise))
         _check_choice("begin", self.begin, get_args(Begin))
-        check_number(self.sigma_uncertainty, "sigma_uncertainty", "a number from 0 to 1")
         if not 0.0 <= self.sigma_uncertainty <= 1.0:
             raise EstimationError(
                 f"sigma_uncertainty is {self.sigma_uncertainty}; it must be from 0 (the stated "
@@ -105,7 +103,6 @@ class FitOptions:
         if self.nuisance is not None:
             wanted = "such as measurements.nuisance_parameters"
             check_type(self.nuisance, NuisanceParameters, "nuisance", wanted)
-        check_number(self.rank_tolerance, "rank_tolerance", "a number above 0 and below 1")
         if not 0.0 < self.rank_tolerance < 1.0:
             raise EstimationError(
                 f"rank_tolerance is {self.rank_tolerance}; it must be above 0 and below 1"
@@ -114,13 +111,7 @@ class FitOptions:
             self, "excluded_poses", check_labels("excluded_poses", self.excluded_poses)
         )
         if self.start is not None:
-            try:
-                start = np.array(self.start, dtype=np.float64)
-            except (TypeError, ValueError):
-                raise ArgumentTypeError(
-                    f"start: got {describe(self.start)}; give an array of values, such as "
-                    "robot.values"
-                ) from None
+            start = np.array(self.start, dtype=np.float64)
             start.setflags(write=False)
             object.__setattr__(self, "start", start)
 
@@ -142,7 +133,7 @@ def merge_options(
 
     Raises
     ------
-    ArgumentTypeError : `options` is no `FitOptions`.
+    DataError : `options` is no `FitOptions`.
     EstimationError : the merged options are not allowed.
     """
     if options is None:
@@ -154,9 +145,9 @@ def merge_options(
 
 
 def check_labels(option: str, labels: Sequence[str]) -> tuple[str, ...]:
-    """Return labels of poses as a tuple; raise ArgumentTypeError for a single text."""
+    """Return labels of poses as a tuple; raise DataError for a single text."""
     if isinstance(labels, str):
-        raise ArgumentTypeError(
+        raise DataError(
             f"{option} is the text {labels!r}; give a sequence of labels, such as [{labels!r}]"
         )
     given = tuple(labels)

@@ -2,13 +2,11 @@
 """Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
 
 from collections.abc import Iterable, Sequence
-from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.argument_types import describe
-from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.errors import DataError
 from loopcal.typing import FloatArray
 
 
@@ -100,7 +98,7 @@ def check_names(names: str | Iterable[str], what: str) -> tuple[str, ...]:
 
 
 def check_type(value: object, wanted: type, what: str, hint: str) -> None:
-    """Raise an ArgumentTypeError that says what to pass unless a value is an instance of a class.
+    """Raise a DataError that says what to pass unless a value is an instance of a class.
 
     Parameters
     ----------
@@ -108,13 +106,21 @@ def check_type(value: object, wanted: type, what: str, hint: str) -> None:
     """
     accepted = (float, int) if wanted is float else wanted
     if not isinstance(value, accepted):
-        raise ArgumentTypeError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
+        raise DataError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
 
 
-def check_number(value: object, what: str, allowed: str) -> None:
-    """Raise an ArgumentTypeError that says what is allowed unless a value is a number."""
-    if not isinstance(value, Real) or isinstance(value, bool):
-        raise ArgumentTypeError(f"{what}: got {describe(value)}; give {allowed}")
+def check_seed(seed: int) -> None:
+    """Raise a DataError for a seed of a random stream below 0."""
+    if seed < 0:
+        raise DataError(f"seed is {seed}; give a whole number, 0 or more")
+
+
+def describe(value: object) -> str:
+    """Return a value as error messages show it: its text and its type."""
+    if isinstance(value, str):
+        return f"the text {value[:60]!r}"
+    name = type(value).__name__
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
 
 
 def set_fields(instance: object, **values: object) -> None:

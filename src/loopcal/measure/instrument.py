@@ -8,9 +8,8 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.argument_types import check_seed, describe
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, set_fields
+from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
 from loopcal.measure.kinds import Kind
 from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.observations import TextArray, check_labels, check_rows

@@ -8,10 +8,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.argument_types import check_seed, describe
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_array, check_number, check_type, set_fields
+from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
 from loopcal.measure.base_rows import check_bodies
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
@@ -251,7 +250,6 @@ class Measurements(TableResult):
         DataError
             If the share is not between 0 and 1, or all poses are in one block.
         """
-        check_number(hold_out, "hold_out", "the share of the poses that is not fitted")
         check_seed(seed)
         if not 0.0 < hold_out < 1.0:
             raise DataError(

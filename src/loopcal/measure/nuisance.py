@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from loopcal.argument_types import check_fields
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds import Kind
 from loopcal.measure.observations import Observations
@@ -51,7 +50,6 @@ class StatedValue:
     nominal: float | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self)
         if self.sd != 0.0 and not is_sd(self.sd):
             raise DataError(
                 f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, "

@@ -8,9 +8,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal.argument_types import describe
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, set_fields
+from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
 from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.kinds.shared_errors import measure_progress
 from loopcal.measure.traceability import InstrumentRecord

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.argument_types import check_fields
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.mechanism import (
@@ -58,7 +57,6 @@ class LineOfSight:
     farthest: float = np.inf
 
     def __post_init__(self) -> None:
-        check_fields(self)
         for name in ("station", "facing"):
             given = np.array(getattr(self, name), dtype=float)
             if given.shape != (3,) or not np.isfinite(given).all():
@@ -124,7 +122,6 @@ class Constraints:
     stroke_margin_angle: float = 0.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
         if not 0.0 <= self.min_margin < 1.0:
             raise DataError(
                 f"the margin from singularities is {self.min_margin:g}; give a share of the "

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.fit_input import check_argument
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Gaussian, Instrument
 from loopcal.mechanism import POSITION, Mechanism, inverse
@@ -207,7 +206,6 @@ def plan_surfaces(
     EstimationError
         Too few points, or no group that satisfies the constraints.
     """
-    check_argument(robot, "robot", Mechanism)
     options = options or SurfaceOptions()
     groups = PlaneLineGroups(robot, options.points, options.sigma)
     checker = build_checker(robot, options.constraints)

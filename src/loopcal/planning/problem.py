@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.measured_frames import intersect_motions
@@ -230,7 +229,6 @@ def prepare_problem(
     MechanismError, DataError
         See `draw_candidates`, `linearize_candidate_groups`, `check_closure`.
     """
-    check_argument(robot, "robot", Mechanism)
     check_type(instrument, Instrument, "instrument", "such as Instrument((sensor,))")
     options = options or PlanOptions()
     check_type(options, PlanOptions, "options", "such as PlanOptions(n_poses=30)")

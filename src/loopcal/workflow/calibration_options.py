@@ -7,14 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from loopcal.apply.validation_findings import check_limit
-from loopcal.argument_types import check_seed
 from loopcal.diagnose.error_frames import FITTED
 from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, Posterior
-from loopcal.estimate.fit_input import check_argument
 from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
-from loopcal.measure.array_checks import check_number, check_type
+from loopcal.measure.array_checks import check_seed, check_type
 from loopcal.mechanism import Mechanism
 
 
@@ -78,7 +76,6 @@ class CalibrationOptions:
 
     def __post_init__(self) -> None:
         check_type(self.fit, FitOptions, "fit", "such as FitOptions(method=MAP())")
-        check_number(self.hold_out, "hold_out", "a share of the poses, from 0 to below 1")
         check_seed(self.seed)
         if fault := describe_wrong_share(self.hold_out):
             raise DataError(f"hold_out is {fault}")
@@ -102,7 +99,6 @@ class CalibrationOptions:
 
     def _check_prior(self) -> None:
         """Refuse what is no earlier calibration, and options that cannot be combined with it."""
-        check_argument(self.prior, "prior", Posterior)
         chosen = {
             "method": self.fit.method is not None,
             "loss": self.fit.loss is not None,

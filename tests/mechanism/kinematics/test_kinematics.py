@@ -4,7 +4,6 @@ instead of exceptions.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import engine, geometry
-from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.errors import DataError
 from loopcal.findings.catalog import load_catalog
 from loopcal.mechanism import (
     Address,
@@ -253,23 +252,6 @@ def test_readings_do_not_depend_on_the_pose_of_the_base(twist):
 def test_matrix_that_is_not_a_pose_is_refused(matrix, words):
     with pytest.raises(DataError, match=words):
         inverse(zoo.hexapod(), matrix[None])
-
-
-NO_ROBOT: Any = "hexapod"
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda robot: forward(NO_ROBOT, np.zeros(6)), "load_robot"),
-        (lambda robot: forward(robot, "rows.csv"), "load_measurements"),
-        (lambda robot: inverse(robot, robot), "n, 4, 4"),
-        (lambda robot: forward(robot, np.zeros(6), start=NO_ROBOT), "Solution"),
-    ],
-)
-def test_argument_of_a_wrong_type_is_refused_with_the_expected_type(call, words):
-    with pytest.raises(ArgumentTypeError, match=words):
-        call(zoo.hexapod())
 
 
 def test_jacobian_has_labels_and_is_the_derivative_of_the_poses():

@@ -8,7 +8,7 @@ from typing import Any
 
 from loopcal.apply.run_comparison.stored_run import StoredRun
 from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
-from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.units import Dimension
@@ -22,13 +22,11 @@ def check_runs(runs: Sequence[StoredRun]) -> None:
 
     Raises
     ------
-    ArgumentTypeError, DataError : `runs.too-few`, `runs.given-twice` or `runs.no-calibration`.
+    DataError : `runs.too-few`, `runs.given-twice` or `runs.no-calibration`.
     """
     is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
     if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
-        raise ArgumentTypeError(
-            "runs: give a list of runs, such as [load_run('may'), load_run('june')]"
-        )
+        raise DataError("runs: give a list of runs, such as [load_run('may'), load_run('june')]")
     if len(runs) < 2:
         raise DataError(report_finding("runs.too-few", count=len(runs)))
     known = set()

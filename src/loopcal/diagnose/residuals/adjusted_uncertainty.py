@@ -66,7 +66,7 @@ def adjust_uncertainty(
 
     Raises
     ------
-    ArgumentTypeError, DataError : another type, or another number of poses.
+    DataError : another number of poses.
     """
     check_fitted_data(fit, data)
     if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:

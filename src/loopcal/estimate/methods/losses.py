@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 
-from loopcal.argument_types import check_fields
 from loopcal.errors import EstimationError
 from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.typing import FloatArray
@@ -50,7 +49,6 @@ class Huber:
     k: float = 1.345
 
     def __post_init__(self) -> None:
-        check_fields(self)
         _check_constant("Huber", self.k)
 
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:
@@ -77,7 +75,6 @@ class Tukey:
     c: float = 4.685
 
     def __post_init__(self) -> None:
-        check_fields(self)
         _check_constant("Tukey", self.c)
 
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:

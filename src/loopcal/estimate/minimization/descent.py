@@ -23,7 +23,7 @@ from loopcal.estimate.methods.fixed_penalty import FixedPenalty, fix_penalty
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.filtered_step import FilteredStep
 from loopcal.estimate.minimization.linear_model import LinearModel, SpectralModel, make_linear_model
-from loopcal.measure.array_checks import check_number, check_type
+from loopcal.measure.array_checks import check_type
 from loopcal.numerics.damping import Damping
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
 from loopcal.numerics.gauss_newton import ROUNDING, DescentStatus, minimize
@@ -132,12 +132,10 @@ class StepControl:
     def __post_init__(self) -> None:
         check_type(self.iterations, Integral, "iterations", "a whole number, 0 or more")
         for name in ("relative", "absolute"):
-            check_number(getattr(self, name), name, "a finite number above 0")
             if not 0.0 < getattr(self, name) < np.inf:
                 raise EstimationError(
                     f"{name} is {getattr(self, name)}; give a finite number above 0"
                 )
-        check_number(self.damping, "damping", "0 or a finite number above it")
         if self.iterations < 0:
             raise EstimationError(f"iterations is {self.iterations}; give 0 or more")
         if not 0.0 <= self.damping < np.inf:

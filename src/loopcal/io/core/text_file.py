@@ -13,7 +13,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-from loopcal.errors import ArgumentTypeError, FileError, LoopcalError
+from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.findings import report_finding
 from loopcal.io.core.descriptors import sync_file
 from loopcal.io.core.limits import PROGRAM_SIZE, FileLimit
@@ -37,18 +37,15 @@ def as_path(path: Any, what: str) -> Path:
 
     Raises
     ------
-    ArgumentTypeError : anything else, such as a robot; `what` says what the file should be.
+    DataError : no file can have this name; `what` says what the file should be.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        sentence = f"the path of a {what} is needed here, not {type(path).__name__}"
-        raise ArgumentTypeError(f"{sentence}; pass text or a Path")
     try:
         name = os.fsencode(path)
     except UnicodeEncodeError:
         name = b"\0"
     if b"\0" in name:
         sentence = f"the path of a {what} contains a null character or half of a character"
-        raise ArgumentTypeError(f"{sentence}, which no file name can have; correct the path")
+        raise DataError(f"{sentence}, which no file name can have; correct the path")
     return Path(path)
 
 

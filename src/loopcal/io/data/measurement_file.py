@@ -33,7 +33,7 @@ from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds,
 from loopcal.io.data.nuisance_settings import read_stated_values
 from loopcal.io.data.pose_rows import read_pose_rows
 from loopcal.io.data.pose_use import read_held_out
-from loopcal.io.robot.robot_file import check_format, require_robot
+from loopcal.io.robot.robot_file import check_format
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import EXAMPLES
@@ -75,9 +75,7 @@ def load_measurements(
     ------
     FileError : a value that does not fit, at its line.
     DataError : a check fails, noise is not a covariance, or a commanded pose cannot be reached.
-    ArgumentTypeError : `path` is not a path, or `robot` is not a robot.
     """
-    require_robot(robot)
     tables = _read_tables(path)
     return _join_tables(tables, robot, allow_outside_stroke, allow_duplicates)
 

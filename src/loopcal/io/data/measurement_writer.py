@@ -36,7 +36,6 @@ from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_stated_values
 from loopcal.io.data.written_measurements import check_written_measurements
-from loopcal.io.robot.robot_file import require_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
@@ -105,7 +104,6 @@ def format_measurements(
     """
     from loopcal.measure import check_redundancy
 
-    require_robot(robot)
     _refuse_names(data)
     observations = data.all_observations
     kinds = [rows.kind for rows in observations]

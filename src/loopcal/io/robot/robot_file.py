@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal.errors import ArgumentTypeError, FileError, MechanismError, suggest_names
+from loopcal.errors import DataError, FileError, MechanismError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.records import read_record, read_units
@@ -95,7 +95,6 @@ def load_robot(source: str | Path) -> Mechanism:
     ------
     FileError : unreadable, or a key is missing, unknown or of the wrong type; with its line.
     MechanismError : the described robot cannot be built; with its file.
-    ArgumentTypeError : `source` is not a path or a name.
     """
     return build_robot(read_yaml(find_robot_file(source), WHAT))
 
@@ -132,11 +131,11 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
     Raises
     ------
     FileError : the file cannot be written. MechanismError : the robot was not loaded from a file.
-    ArgumentTypeError : there is not one uncertainty for each parameter.
+    DataError : there is not one uncertainty for each parameter.
     """
     count = len(robot.parameters.names)
     if plus_minus is not None and np.shape(plus_minus) != (count,):
-        raise ArgumentTypeError(
+        raise DataError(
             f"plus_minus has shape {np.shape(plus_minus)}; give one uncertainty for each of the "
             f"{count} parameters, such as fit.plus_minus"
         )
@@ -176,18 +175,10 @@ def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
 
 def get_source(robot: Mechanism) -> RobotSource:
     """Return the origin of a robot; raise MechanismError where it was not loaded from a file."""
-    require_robot(robot)
     if not isinstance(robot.record, RobotSource):
         sentence = f"{robot.name} was not loaded from a robot file and has no text to write"
         raise MechanismError(f"{sentence}; use load_robot")
     return robot.record
-
-
-def require_robot(robot: Any) -> None:
-    """Raise ArgumentTypeError where a robot is needed, but something else is given."""
-    if not isinstance(robot, Mechanism):
-        sentence = f"a robot is needed here, not {type(robot).__name__}"
-        raise ArgumentTypeError(f"{sentence}; pass the result of load_robot(path)")
 
 
 def find_robot_file(source: str | Path) -> Path:

@@ -24,7 +24,7 @@ from loopcal.mechanism.kinematics.batch_kinematics import (
     compute_readings,
     inverse_trials,
 )
-from loopcal.mechanism.kinematics.pose_solutions import Solution, check_arguments, make_solution
+from loopcal.mechanism.kinematics.pose_solutions import Solution, make_solution
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.stages.chain_kinematics import solve_stages
 from loopcal.mechanism.stages.chain_state import join_stage_states
@@ -118,7 +118,6 @@ def find_assembly_modes(
     MechanismError
         New modes were still found after `max_starts` starts.
     """
-    check_arguments("find_assembly_modes", robot)
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):
         raise DataError(
@@ -155,7 +154,6 @@ def find_working_modes(
     Modes differ in their readings, and in their poses if the machine has fewer controlled
     coordinates than freedoms. Parameters, result and errors as for `find_assembly_modes`.
     """
-    check_arguments("find_working_modes", robot)
     wanted = np.asarray(target, dtype=float).reshape(-1)
     if len(wanted) != len(robot.controlled):
         raise DataError(

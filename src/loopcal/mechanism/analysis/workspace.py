@@ -15,7 +15,7 @@ from loopcal.engine import State
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.mechanism.kinematics.pose_solutions import Solution, check_arguments, inverse
+from loopcal.mechanism.kinematics.pose_solutions import Solution, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
@@ -159,13 +159,10 @@ def sample_workspace(
 
     Raises
     ------
-    ArgumentTypeError
-        Not a robot.
     MechanismError
         n is below 1, the robot states no range for a controlled coordinate, or almost nothing of
         its workspace can be reached.
     """
-    check_arguments("sample_workspace", robot)
     if n < 1:
         raise MechanismError(f"{n} positions to draw; give 1 or more")
     rng = np.random.default_rng(seed)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal import geometry
 from loopcal.engine import State
-from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.errors import DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.closure.limb_rows import name_passive_joints
@@ -119,19 +119,18 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     ------
     DataError
         Another number of columns than the robot has actuators.
-    ArgumentTypeError
-        Not a robot, not numbers, or not a Solution.
     """
-    begin = check_arguments("forward", robot, start)
     a = len(robot.actuators)
-    readings = np.atleast_2d(_as_numbers(q, f"readings, numbers of shape (n, {a})"))
+    readings = np.atleast_2d(np.asarray(q, dtype=float))
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
             f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "
             f"({', '.join(actuator.name for actuator in robot.actuators)}); give one reading for "
             "each"
         )
-    state = forward_trials(robot, robot.values[None], readings[None], begin)
+    state = forward_trials(
+        robot, robot.values[None], readings[None], None if start is None else start.state
+    )
     return make_solution(robot, state, readings[:, :a])
 
 
@@ -156,13 +155,11 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     ------
     DataError
         Another shape, or a matrix that is not a pose.
-    ArgumentTypeError
-        Not a robot, not numbers, or not a Solution.
     """
-    begin = check_arguments("inverse", robot, start)
+    begin = None if start is None else start.state
     c = len(robot.controlled)
     shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
-    wanted = _as_numbers(target, shapes)
+    wanted = np.asarray(target, dtype=float)
     values = robot.values[None]
     is_pose = wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4)
     if wanted.ndim == 2 and c == 4 and is_pose:
@@ -276,44 +273,6 @@ def _reach_pose(
     if controls_all(robot):
         return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
     return find_nearest_reachable(robot, robot.values[None], T[None], start), None
-
-
-def check_arguments(function: str, robot: object, start: object = None) -> State | None:
-    """Return the state of a start; refuse anything but a Mechanism and a Solution or None."""
-    if not isinstance(robot, Mechanism):
-        raise ArgumentTypeError(
-            f"{function} needs a robot as returned by loopcal.load_robot, not "
-            f"{_describe_argument(robot)}"
-        )
-    if start is None:
-        return None
-    if not isinstance(start, Solution):
-        raise ArgumentTypeError(
-            "start must be a Solution, as forward and inverse return it, not "
-            f"{_describe_argument(start)}"
-        )
-    return start.state
-
-
-def _as_numbers(values: Any, allowed: str) -> FloatArray:
-    """Return an argument as an array of floats; refuse what is not made of numbers."""
-    try:
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        hint = ""
-        if isinstance(values, str):
-            hint = "; if it is a file, load it with loopcal.load_measurements and pass its readings"
-        elif hasattr(values, "readings"):
-            hint = "; pass its attribute readings"
-        raise ArgumentTypeError(
-            f"{_describe_argument(values)} was given in place of {allowed}{hint}"
-        ) from None
-
-
-def _describe_argument(value: object) -> str:
-    """Return an argument for a message: a text with its type, anything else by type."""
-    kind = type(value).__name__
-    return f"the text {value!r}" if isinstance(value, str) else f"an object of type {kind}"
 
 
 def _check_poses(T: FloatArray) -> None:
