@@ -51,7 +51,7 @@ COMMANDS = (
     "export RUN -o parameters.csv",
     "bootstrap RUN --count 5",
     "sample RUN",
-    "region RUN -p west.length",
+    "sample RUN --region -p west.length",
     "calibrate five-bar new.csv -o second --prior RUN",
 )
 """Commands that read a run folder."""
