@@ -110,7 +110,7 @@ def test_pipe_is_not_replaced_even_with_force(run) -> None:
             assert (code, out, err.count("\n")) == (1, "", 1)
             assert "this is a device or a pipe" in err
         with pytest.raises(FileError, match="this is a device or a pipe"):
-            write_text(name, "text", Path.read_text)
+            write_text(name, "text")
     assert stat.S_ISFIFO(os.lstat("pipe").st_mode)
     assert Path("link").is_symlink()
     assert not Path("new.yaml").exists()

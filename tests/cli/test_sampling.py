@@ -11,7 +11,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.cli import main
-from loopcal.io.runs.run_folder import load_run, read_run_folder, write_run_folder
+from loopcal.io.runs.run_folder import read_run_folder, write_run_folder
 from loopcal.units import find_unit
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
@@ -148,6 +148,6 @@ def test_a_run_with_another_estimate_than_its_data_have_is_not_examined(
     for row, value in zip(result["fit"]["parameters"], arrays["estimate"].tolist(), strict=True):
         row["estimate"] = value / find_unit(row["unit"]).factor_to_si
     robot_text = (folder / "run" / "robot.yaml").read_text()
-    write_run_folder(tmp_path / "run", result, arrays, robot_text, load_run)
+    write_run_folder(tmp_path / "run", result, arrays, robot_text)
     assert main(["bootstrap", str(tmp_path / "run"), "--count", "10"]) == 1
     assert "cannot be repeated" in capsys.readouterr().err

@@ -19,7 +19,7 @@ def write(path: Path, value: int, force: bool = False, size: int = 100) -> str:
     files = {"robot.yaml": text.encode(), "arrays.npz": text.encode() * size}
     document = {"made_by": {}, "fit": {}, "value": value}
     try:
-        write_result_folder(path, RUN, document, files, os.listdir, force)
+        write_result_folder(path, RUN, document, files, force)
     except FileError as error:
         return str(error)
     return ""

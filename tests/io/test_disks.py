@@ -49,7 +49,7 @@ def test_disk_that_becomes_full_keeps_the_old_folder_and_file(tmp_path, size) ->
 
     def write_file() -> str:
         try:
-            write_text(file, "new" * 3000, Path.read_text)
+            write_text(file, "new" * 3000)
         except FileError as error:
             return str(error)
         return ""

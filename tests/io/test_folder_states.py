@@ -151,7 +151,7 @@ class RunFolder(RuleBasedStateMachine):
     def write_a_study_in_its_place(self) -> None:
         document = {"made_by": {}, "paper": ""}
         with pytest.raises(FileError, match="something other than a study"):
-            write_result_folder(self.path, STUDY, document, {}, os.listdir, force=True)
+            write_result_folder(self.path, STUDY, document, {}, force=True)
 
     @invariant()
     def everything_is_there(self) -> None:

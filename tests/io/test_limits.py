@@ -253,7 +253,7 @@ def test_counts_on_the_command_line_are_refused_above_their_limit(name, capsys) 
 
 
 def test_every_option_that_takes_a_count_has_a_limit() -> None:
-    """A seed, the number of directions of --keep and that of a port take no memory."""
+    """A seed and the number of directions of --keep take no memory."""
     unlimited, used = set(), set()
     for name in (name for members in SECTIONS.values() for name in members):
         command = find_command(name)
@@ -264,7 +264,7 @@ def test_every_option_that_takes_a_count_has_a_limit() -> None:
                 used.add(option.type.limit)
             elif isinstance(option.type, click.types.IntParamType):
                 unlimited.add(option.name)
-    assert unlimited == {"seed", "keep", "port"}
+    assert unlimited == {"seed", "keep"}
     assert used == set(COUNTED)
     assert [getattr(limits, name) for name in COUNTED] == list(limits.COUNT_LIMITS)
 

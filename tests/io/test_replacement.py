@@ -10,55 +10,56 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.core.outputs import replace_folder
-from loopcal.io.core.text_file import write_text
-
-
-def refuse(path: Path) -> None:
-    raise ValueError(f"{path}: line 3 is not a number")
+from loopcal.io.core.text_file import replace_file, write_text
 
 
 def list_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.rglob("*"))
 
 
-def test_file_that_cannot_be_read_replaces_nothing(tmp_path) -> None:
+def test_content_is_written_beside_the_target_until_it_is_complete(tmp_path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text("old")
-    with pytest.raises(FileError, match="This is a defect of loopcal") as caught:
-        write_text(path, "new", refuse)
-    assert caught.value.code == "files.written-unreadable"
-    assert f"({path}: line 3 is not a number)" in str(caught.value)
+
+    def write_half() -> None:
+        with replace_file(path) as new:
+            new.write_text("half")
+            assert (new.parent, new.suffix, path.read_text()) == (tmp_path, ".yaml", "old")
+            raise ValueError("stop")
+
+    with pytest.raises(ValueError, match="stop"):
+        write_half()
     assert (path.read_text(), list_names(tmp_path)) == ("old", ["robot.yaml"])
+    write_text(path, "é\n")
+    assert path.read_bytes() == "é\n".encode()
 
 
-def test_folder_that_cannot_be_read_replaces_nothing(tmp_path) -> None:
+def test_folder_that_is_not_completed_replaces_nothing(tmp_path) -> None:
     path = tmp_path / "run"
-    for old in (False, True):
-        with pytest.raises(FileError) as caught, replace_folder(path, refuse) as folder:
+
+    def write_half() -> None:
+        with replace_folder(path) as folder:
             (folder / "new").touch()
-        assert caught.value.code == "files.written-unreadable"
+            raise ValueError("stop")
+
+    for old in (False, True):
+        with pytest.raises(ValueError, match="stop"):
+            write_half()
         assert list_names(tmp_path) == ["old", "run"] * old
         path.mkdir(exist_ok=True)
         (path / "old").touch()
-
-
-def test_read_back_sees_the_complete_content_beside_the_target(tmp_path) -> None:
-    path, seen = tmp_path / "data.csv", []
-    write_text(path, "é\n", lambda new: seen.append((new.read_bytes(), new.parent, new.suffix)))
-    assert seen == [("é\n".encode(), tmp_path, ".csv")]
-    assert path.read_bytes() == "é\n".encode()
 
 
 def test_permissions_are_those_of_the_old_file_or_of_any_new_file(tmp_path) -> None:
     plain, folder = tmp_path / "plain", tmp_path / "folder"
     plain.touch()
     folder.mkdir()
-    write_text(tmp_path / "new", "text", Path.read_text)
+    write_text(tmp_path / "new", "text")
     assert (tmp_path / "new").stat().st_mode == plain.stat().st_mode
     plain.chmod(0o640)
-    write_text(plain, "text", Path.read_text)
+    write_text(plain, "text")
     assert stat.S_IMODE(plain.stat().st_mode) == 0o640
-    with replace_folder(tmp_path / "run", os.listdir):
+    with replace_folder(tmp_path / "run"):
         pass
     assert (tmp_path / "run").stat().st_mode == folder.stat().st_mode
 
@@ -66,7 +67,8 @@ def test_permissions_are_those_of_the_old_file_or_of_any_new_file(tmp_path) -> N
 def test_temporary_names_are_unpredictable_and_created_exclusively(tmp_path, monkeypatch) -> None:
     names = []
     for _ in range(50):
-        write_text(tmp_path / "a", "text", lambda new: names.append(new.name))
+        with replace_file(tmp_path / "a") as new:
+            names.append(new.name)
     assert len(set(names)) == 50
     victim = tmp_path / "victim"
     victim.write_text("mine")
@@ -74,14 +76,14 @@ def test_temporary_names_are_unpredictable_and_created_exclusively(tmp_path, mon
     planted = tmp_path / f".loopcal-new-{'0' * 16}-a"
     planted.symlink_to(victim)
     with pytest.raises(FileError, match="file exists"):
-        write_text(tmp_path / "a", "overwritten", Path.read_text)
+        write_text(tmp_path / "a", "overwritten")
     assert (victim.read_text(), planted.is_symlink()) == ("mine", True)
 
 
 def test_names_that_file_systems_allow_are_written(tmp_path) -> None:
     for name in ("n" * 250 + ".csv", "é" * 125 + ".csv", os.fsdecode(b"\xff\xfe.csv"), "a\nb"):
-        write_text(tmp_path / name, "text", Path.read_text)
+        write_text(tmp_path / name, "text")
         assert (tmp_path / name).read_text() == "text"
-        with replace_folder(tmp_path / f"{name[1:]}", os.listdir):
+        with replace_folder(tmp_path / f"{name[1:]}"):
             pass
         assert (tmp_path / name[1:]).is_dir()

@@ -28,7 +28,7 @@ FILES = {
 
 def write(path: Path, kind: FolderKind = RUN, force: bool = False, text: str = "") -> None:
     document = DOCUMENTS[kind.content] | {"text": text}
-    write_result_folder(path, kind, document, FILES[kind.content], os.listdir, force)
+    write_result_folder(path, kind, document, FILES[kind.content], force)
 
 
 def read_all(path: Path) -> dict[str, bytes]:

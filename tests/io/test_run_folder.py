@@ -41,7 +41,7 @@ ARRAYS["posterior_part"] = np.zeros(1, dtype=int)
 def write(folder, force: bool = False, value: float = 1.5):
     arrays = ARRAYS | {"a": np.arange(3.0)}
     result = {**RESULT, "value": value}
-    return write_run_folder(folder, result, arrays, "name: h\n", read_run_folder, force)
+    return write_run_folder(folder, result, arrays, "name: h\n", force)
 
 
 def test_run_folder_is_read_as_written(tmp_path) -> None:
@@ -80,7 +80,7 @@ def test_empty_folder_is_used(tmp_path) -> None:
 
 def test_failed_write_leaves_no_files(tmp_path) -> None:
     with pytest.raises(ValueError, match="Object arrays"):
-        write_run_folder(tmp_path / "run", {}, {"a": np.array([object()])}, "", read_run_folder)
+        write_run_folder(tmp_path / "run", {}, {"a": np.array([object()])}, "")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -7,9 +7,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from loopcal.apply import RunComparison
-from loopcal.documents.writing import HTML, check_ending, write_document
+from loopcal.documents.writing import HTML, check_ending
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.text_file import as_path
+from loopcal.io.core.text_file import as_path, write_text
 from loopcal.io.runs.comparison_file import save_comparison
 from loopcal.report.document.comparison_document import build_comparison_document
 from loopcal.report.document.page import render_html
@@ -47,9 +47,9 @@ def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
     ending = check_ending(path, "comparison", ENDINGS)
     if ending in HTML:
         document = build_comparison_document(comparison, f"loopcal {version('loopcal')}")
-        write_document(path, render_html(document))
+        write_text(path, render_html(document))
     elif ending == ".json":
-        write_document(path, to_json(comparison.to_dict()))
+        write_text(path, to_json(comparison.to_dict()))
     else:
         table = tabulate_comparison(comparison)
         save_comparison(path, [column.title for column in table.columns], table.rows)

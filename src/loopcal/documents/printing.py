@@ -80,7 +80,8 @@ def print_pdf(page: Path, output: Path) -> None:
                 "a browser and print it",
                 output,
             )
-        write_bytes(output, printed.read_bytes(), _check_pdf)
+        _check_pdf(printed)
+        write_bytes(output, printed.read_bytes())
 
 
 def _check_pdf(file: Path) -> None:

@@ -9,10 +9,10 @@ import webbrowser
 from pathlib import Path
 
 from loopcal.documents.sources import load_record
-from loopcal.documents.writing import check_ending, write_document
+from loopcal.documents.writing import check_ending
 from loopcal.io import Run
 from loopcal.io.core.outputs import refuse_outputs
-from loopcal.io.core.text_file import as_path
+from loopcal.io.core.text_file import as_path, write_text
 from loopcal.mechanism import Mechanism
 from loopcal.report.document.page import render_html
 from loopcal.report.document.view_document import build_calibration_view, build_robot_view
@@ -51,7 +51,7 @@ def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) ->
     refuse_outputs((path,), (), force=True)
     is_robot = isinstance(source, Mechanism)
     document = build_robot_view(source) if is_robot else build_calibration_view(load_record(source))
-    write_document(path, render_html(document))
+    write_text(path, render_html(document))
     return path
 
 

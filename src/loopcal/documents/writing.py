@@ -10,10 +10,8 @@ from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io import Run
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import as_path, read_text, write_text
+from loopcal.io.core.text_file import as_path, write_text
 from loopcal.plain_text import quote
 from loopcal.report.document.calibration_document import build_document
 from loopcal.report.document.page import render_html
@@ -58,8 +56,8 @@ def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
     document = build_document(load_record(report))
     html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
     with restore_on_failure((path, data)):
-        write_document(path, html)
-        write_document(data, json_text)
+        write_text(path, html)
+        write_text(data, json_text)
     return path
 
 
@@ -86,13 +84,3 @@ def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:
         finding = report_finding("files.document-ending", what=what, allowed=allowed, ending=shown)
         raise FileError(finding, path)
     return ending
-
-
-def write_document(path: Path, text: str) -> None:
-    """Write a page, or a document as JSON, to a file, and compare what is read from it."""
-    write_text(path, text, lambda file: _check_document(file, text))
-
-
-def _check_document(file: Path, text: str) -> None:
-    """Read a written document; raise LoopcalError where it is not the one that was made."""
-    require_same("document", text, read_text(file, "document", limit=TABLE_SIZE))

@@ -13,7 +13,6 @@ from pathlib import Path
 from loopcal.errors import DataError, FileError, suggest_names
 from loopcal.findings import report_finding
 from loopcal.io.core.outputs import replace_folder
-from loopcal.io.core.read_back import require_same
 from loopcal.io.core.text_file import as_path, read_text
 
 README = "README.md"
@@ -64,12 +63,8 @@ def write_example(name: str, path: str | Path) -> tuple[str, ...]:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise FileError(report_finding("files.example-exists", name=name), path)
 
-    def read_back(folder: Path) -> None:
-        for file, source in files.items():
-            require_same(file, source.read_bytes(), (folder / file).read_bytes())
-
     refuse_existing(path)
-    with replace_folder(path, read_back, refuse_existing) as folder:
+    with replace_folder(path, refuse_existing) as folder:
         for file, source in files.items():
             (folder / file).write_bytes(source.read_bytes())
     return tuple(files)

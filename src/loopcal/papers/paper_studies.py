@@ -12,11 +12,10 @@ from pathlib import Path
 
 from loopcal.errors import DataError
 from loopcal.io.core.outputs import restore_on_failure
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import read_text, write_text
+from loopcal.io.core.text_file import write_text
 from loopcal.papers import Paper
 from loopcal.studies import Study, load_study
-from loopcal.studies.files.template import quote_robot, write_study_text
+from loopcal.studies.files.template import quote_robot
 
 FILE = "study.yaml"
 """Name of the study file in the folder of a paper with one robot."""
@@ -57,13 +56,8 @@ class PaperStudyFile:
         """Write the files; FileError where that is impossible."""
         with restore_on_failure(self.outputs):
             if self.poses is not None:
-                text = self.poses_text
-                write_text(
-                    self.poses,
-                    text,
-                    read_back=lambda path: require_same("text", text, read_text(path, "poses")),
-                )
-            write_study_text(self.path, self.text)
+                write_text(self.poses, self.poses_text)
+            write_text(self.path, self.text)
 
 
 def make_paper_study(paper: Paper, path: Path, robot: str | None = None) -> PaperStudyFile:

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures as files: written, checked, with identical bytes for identical content."""
+"""Pictures as files, with identical bytes for identical content."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.parsers import expat
 
 from loopcal.errors import FileError
 
@@ -29,35 +27,12 @@ PLACES = 4
 SALT = "loopcal"
 """Identifiers in an SVG are random without a salt."""
 
-_PDF_END = re.compile(rb"startxref\s+(\d+)\s+%%EOF\s*\Z")
-"""End of a PDF file, with the place of its table of objects."""
-
 METADATA: dict[str, dict[str, None]] = {
     ".png": {},
     ".svg": {"Date": None},
     ".pdf": {"CreationDate": None},
 }
 """The time of writing, which is left out, by format."""
-
-
-def check_picture(path: Path) -> None:
-    """Read a picture that was written; raise an exception where it is not complete.
-
-    PNG is decoded, SVG is parsed, and of PDF the first line and the place of its table of objects
-    are read.
-    """
-    if path.suffix.lower() == ".png":
-        from matplotlib.image import imread
-
-        imread(path)
-        return
-    content = path.read_bytes()
-    if path.suffix.lower() == ".svg":
-        expat.ParserCreate().Parse(content, True)
-        return
-    end = _PDF_END.search(content)
-    if not content.startswith(b"%PDF-") or end is None or content[int(end[1]) :][:4] != b"xref":
-        raise FileError("this picture is not a complete PDF file", path)
 
 
 @contextmanager
@@ -117,15 +92,12 @@ def render_svg_text(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def save_figure(
-    path: Path, figure: Figure, *, write: Callable[[Path, bytes, Callable[[Path], object]], object]
-) -> None:
+def save_figure(path: Path, figure: Figure, *, write: Callable[[Path, bytes], object]) -> None:
     """Write a figure to a file.
 
     Parameters
     ----------
-    write : writes bytes to a file that the given function reads, such as
-        `loopcal.io.core.text_file.write_bytes`.
+    write : writes bytes to a file, such as `loopcal.io.core.text_file.write_bytes`.
 
     Raises
     ------
@@ -139,4 +111,4 @@ def save_figure(
             f"{', '.join(FORMATS)}",
             path,
         )
-    write(path, render_figure(figure, ending), check_picture)
+    write(path, render_figure(figure, ending))

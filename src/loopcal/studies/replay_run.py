@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.findings import Finding, report_finding
-from loopcal.io import load_measurements, load_robot
 from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.robot.robot_file import format_robot
@@ -90,7 +89,7 @@ def calibrate_trial(
     }
     document = {"study": study.title, "cell": dict(levels), "trial": trial}
     files = {name: text.encode() for name, text in contents.items()}
-    write_result_folder(place, INPUTS, document, files, force=force, read_back=_read_inputs)
+    write_result_folder(place, INPUTS, document, files, force=force)
     paths = {"robot": place / ROBOT, "data": place / DATA}
     report = calibrate(robot, data, options, progress)
     save_run(output, report, paths, command, force)
@@ -101,9 +100,3 @@ def calibrate_trial(
         level = levels[FACTORS["methods"]]
         findings.append(report_finding("store.replay-method", method=level))
     return Replay(report, build_document(report, paths, command), place, tuple(findings))
-
-
-def _read_inputs(folder: Path) -> None:
-    """Read the files of the folder of inputs."""
-    load_robot(folder / TRUTH)
-    load_measurements([folder / DATA], load_robot(folder / ROBOT))

@@ -98,7 +98,7 @@ def import_file(name: str, path: Path) -> None:
             return
         exported = export_robot(ExportSource(robot), known, path)
     path.write_bytes(exported.text.encode())
-    exported.read_back(path)
+    known.read(path, options)
 
 
 def try_damages(

@@ -256,7 +256,7 @@ def _correct_file(
     if not is_written:
         return _Correction(report, failure, (), is_written)
     exported = export_robot(ExportSource(report.robot), source, file)
-    write_text(output, exported.text, exported.read_back)
+    write_text(output, exported.text)
     return _Correction(report, failure, tuple(map(str, exported.findings)), is_written)
 
 
@@ -347,7 +347,7 @@ def export(
     loaded = replace(load_source(source), is_for_people=output is None)
     exported = export_robot(loaded, target, into)
     if output is not None:
-        write_text(output, exported.text, exported.read_back)
+        write_text(output, exported.text)
     if as_json:
         notes = [str(finding) for finding in exported.findings]
         document = {"output": output, "format": target.name, "notes": notes, "reasons": failures}

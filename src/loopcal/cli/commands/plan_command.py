@@ -276,7 +276,6 @@ def _write_plan(
     from loopcal.io.runs.plan_folder import (
         DATA,
         SHEET,
-        check_written_plan,
         format_plan_data,
         format_sheet,
         format_surface_data,
@@ -287,7 +286,7 @@ def _write_plan(
     from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
     from loopcal.report.figures import draw_curve, draw_plan
-    from loopcal.report.pictures import check_picture, render_figure
+    from loopcal.report.pictures import render_figure
 
     figures = {}
     if isinstance(result, Plan):
@@ -300,12 +299,7 @@ def _write_plan(
     document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
     pictures = {name: render_figure(figure, ".png") for name, figure in figures.items()}
 
-    def read_back(folder: Path) -> None:
-        check_written_plan(folder, result)
-        for name in pictures:
-            check_picture(folder / name)
-
-    write_plan_folder(output, texts, document, pictures, read_back, force)
+    write_plan_folder(output, texts, document, pictures, force)
     files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
     return f"{files}, pictures" if pictures else files
 

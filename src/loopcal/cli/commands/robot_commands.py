@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shlex
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +55,8 @@ def new(
     from loopcal.io.core.text_file import write_text
     from loopcal.io.core.yaml_file import parse_yaml
     from loopcal.io.data.measurement_writer import format_template
-    from loopcal.io.data.written_measurements import check_written_template
     from loopcal.io.robot.derived_robots import format_new_robot
-    from loopcal.io.robot.robot_file import build_robot, write_robot
+    from loopcal.io.robot.robot_file import build_robot
 
     make_instrument(options)  # refuses wrong options before anything is written
     refuse_outputs((output, measurements), (), force)
@@ -69,12 +67,9 @@ def new(
     if measurements is not None:
         refuse_settings_beside(measurements)
     with restore_on_failure((output, measurements)):
-        write_robot(output, robot_text, robot)
+        write_text(output, robot_text)
         if measurements is not None:
-            check = partial(
-                check_written_template, text=template, robot=robot, instrument=instrument
-            )
-            write_text(measurements, template, check)
+            write_text(measurements, template)
     if as_json:
         terminal.print_json({"robot": output, "measurements": measurements})
         return

@@ -81,7 +81,6 @@ def gcode(
     from loopcal.io.formats.gcode_program import (
         DEFAULT_FEED,
         GcodeSettings,
-        check_written_gcode,
         format_gcode,
         read_stops,
         refuse_coordinates,
@@ -99,9 +98,7 @@ def gcode(
     refuse_coordinates(machine)
     home = check_route(machine, stops.labels, stops.coordinates)
     text = format_gcode(machine, stops, home, GcodeSettings(speed, pause, program_unit))
-    write_text(
-        output, text, lambda path: check_written_gcode(path, text, machine, stops, program_unit)
-    )
+    write_text(output, text)
     counts = {"stops": len(stops.labels), "unit": program_unit}
     if as_json:
         terminal.print_json({"program": output, **counts})

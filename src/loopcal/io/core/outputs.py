@@ -16,7 +16,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.json_text import read_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.replacement import create_temporary, place_folder, restore_files
-from loopcal.io.core.text_file import check_readable, report_write_errors, resolve_target
+from loopcal.io.core.text_file import report_write_errors, resolve_target
 
 FILES = "files"
 """Key of the list of files in the document of a result folder."""
@@ -109,9 +109,7 @@ def resolve_folder(path: Path) -> Path:
 
 
 @contextmanager
-def replace_folder(
-    path: Path, read_back: Callable[[Path], object], check: Callable[[Path], None] | None = None
-) -> Iterator[Path]:
+def replace_folder(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
     """Yield a temporary folder that takes the place of `path` where the body succeeds.
 
     At every moment, `path` is the old or the new folder, complete. A symbolic link to a folder
@@ -119,17 +117,15 @@ def replace_folder(
 
     Parameters
     ----------
-    read_back : reads the complete temporary folder; see `write_text`.
     check : raises FileError where a folder that is in use must not be replaced.
 
     Raises
     ------
-    FileError : in place of every OSError; or `files.written-unreadable`.
+    FileError : in place of every OSError.
     """
     with report_write_errors(path):
         target = resolve_folder(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         with create_temporary(target, is_folder=True) as temporary:
             yield temporary
-            check_readable(path, temporary, read_back)
             place_folder(temporary, target, path, check)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,6 @@ from loopcal.io.core.descriptors import watch_folder
 from loopcal.io.core.json_text import convert_document, format_content, read_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import FILES, replace_folder, resolve_folder
-from loopcal.io.core.read_back import require_same
 from loopcal.io.core.replacement import list_leftovers, remove_leftovers
 from loopcal.io.core.text_file import report_write_errors, sha256
 
@@ -155,7 +154,6 @@ def write_result_folder(
     kind: FolderKind,
     document: Mapping[str, Any],
     files: Mapping[str, bytes],
-    read_back: Callable[[Path], object],
     force: bool = False,
 ) -> None:
     """Write a folder whole or not at all.
@@ -164,8 +162,6 @@ def write_result_folder(
     ----------
     document : content of the document, to which the list of files is added.
     files : name -> content.
-    read_back : reads the complete folder before it takes its name. The document, and that the
-        folder is one that loopcal may replace, are checked for every kind.
     force : see `refuse_folder`.
 
     Raises
@@ -175,15 +171,8 @@ def write_result_folder(
     digests = dict.fromkeys((*sorted(files), kind.document), _BLANK)
     computed = convert_document({**document, FILES: digests})
 
-    def check(folder: Path) -> None:
-        read = _check_content(folder, kind)
-        for key in document.keys() - {FILES}:
-            is_same = key in read and read[key] == computed[key]
-            require_same(f"{key!r} of {kind.document} is what was computed", True, is_same)
-        read_back(folder)
-
     refuse_folder(path, kind, force)
-    with replace_folder(path, check, lambda old: refuse_folder(old, kind, force)) as folder:
+    with replace_folder(path, lambda old: refuse_folder(old, kind, force)) as folder:
         for name, content in files.items():
             file = folder / name
             file.parent.mkdir(exist_ok=True)

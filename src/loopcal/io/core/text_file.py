@@ -7,14 +7,13 @@ import errno
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.findings import report_finding
 from loopcal.io.core.descriptors import sync_file
 from loopcal.io.core.limits import PROGRAM_SIZE, FileLimit
 from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers
@@ -154,32 +153,26 @@ def resolve_target(path: str | Path) -> Path:
         raise FileError("this symbolic link has no target; choose another name", path) from None
 
 
-def write_text(path: str | Path, text: str, read_back: Callable[[Path], object]) -> None:
+def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 file whole or not at all; see `write_bytes`."""
-    write_bytes(path, text.encode("utf-8"), read_back)
+    write_bytes(path, text.encode("utf-8"))
 
 
-def write_bytes(path: str | Path, content: bytes, read_back: Callable[[Path], object]) -> None:
+def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file whole or not at all; see `replace_file`."""
-    with replace_file(path, read_back) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(content)
 
 
 @contextmanager
-def replace_file(path: str | Path, read_back: Callable[[Path], object]) -> Iterator[Path]:
+def replace_file(path: str | Path) -> Iterator[Path]:
     """Yield an empty temporary file that takes the place of `path` where the body succeeds.
 
     A symbolic link stays a link; its target is written. An old file keeps its permissions.
 
-    Parameters
-    ----------
-    read_back : reads the complete temporary file, whose name ends in that of the target. The target
-        is replaced only if this succeeds.
-
     Raises
     ------
-    FileError : see `resolve_target`; the folder does not exist, no permission, or a full disk; or
-        `files.written-unreadable`, where `read_back` raises.
+    FileError : see `resolve_target`; the folder does not exist, no permission, or a full disk.
     """
     target = resolve_target(path)
     with report_write_errors(path):
@@ -187,26 +180,9 @@ def replace_file(path: str | Path, read_back: Callable[[Path], object]) -> Itera
         with create_temporary(target) as temporary:
             yield temporary
             sync_file(temporary)
-            check_readable(path, temporary, read_back)
             if target.exists():
                 temporary.chmod(stat.S_IMODE(target.stat().st_mode))
             place_file(temporary, target, Path(path))
-
-
-def check_readable(path: str | Path, temporary: Path, read_back: Callable[[Path], object]) -> None:
-    """Read a file or folder before it takes the name `path`.
-
-    Raises
-    ------
-    FileError : `read_back` raises, which is a defect of loopcal.
-    """
-    try:
-        read_back(temporary)
-    except MemoryError:
-        raise
-    except Exception as error:
-        reason = str(error).replace(str(temporary), str(path)) or type(error).__name__
-        raise FileError(report_finding("files.written-unreadable", reason=reason), path) from error
 
 
 @contextmanager

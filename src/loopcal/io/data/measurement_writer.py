@@ -35,7 +35,6 @@ from loopcal.io.data.instrument_settings import format_instrument
 from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_stated_values
-from loopcal.io.data.written_measurements import check_written_measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
@@ -90,7 +89,7 @@ def save_measurements(
     """
     text = format_measurements(data, robot, remark)
     refuse_settings_beside(Path(path))
-    write_text(path, text, lambda written: check_written_measurements(written, data, robot))
+    write_text(path, text)
 
 
 def format_measurements(

@@ -26,14 +26,18 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import NAME_COLUMNS, format_header, format_row
+from loopcal.io.core.csv_table import (
+    NAME_COLUMNS,
+    format_header,
+    format_row,
+    refuse_settings_beside,
+)
 from loopcal.io.core.limits import PATTERN_SECONDS
 from loopcal.io.core.names import find_fault, format_comment, make_name
 from loopcal.io.core.numbers import parse_finite
-from loopcal.io.core.text_file import as_path
+from loopcal.io.core.text_file import as_path, write_text
 from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME, USE_COLUMN
 from loopcal.io.data.measurement_file import FORMAT
-from loopcal.io.exports.converted_file import save_table
 from loopcal.io.exports.export_lines import (
     Line,
     Misfit,
@@ -179,7 +183,7 @@ class Conversion:
 
     Parameters
     ----------
-    text : the measurement file. table : its header and rows. settings : its settings.
+    text : the measurement file. table : its header and rows.
     passed : number of lines without data.
     misfits : lines that do not fit the profile, with the reason.
     findings : differences between lines of a pose that the file does not keep.
@@ -187,7 +191,6 @@ class Conversion:
 
     text: str
     table: tuple[tuple[str, ...], ...]
-    settings: Mapping[str, Any]
     passed: int
     misfits: tuple[tuple[int, str], ...]
     findings: tuple[Finding, ...] = ()
@@ -240,7 +243,7 @@ def convert_export(
     lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
     table = _tabulate(profile, rows)
     text = "\n".join([*lines, *map(format_row, table)]) + "\n"
-    return Conversion(text, table, settings, skipped, tuple(misfits), findings)
+    return Conversion(text, table, skipped, tuple(misfits), findings)
 
 
 def save_conversion(conversion: Conversion, path: str | Path) -> None:
@@ -250,7 +253,8 @@ def save_conversion(conversion: Conversion, path: str | Path) -> None:
     ------
     FileError : the file cannot be written.
     """
-    save_table(path, conversion.text, conversion.table, conversion.settings)
+    refuse_settings_beside(Path(path))
+    write_text(path, conversion.text)
 
 
 def _parse_row(line: Line, profile: Profile, clock: PatternClock) -> Row:

@@ -17,12 +17,17 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.csv_table import Table, format_header, format_row, read_table
-from loopcal.io.core.text_file import read_text
+from loopcal.io.core.csv_table import (
+    Table,
+    format_header,
+    format_row,
+    read_table,
+    refuse_settings_beside,
+)
+from loopcal.io.core.text_file import read_text, write_text
 from loopcal.io.data.kind_rows import KindRows, read_kinds
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export, list_headers
-from loopcal.io.exports.converted_file import save_table
 from loopcal.io.exports.profile import Profile
 from loopcal.io.exports.profile_reader import check_columns
 from loopcal.measure import Measurements, Observations
@@ -40,7 +45,7 @@ class FilledSheet:
 
     Attributes
     ----------
-    text : the measurement file. table : its header and rows. settings : its settings.
+    text : the measurement file. table : its header and rows.
     misfits : export, line and reason of lines that do not match the profile.
     data : the measurements, for checks before the file is written. unit : of the points.
     findings : what is filled in, missing, unknown or repeated.
@@ -48,7 +53,6 @@ class FilledSheet:
 
     text: str
     table: tuple[tuple[str, ...], ...]
-    settings: Mapping[str, object]
     misfits: tuple[tuple[str, int, str], ...]
     data: Measurements
     unit: str
@@ -128,13 +132,13 @@ def fill_sheet(
     rows = (format_header(header), *cells)
     text = "\n".join([*lines, *map(format_row, rows)]) + "\n"
     unit = next((units.get(name) for name in columns if units.get(name)), None) or "mm"
-    settings = table.settings.content
-    return FilledSheet(text, rows, settings, tuple(misfits), data, unit, tuple(findings))
+    return FilledSheet(text, rows, tuple(misfits), data, unit, tuple(findings))
 
 
 def save_filled_sheet(filled: FilledSheet, path: str | Path) -> None:
     """Write a filled sheet; FileError where it cannot be written."""
-    save_table(path, filled.text, filled.table, filled.settings)
+    refuse_settings_beside(Path(path))
+    write_text(path, filled.text)
 
 
 def _read_sheet(path: Path, robot: Mechanism) -> tuple[Table, KindRows]:

@@ -20,11 +20,9 @@ from typing import Literal
 
 import numpy as np
 
-from loopcal.errors import DataError, FileError
+from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import read_table, require_columns
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import read_text
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.formats.value_file import format_short
 from loopcal.io.runs.plan_folder import SHEET, VIA
@@ -148,27 +146,6 @@ def format_gcode(
         lines += [f"(pose {_clean(label)})", move(coordinates)]
         lines += [f"(MSG, measure pose {_clean(label)})", wait]
     return "\n".join([*lines, "(back to home)", move(home), "M2"]) + "\n"
-
-
-def check_written_gcode(
-    path: Path, text: str, robot: Mechanism, stops: PlannedStops, unit: str
-) -> None:
-    """Read a program; raise LoopcalError where it is not this text, or its moves between the first
-    and the last, which are those to home, do not lead to the stops.
-    """
-    written = read_text(path, "program")
-    require_same("text", text, written)
-    factors = _get_factors(robot, unit)
-    letters = [WORDS[name] for name in robot.controlled]
-    moves = []
-    for line in written.splitlines():
-        if match := _MOVE.match(line):
-            words = dict(_WORD.findall(match["words"]))
-            moves.append([float(words[w]) * f for w, f in zip(letters, factors, strict=True)])
-    if len(moves) != len(stops.labels) + 2:
-        raise FileError(f"{len(moves)} moves were written for {len(stops.labels)} stops", path)
-    difference = np.abs(np.array(moves[1:-1]) - stops.coordinates)
-    require_same("rounded moves", True, bool((difference <= ROUNDING).all()))
 
 
 def _get_factors(robot: Mechanism, unit: str) -> list[float]:

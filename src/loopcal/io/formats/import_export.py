@@ -7,11 +7,12 @@ from pathlib import Path
 
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import report_finding
+from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
-from loopcal.io.robot.robot_file import build_robot, load_robot, write_robot
+from loopcal.io.robot.robot_file import build_robot, load_robot
 from loopcal.io.runs.run import Run
 from loopcal.io.runs.run_folder import load_run_or_robot
 from loopcal.mechanism import Mechanism
@@ -66,7 +67,7 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
         if imported.measurements is None:
             raise DataError(report_finding("files.no-measurements", file=str(path)))
         save_measurements(imported.measurements, data, robot, f"read from {path.name}")
-    write_robot(output, imported.robot_text, robot)
+    write_text(output, imported.robot_text)
     return load_robot(output)
 
 

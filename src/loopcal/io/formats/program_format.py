@@ -139,12 +139,10 @@ class Exported:
 
     Attributes
     ----------
-    read_back : reads the written file; raises LoopcalError where it does not state the values.
     findings : changes, and what it cannot express.
     """
 
     text: str
-    read_back: Callable[[Path], object]
     findings: tuple[Finding, ...] = ()
 
 

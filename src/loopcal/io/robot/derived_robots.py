@@ -10,10 +10,11 @@ from pathlib import Path
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.io.core import file_reference
+from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.core.yaml_text import add_key, quote_scalar, remove_key
 from loopcal.io.robot.identified_table import add_table
-from loopcal.io.robot.robot_file import format_robot, get_source, list_shipped_robots, write_robot
+from loopcal.io.robot.robot_file import format_robot, get_source, list_shipped_robots
 from loopcal.mechanism import FAMILIES, Mechanism
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar", "stages": "arm-6r"}
@@ -71,7 +72,7 @@ def save_reduced_robot(robot: Mechanism, dropped: Mapping[str, str], path: str |
     ------
     FileError : the file cannot be written. MechanismError : as `format_reduced_robot`.
     """
-    write_robot(path, format_reduced_robot(robot, dropped), robot)
+    write_text(path, format_reduced_robot(robot, dropped))
 
 
 def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:

@@ -21,7 +21,6 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError, MechanismError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
@@ -139,25 +138,7 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None
             f"plus_minus has shape {np.shape(plus_minus)}; give one uncertainty for each of the "
             f"{count} parameters, such as fit.plus_minus"
         )
-    write_robot(path, format_robot(robot, plus_minus), robot)
-
-
-def write_robot(path: str | Path, text: str, robot: Mechanism) -> None:
-    """Write the text of a robot file, which is read back as this robot; raise as `save_robot`."""
-    write_text(path, text, lambda written: check_same_robot(robot, text, load_robot(written)))
-
-
-def check_same_robot(robot: Mechanism, text: str, read: Mechanism) -> None:
-    """Raise DataError where a robot that was read from a file is not the one that was written.
-
-    `text` was to be written. Values may differ by the rounding of one number, because a file states
-    them in its unit.
-    """
-    require_same("the text is complete", True, get_source(read).file.text == text)
-    require_same("actuators", robot.actuators, read.actuators)
-    require_same("parameters", robot.parameters.names, read.parameters.names)
-    require_same_numbers("nominal values", robot.parameters.nominal, read.parameters.nominal)
-    require_same_numbers("identified values", robot.values, read.values, float(np.finfo(float).eps))
+    write_text(path, format_robot(robot, plus_minus))
 
 
 def format_robot(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:

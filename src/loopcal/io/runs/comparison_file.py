@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from loopcal.io.core.csv_table import format_row
-from loopcal.io.core.limits import TABLE_SIZE
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import read_text, write_text
+from loopcal.io.core.text_file import write_text
 from loopcal.plain_text import escape_formula
 
 
@@ -27,7 +25,4 @@ def save_comparison(path: Path, titles: Sequence[str], rows: Sequence[Sequence[s
     lines = [titles, *rows]
     text = "".join(format_row(map(escape_formula, line)) + "\n" for line in lines)
 
-    def read_back(written: Path) -> None:
-        require_same("text", text, read_text(written, "comparison", "", TABLE_SIZE))
-
-    write_text(path, text, read_back)
+    write_text(path, text)

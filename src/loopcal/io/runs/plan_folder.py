@@ -23,16 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import format_row, read_table
+from loopcal.io.core.csv_table import format_row
 from loopcal.io.core.numbers import parse_exact
-from loopcal.io.core.read_back import require_same, require_same_numbers
 from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN, get_dimension
-from loopcal.io.data.measurement_file import (
-    has_empty_readings,
-    load_contact_sheet,
-    load_measurements,
-)
 from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
 from loopcal.mechanism import POSITION, Mechanism
 from loopcal.units import Dimension, find_unit
@@ -53,9 +47,6 @@ PLAN = FolderKind(
 VIA = "via"
 DIGITS = 12
 """Significant digits of a number: more than it was rounded to, fewer than a double has."""
-
-ROUNDING = 1e-11
-"""Relative difference of a number that was written with these digits."""
 
 
 FREE = "free"
@@ -138,7 +129,6 @@ def write_plan_folder(
     texts: Mapping[str, str],
     document: Mapping[str, Any],
     pictures: Mapping[str, bytes],
-    read_back: Callable[[Path], object],
     force: bool = False,
 ) -> None:
     """Write the folder of a plan whole or not at all.
@@ -147,7 +137,7 @@ def write_plan_folder(
     ----------
     path : the folder to make. texts : name -> text of a file.
     document : content of plan.json; `format` and `files` are added.
-    pictures : name -> content. read_back : see `write_result_folder`.
+    pictures : name -> content.
     force : replace an older, unchanged plan.
 
     Raises
@@ -155,27 +145,7 @@ def write_plan_folder(
     FileError : see `write_result_folder`.
     """
     files = {name: text.encode() for name, text in texts.items()} | dict(pictures)
-    write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, read_back, force)
-
-
-def check_written_plan(folder: Path, plan: Plan | SurfacePlan) -> None:
-    """Read the sheets of a plan; raise LoopcalError where they do not state its poses."""
-    robot, labels = plan.robot, plan.poses.labels
-    sheet = read_table(folder / SHEET)
-    if has_empty_readings(folder / DATA, robot):
-        data = load_contact_sheet(folder / DATA, folder / SHEET, robot)
-    else:
-        data = load_measurements(
-            folder / DATA, robot, allow_outside_stroke=True, allow_duplicates=True
-        )
-    require_same("held-out poses", plan.poses.held_out.tolist(), data.is_held_out.tolist())
-    require_same("names of poses", labels, data.labels)
-    require_same_numbers("readings", plan.poses.readings, data.readings, ROUNDING)
-    place = {name: i for i, name in enumerate(sheet.text("pose"))}
-    for i, actuator in enumerate(robot.actuators):
-        numbers = sheet.numbers(actuator.name, actuator.dimension)
-        of_poses = numbers[[place[label] for label in labels]]
-        require_same_numbers(actuator.name, plan.poses.readings[:, i], of_poses, ROUNDING)
+    write_result_folder(path, PLAN, {"format": FORMAT, **document}, files, force)
 
 
 def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:

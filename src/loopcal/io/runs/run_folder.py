@@ -13,8 +13,7 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,6 @@ import numpy as np
 from loopcal.engine import collect_versions
 from loopcal.errors import FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.read_back import require_same
 from loopcal.io.core.result_folder import (
     FolderKind,
     describe_leftover,
@@ -34,12 +32,7 @@ from loopcal.io.core.result_folder import (
 )
 from loopcal.io.core.text_file import as_path, sha256
 from loopcal.io.robot.identified_table import remove_mark
-from loopcal.io.robot.robot_file import (
-    check_same_robot,
-    format_robot,
-    list_shipped_robots,
-    load_robot,
-)
+from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
 from loopcal.io.runs.run import Run
 from loopcal.io.runs.run_arrays import read_run_arrays
 from loopcal.io.runs.run_result import (
@@ -103,7 +96,6 @@ def write_run_folder(
     result: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
     robot_text: str,
-    read_back: Callable[[Path], object],
     force: bool = False,
     robot_name: str = ROBOT,
 ) -> Path:
@@ -113,7 +105,6 @@ def write_run_folder(
     ----------
     path : the folder to make. result : content of result.json; `format` and `files` are added.
     arrays : name -> array, SI. robot_text : of the corrected robot file.
-    read_back : see `write_result_folder`.
     force : replace an older run. robot_name : of that file, ROBOT or FAILED_ROBOT.
 
     Raises
@@ -123,7 +114,7 @@ def write_run_folder(
     path = as_path(path, "run folder")
     np.savez(stream := BytesIO(), allow_pickle=False, **arrays)
     files = {robot_name: robot_text.encode(), ARRAYS: stream.getvalue()}
-    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, read_back, force)
+    write_result_folder(path, RUN, {"format": FORMAT, **result}, files, force)
     return path
 
 
@@ -186,31 +177,7 @@ def save_run(
     text = remove_mark(format_robot(report.robot, report.identification.plus_minus))
     name = name_robot_file(report, force)
     text = WARNING + text if report.failures else text
-    arrays = report.arrays()
-    check = partial(_check_written_run, arrays=arrays, robot=report.robot, text=text)
-    return write_run_folder(path, document, arrays, text, check, force, name)
-
-
-def _check_written_run(
-    path: Path, arrays: Mapping[str, np.ndarray], robot: Mechanism, text: str
-) -> None:
-    """Read a run; raise LoopcalError where it does not hold these numbers."""
-    run = load_run(path)
-    _read_everything(run)
-    check_same_robot(robot, text, run.robot)
-    require_same("arrays", sorted(arrays), sorted(run.arrays))
-    for name, array in arrays.items():
-        require_same(f"bytes of {name}", array.tobytes(), run.arrays[name].tobytes())
-
-
-def _read_everything(run: Run) -> None:
-    """Read whatever another command reads from a run; raise LoopcalError where it cannot."""
-    budget = run.result.get("expected_error")
-    if "posterior_unit" in run.arrays:
-        run.load_posterior()
-    if budget is not None and budget.get("sources") is not None:
-        run.load_budget()
-    _ = (run.fitted_rows, run.held_out, run.excluded, run.failure, run.load_uncertainty())
+    return write_run_folder(path, document, report.arrays(), text, force, name)
 
 
 def build_document(

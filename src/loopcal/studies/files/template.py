@@ -8,10 +8,8 @@ import os
 from importlib.resources import files
 from pathlib import Path
 
-from loopcal.io.core.read_back import require_same
-from loopcal.io.core.text_file import read_text, write_text
+from loopcal.io.core.text_file import write_text
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
-from loopcal.studies.files.study_file import load_study
 
 PLACE = "ROBOT"
 """Stands for the robot in the template."""
@@ -30,7 +28,7 @@ def write_template(path: Path, robot: str) -> None:
     """
     load_robot(robot)
     text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
-    write_study_text(path, text.replace(f"[{PLACE}]", f"[{quote_robot(path, robot)}]"))
+    write_text(path, text.replace(f"[{PLACE}]", f"[{quote_robot(path, robot)}]"))
 
 
 def quote_robot(path: Path, robot: str) -> str:
@@ -45,18 +43,3 @@ def quote_robot(path: Path, robot: str) -> str:
     if robot not in list_shipped_robots():
         name = Path(os.path.relpath(file, path.parent)).as_posix()
     return name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)
-
-
-def write_study_text(path: Path, text: str) -> None:
-    """Write the text of a study file, which is read back as a study.
-
-    Raises
-    ------
-    FileError : it is no study, or the file cannot be written.
-    """
-
-    def read_back(written: Path) -> None:
-        require_same("text", text, read_text(written, "study file"))
-        load_study(written)
-
-    write_text(path, text, read_back=read_back)

@@ -255,7 +255,7 @@ def _list_options(wanted: Mapping[Name, float | str]) -> Exported:
         lines += [header] if header not in lines else []
         lines.append(f"{option}: {text}")
     content = "\n".join(lines) + "\n"
-    return Exported(content, parse_config_file, (report_finding("files.options-to-change"),))
+    return Exported(content, (report_finding("files.options-to-change"),))
 
 
 def parse_config_file(path: Path) -> KlipperConfig:

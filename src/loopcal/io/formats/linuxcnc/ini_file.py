@@ -112,7 +112,7 @@ def _list_changes(
         number = f"{source.round_number(added, name, factor, DECIMALS) + 0.0:+.{DECIMALS}f}"
         shown = number.rstrip("0").rstrip(".")
         lines += [f"[JOINT_{n}]", f"# add {shown} {unit} to {OFFSET}"]
-    return Exported("\n".join(lines) + "\n", lambda _: None)
+    return Exported("\n".join(lines) + "\n")
 
 
 def _read_unit(ini: IniFile, own: str) -> str:
