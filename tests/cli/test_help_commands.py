@@ -56,15 +56,6 @@ def test_an_example_replaces_nothing(tmp_path, monkeypatch, capsys) -> None:
     assert main(["example", "hexapod-42", "-o", "."]) == 1
 
 
-def test_a_damaged_copy_is_not_placed(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    write = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", lambda path, content: write(path, content[:-1]))
-    assert main(["example", "delta-printer"]) == 1
-    assert "This is a defect of loopcal" in " ".join(capsys.readouterr().err.split())
-    assert not Path("delta-printer").exists()
-
-
 def test_an_unknown_example_is_refused_with_similar_names(capsys) -> None:
     assert main(["example", "hexapod"]) == 1
     err = " ".join(capsys.readouterr().err.split())
