@@ -120,8 +120,8 @@ def refuse_other_content(path: Path, kind: FolderKind) -> None:
                     raise  # otherwise another command has replaced the folder meanwhile
 
 
-def _check_content(path: Path, kind: FolderKind) -> dict[str, Any]:
-    """Return the document of a folder; raise FileError as `refuse_other_content`."""
+def _check_content(path: Path, kind: FolderKind) -> None:
+    """Raise FileError as `refuse_other_content`."""
     document = _read_document(path / kind.document)
     if document is None or any(key not in document for key in kind.keys):
         raise FileError(report_finding("files.folder-of-others", content=kind.content), path)
@@ -134,7 +134,6 @@ def _check_content(path: Path, kind: FolderKind) -> dict[str, Any]:
     if changed:
         code = "files.changed-files"
         raise FileError(report_finding(code, content=kind.content, files=changed), path)
-    return document
 
 
 def list_changed_files(path: Path, kind: FolderKind) -> tuple[str, ...]:

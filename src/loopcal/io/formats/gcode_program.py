@@ -43,11 +43,6 @@ ANGLES = "(A B C: roll, pitch, yaw in degrees, R = Rz Ry Rx.)"
 """Comment on the words of angles."""
 
 UNIT_CODES = {"mm": "G21", "in": "G20"}
-ROUNDING = 2e-8
-"""Difference of coordinates that were written with these decimals [m, rad]."""
-
-_MOVE = re.compile(r"^G53 G1 (?P<words>[^F(]*) F")
-_WORD = re.compile(r"([A-Z])(-?[\d.]+)")
 
 
 @dataclass(frozen=True)
