@@ -22,19 +22,17 @@ from benchmarks.bench_start import import_numpy, read_processor_time, run_python
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.engine import get_current_engine
 from loopcal.engine.selection import VARIABLE
-from loopcal.estimate import LeastSquares, identify, identify_trials
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Sensor,
-    Trials,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, differentiate_pose, forward, forward_trials, inverse
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import Trials, sample_truth, simulate, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
 
 ENGINES = ("numpy", "native") if find_spec("loopcal_native") else ("numpy",)
 POSES, TRIALS, MANY = 10_000, 200, 10_000

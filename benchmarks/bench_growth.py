@@ -11,20 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_once
-from loopcal.apply import compensate
-from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.runs.compensation_file import format_compensation
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import Mechanism
-from loopcal.workflow import CalibrationOptions, calibrate
+from loopcal.apply.compensation import compensate
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.runs.result_files import format_compensation
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
 
 UM = 1e-6
 ROWS, FEW, MANY = 100_000, 10_000, 40_000

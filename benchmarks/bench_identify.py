@@ -10,23 +10,19 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
-from loopcal.diagnose import build_regularization_path, score_leave_one_out
-from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
+from loopcal.diagnose.cross_validation import build_regularization_path, score_leave_one_out
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Measurements,
-    Plane,
-    Pose,
-    Sensor,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.model import Mechanism
 
 UM, URAD = 1e-6, 1e-6
 TRIALS = 1000

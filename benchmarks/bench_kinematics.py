@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
 
 ROBOT = Path(__file__).resolve().parent.parent / "src" / "loopcal" / "robots" / "hexapod-42.yaml"
 POSES = 10_000

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from benchmarks.harness import Metric, measure_ratio, measure_time
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import observe_poses
-from loopcal.io import load_robot
-from loopcal.mechanism import WorkspaceSample, inverse, sample_workspace
-from loopcal.planning.design import D, PriorInformation, choose_design, coordinate_exchange
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.workspace import WorkspaceSample, sample_workspace
+from loopcal.planning.design_space import D, PriorInformation
+from loopcal.planning.exchange import choose_design, coordinate_exchange
 
 Array = NDArray[np.float64]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)

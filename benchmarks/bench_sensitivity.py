@@ -6,16 +6,14 @@ as many 6 x 6 systems; and the first answer of a mechanism that has never been s
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, measure_time
-from loopcal.io import load_robot
-from loopcal.mechanism import (
-    Assembly,
-    Mechanism,
-    build,
-    differentiate_pose,
-    forward,
-    forward_trials,
-)
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.assembly import Assembly
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward
 
 POSES = 10_000
 

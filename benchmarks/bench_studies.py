@@ -12,10 +12,10 @@ from typing import Any
 
 from benchmarks.harness import Metric
 from loopcal.studies.driver import RunReport
-from loopcal.studies.execution import Answer, Executor, Processes, Serial
+from loopcal.studies.execution.executors import Answer, Executor, Processes, Serial
 from loopcal.studies.running import read_source, run_study
-from loopcal.studies.simulation.poses import CellPoses
-from loopcal.studies.simulation.tasks import BlockResult, BlockTask, PosesTask, compute_task
+from loopcal.studies.simulation.block import BlockResult, BlockTask, PosesTask, compute_task
+from loopcal.studies.simulation.machines import CellPoses
 
 STUDY = """\
 format: 1

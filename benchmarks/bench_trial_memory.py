@@ -13,8 +13,9 @@ import numpy as np
 
 from benchmarks.bench_engine import ENGINES, ROOT, simulate_hexapods, use_engine
 from benchmarks.harness import Metric
-from loopcal.estimate import LeastSquares, identify_trials
-from loopcal.io import load_robot
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
 
 FEW, MANY = 1_000, 10_000
 CLEAR = Path("/proc/self/clear_refs")

@@ -13,7 +13,8 @@ import numpy as np
 from benchmarks.harness import Metric, time_once
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
-from loopcal.mechanism import Mechanism, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import inverse
 from loopcal.typing import FloatArray
 
 ROWS = 32

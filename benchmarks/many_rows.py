@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from loopcal.io import load_robot
-from loopcal.measure import sample_truth
-from loopcal.mechanism import forward, inverse
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.simulation import sample_truth
+from loopcal.mechanism.solutions import forward, inverse
 from tools.machine import describe_machine
 
 RESULT = Path(__file__).resolve().parent / "many_rows.json"

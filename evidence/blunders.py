@@ -10,10 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.diagnose import find_outliers
-from loopcal.estimate import Huber, LeastSquares, Tukey, identify
-from loopcal.io import load_robot
-from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, sample_truth, simulate
+from loopcal.diagnose.outliers import find_outliers
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber, Tukey
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
 
 DRAWS, CLEAN, POSES = 200, 1000, 40
 SIGMA = np.array([5e-6] * 3 + [1e-6] * 3)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.papers.cmm_constraint_2011 import layouts
 from loopcal.papers.cmm_constraint_2011.calibrations import (
     BEFORE,
@@ -43,7 +43,7 @@ from loopcal.papers.cmm_constraint_2011.machines import (
     load_machine,
     plan_points,
 )
-from loopcal.planning.plane_line_groups import PlaneLineGroups
+from loopcal.planning.plane_line_planning import PlaneLineGroups
 from loopcal.typing import FloatArray
 
 SEED, DRAWS, STARTS, FEW_DRAWS, DRAWS_PER_INTERPRETATION = 0, 200, 5, 40, 60

@@ -11,19 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.diagnose import check_clusters
-from loopcal.estimate import LeastSquares, identify
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
+from loopcal.diagnose.cluster_covariance import check_clusters
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
 
 CLEAN, COMMON, POSES = 400, 100, 30
 SIGMA, ANGLE = 10e-6, 50e-6

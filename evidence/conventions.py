@@ -10,24 +10,23 @@ from typing import Any
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose import IMPLAUSIBLE, ConventionCheck, compare_conventions
+from loopcal.diagnose.conventions.convention_check import (
+    IMPLAUSIBLE,
+    ConventionCheck,
+    compare_conventions,
+)
 from loopcal.errors import LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import (
-    KINDS,
-    Component,
-    Gaussian,
-    Instrument,
-    Kind,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    simulate,
-)
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.units import Dimension
 
 SEED, POSES = 3, 20

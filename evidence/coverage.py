@@ -10,21 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.estimate import MAP, LeastSquares, identify_trials
-from loopcal.estimate.identified_trials import IdentifiedTrials
-from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.minimization.filtered_step import penalize
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Pose,
-    Sensor,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, differentiate_pose, forward_trials, sample_workspace
+from loopcal.estimate.descent import penalize
+from loopcal.estimate.penalties import MAP, LeastSquares, Method
+from loopcal.estimate.trial_identification import IdentifiedTrials, identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.workspace import sample_workspace
 
 Array = NDArray[np.float64]
 

@@ -16,15 +16,15 @@ import numpy as np
 
 from benchmarks.bench_engine import use_engine
 from loopcal.engine import Engine, State, select_engine
-from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
-from loopcal.measure.kinds.poses.pose import compare_poses
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose, compare_poses
+from loopcal.measure.simulation import sample_truth, simulate
 from loopcal.mechanism.platform_coordinates import EULER, POSITION, read_coordinates, state_target
-from loopcal.numerics.decomposition import RANK_TOLERANCE
-from loopcal.numerics.triangular_systems import solve_regular
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.decomposition import RANK_TOLERANCE, solve_regular
 from tests.engine.cases import Case, draw_map, draw_twist_rows, make_case
 
 TRIALS, POSES = 5, 40

@@ -16,31 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.apply import PoseUncertainty, compute_error_budget, pose_uncertainty, validate
-from loopcal.diagnose import estimate_calibration_gain
+from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
+from loopcal.apply.error_budget import compute_error_budget
+from loopcal.apply.validation import validate
 from loopcal.diagnose.error_frames import fit_frames, fit_unfixed_frames
-from loopcal.estimate import identify, identify_trials
-from loopcal.estimate.identified_trials import IdentifiedTrials
-from loopcal.estimate.inference.measured_frames import MeasuredFrames
-from loopcal.estimate.inference.posterior import Posterior, compute_posterior
-from loopcal.estimate.trial_posteriors import compute_trial_posterior
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Distance,
-    Gaussian,
-    Instrument,
-    Kind,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    Trials,
-    sample_truth,
-    simulate_trials,
+from loopcal.diagnose.fit_examination import estimate_calibration_gain
+from loopcal.estimate.identification import identify
+from loopcal.estimate.posterior import MeasuredFrames, Posterior, compute_posterior
+from loopcal.estimate.trial_identification import (
+    IdentifiedTrials,
+    compute_trial_posterior,
+    identify_trials,
 )
-from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
-from loopcal.planning import Plan, PlanOptions, plan
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.pose_planning import plan
+from loopcal.planning.result import Plan
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]

@@ -28,8 +28,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from loopcal.cli import main
-from loopcal.io.core import descriptors, outputs, replacement, result_folder, text_file
+from loopcal.cli.entry_point import main
+from loopcal.io.core import outputs, replacement, result_folder, text_file
+from loopcal.io.core import replacement as descriptors
 
 MODULES = (descriptors, outputs, replacement, result_folder, text_file, shutil)
 TRACED = frozenset(str(module.__file__) for module in MODULES)

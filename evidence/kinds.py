@@ -16,37 +16,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.apply import validate
-from loopcal.diagnose import PoseErrors, find_frame_motions
+from loopcal.apply.validation import validate
+from loopcal.diagnose.frame_motions import find_frame_motions
+from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import LoopcalError
-from loopcal.estimate import (
-    MAP,
-    FitOptions,
-    Identification,
-    LeastSquares,
-    identify,
-    identify_trials,
-)
-from loopcal.estimate.identified_trials import IdentifiedTrials
-from loopcal.estimate.nuisance.estimate import estimate_nuisance
-from loopcal.estimate.problem_construction import problem_of, problem_of_trials
-from loopcal.geometry.alignment import align_point_sets, solve_hand_eye
-from loopcal.io import load_robot
-from loopcal.measure import (
-    KINDS,
-    Gaussian,
-    Instrument,
-    JointSensor,
-    Kind,
-    Measurements,
-    Sensor,
-    Trials,
-    collect_nuisance_parameters,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, build, forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.nuisance_estimate import estimate_nuisance
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of, problem_of_trials
+from loopcal.estimate.result import Identification
+from loopcal.estimate.trial_identification import IdentifiedTrials, identify_trials
+from loopcal.geometry import align_point_sets, solve_hand_eye
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.joints import JointSensor
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.simulation import Trials, sample_truth, simulate, simulate_trials
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import IntArray
 from loopcal.units import Dimension

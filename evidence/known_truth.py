@@ -9,31 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.diagnose import choose_model
-from loopcal.estimate import (
+from loopcal.diagnose.cross_validation import choose_model
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import (
     GCV,
     MAP,
-    InflatedTolerances,
     LeastSquares,
+    Method,
     Ridge,
     TruncatedSVD,
     TruncationGCV,
-    identify,
-    identify_trials,
 )
-from loopcal.estimate.methods.penalties import Method
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Sensor,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
+from loopcal.estimate.tolerance_components import InflatedTolerances
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 
 Array = NDArray[np.float64]
 

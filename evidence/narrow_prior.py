@@ -10,18 +10,15 @@ from dataclasses import replace
 import numpy as np
 
 from evidence.known_truth import Array, make_instrument, position_errors
-from loopcal.estimate import (
-    MAP,
-    Identification,
-    InflatedTolerances,
-    LeastSquares,
-    identify,
-    identify_trials,
-)
-from loopcal.estimate.methods.penalties import Method
-from loopcal.io import load_robot
-from loopcal.measure import Trials, sample_truth, simulate_trials
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares, Method
+from loopcal.estimate.result import Identification
+from loopcal.estimate.tolerance_components import InflatedTolerances
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
 
 SEED, MACHINES, POSES, HELD_OUT = 9, 60, 25, 60

@@ -12,18 +12,17 @@ import numpy as np
 from evidence.planned import CASES, Case
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
-from loopcal.io import load_robot
-from loopcal.mechanism import sample_workspace
-from loopcal.planning.design import (
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.design_space import (
     Criterion,
     D,
     I,
     PriorInformation,
-    choose_design,
     evaluate_criterion,
     factor_design,
-    fedorov_exchange,
 )
+from loopcal.planning.exchange import choose_design, fedorov_exchange
 
 CANDIDATES, POSES, STARTS, DRAWS, PREDICTED = 1000, 20, 20, 200, 200
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)

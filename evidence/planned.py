@@ -16,19 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.estimate import identify_trials
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Pose,
-    Sensor,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
-from loopcal.planning import PlanOptions, Target
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.constraints import PlanOptions, Target
 from loopcal.planning.pose_groups import linearize_groups
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import PlanningProblem, prepare_problem

@@ -12,18 +12,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from loopcal.estimate import Identification, LeastSquares, identify
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Closure,
-    Gaussian,
-    Instrument,
-    Sensor,
-    Trials,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.result import Identification
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.joints import Closure
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import FloatArray
 
 SEED, POSES, REPEATS = 17, 100, 200

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.studies.driver import count_blocks
-from loopcal.studies.execution import Executor, Processes
+from loopcal.studies.execution.executors import Executor, Processes
 from loopcal.studies.files.store import NAME, read_store
 from loopcal.studies.files.study_folder import load_specification
 from loopcal.studies.running import read_source, run_study

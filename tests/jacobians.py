@@ -244,7 +244,7 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
     import jax.numpy
 
     from loopcal import engine
-    from loopcal.geometry import rotations
+    from loopcal import geometry as rotations
 
     def stack(rows: tuple[tuple[Any, ...], ...]) -> Any:
         entries = jax.numpy.broadcast_arrays(*(entry for row in rows for entry in row))

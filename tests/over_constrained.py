@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 
 Array = NDArray[np.float64]
 

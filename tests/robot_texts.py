@@ -3,8 +3,8 @@
 
 from pathlib import Path
 
-from loopcal.io import load_robot
-from loopcal.mechanism import Mechanism
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.model import Mechanism
 
 
 def load_text(folder: Path, text: str) -> Mechanism:

@@ -16,20 +16,20 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.estimate import FitOptions, identify
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
 from loopcal.io.core.records import _to_si, read_units
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.robot_file import HEADER, list_shipped_robots, load_robot
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Measurements,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import FAMILIES, Mechanism, build, forward, inverse, sample_workspace
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families import FAMILIES
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests.zoo import load_cached_robot, move_base
 
 Array = NDArray[np.float64]

@@ -13,20 +13,19 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from loopcal.apply import compensate
-from loopcal.diagnose.fit_checks import cluster_covariance
-from loopcal.diagnose.fit_checks.cluster_covariance import choose_clusters, compute_robust_spread
-from loopcal.diagnose.fit_checks.independent_units import Clusters
-from loopcal.diagnose.residuals.residual_rows import ResidualRows
-from loopcal.estimate import identify
+from loopcal.apply.compensation import compensate
+from loopcal.diagnose import cluster_covariance
+from loopcal.diagnose.cluster_covariance import Clusters, choose_clusters, compute_robust_spread
+from loopcal.diagnose.residual_patterns import ResidualRows
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.identification import identify
 from loopcal.estimate.observation_rows import list_block_labels
-from loopcal.io import load_measurements, load_robot
 from loopcal.io.core.csv_table import read_table
-from loopcal.io.data.measurement_file import load_pose_names
-from loopcal.io.runs.compensation_file import format_compensation, load_targets
-from loopcal.measure import Measurements
-from loopcal.report.compensation_view import view_compensation
+from loopcal.io.data.measurement_file import load_measurements, load_pose_names
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.runs.result_files import format_compensation, load_targets
+from loopcal.measure.measurements import Measurements
+from loopcal.report.calibration_view import view_compensation
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
 MORE, MOST = 8, 24.0

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.geometry import rotations
+from loopcal import geometry as rotations
 from tests.jacobians import central_difference, check_jacobian, under_jax
 
 POINT = np.array([0.3, -1.2])

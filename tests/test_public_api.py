@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Public names of the package: each exists, is documented, and is imported on first use."""
 
-import ast
-import inspect
 import subprocess
 import sys
 
@@ -18,10 +16,8 @@ def test_every_public_name_exists(name) -> None:
     assert name in dir(loopcal)
 
 
-def test_unknown_attribute_lists_the_public_names() -> None:
-    with pytest.raises(
-        AttributeError, match=r"no attribute 'calibrate_all'; public names are .*identify"
-    ):
+def test_unknown_attribute_is_named() -> None:
+    with pytest.raises(AttributeError, match="calibrate_all"):
         _ = loopcal.calibrate_all
 
 
@@ -33,18 +29,6 @@ def test_importing_loopcal_does_not_import_numpy() -> None:
         ).stdout
         == "False\n"
     )
-
-
-def test_imports_for_type_checkers_equal_the_public_names() -> None:
-    imports = [
-        node
-        for node in ast.walk(ast.parse(inspect.getsource(loopcal)))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("loopcal.")
-    ]
-    visible = {name.name: node.module for node in imports for name in node.names}
-    assert visible == {
-        name: package for package, names in loopcal.PUBLIC_NAMES.items() for name in names
-    }
 
 
 def test_api_page_is_up_to_date() -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from loopcal.cli import command_line, main
-from loopcal.io import load_robot
+from loopcal.cli.entry_point import command_line, main
+from loopcal.io.robot.robot_file import load_robot
 from tests.cli.page_commands import list_commands
 from tools import speed_tables
 

@@ -31,7 +31,7 @@ WATCH = """
 import os, sys, tempfile
 from pathlib import Path
 import matplotlib.font_manager  # its cache of fonts is made once for a user
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 inside, events = Path.cwd().resolve(), []
 FORBIDDEN = ("socket.", "subprocess.", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pty.",
              "urllib.", "http.", "ftplib.", "smtplib.", "webbrowser.", "pickle.")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import (
+from loopcal.mechanism.assembly import (
     AXES,
     Actuator,
     Address,
@@ -23,13 +23,12 @@ from loopcal.mechanism import (
     Limb,
     LinearMap,
     Link,
-    Mechanism,
-    PoseRecord,
-    Workspace,
-    build,
 )
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.families.linear_delta import LinearDelta
+from loopcal.mechanism.families.records import PoseRecord, Workspace
+from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 

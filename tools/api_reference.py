@@ -6,6 +6,7 @@ python -m tools.api_reference            rewrite the page
 
 from __future__ import annotations
 
+import ast
 import enum
 import inspect
 import re
@@ -29,8 +30,7 @@ SECTIONS = {
     "loopcal.apply": "Use of a calibration",
     "loopcal.sampling": "Resampling and posterior draws",
     "loopcal.planning": "Planning",
-    "loopcal.studies.running": "Simulation studies",
-    "loopcal.studies": "Parts of studies",
+    "loopcal.studies": "Simulation studies",
     "loopcal.documents": "Documents",
     "loopcal.progress_bar": "Notebooks",
     "loopcal.findings": "Findings",
@@ -50,18 +50,28 @@ shapes, units and errors. This page is made from the code by `make docs`.
 
 def write_page() -> str:
     """Return the text of the page."""
-    if set(SECTIONS) != set(loopcal.PUBLIC_NAMES):
-        raise SystemExit(f"SECTIONS lacks {set(loopcal.PUBLIC_NAMES) - set(SECTIONS)}")
+    names = list_names()
+    if set(SECTIONS) != set(names):
+        raise SystemExit(f"SECTIONS lacks {set(names) - set(SECTIONS)}")
     sections = [HEAD]
     for package, heading in SECTIONS.items():
-        rows = [(f"`{name}`", describe_name(name)) for name in list_names(package)]
+        rows = [(f"`{name}`", describe_name(name)) for name in names[package]]
         sections.append(f"\n## {heading}\n\n{format_table(('name', 'purpose'), rows)}")
     return "".join(sections)
 
 
-def list_names(package: str) -> list[str]:
-    """Return the public names of a section in the order of the alphabet."""
-    return sorted(loopcal.PUBLIC_NAMES[package], key=lambda name: (name.lower(), name))
+def list_names() -> dict[str, list[str]]:
+    """Return the public names of each package, in the order of the alphabet."""
+    stub = Path(loopcal.__file__).with_suffix(".pyi")
+    names: dict[str, list[str]] = {}
+    for node in ast.parse(stub.read_text("utf-8")).body:
+        if isinstance(node, ast.ImportFrom):
+            package = f"loopcal.{str(node.module).split('.')[0]}"
+            names.setdefault(package, []).extend(alias.name for alias in node.names)
+    return {
+        package: sorted(members, key=lambda name: (name.lower(), name))
+        for package, members in names.items()
+    }
 
 
 def describe_name(name: str) -> str:

@@ -18,7 +18,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from loopcal.documents.printing import find_browser, is_root
+from loopcal.documents import find_browser, is_root
 
 LOADS = {("img", "src"), ("script", "src"), ("link", "href"), ("iframe", "src"), ("source", "src")}
 """Attributes whose target a browser loads without being asked."""

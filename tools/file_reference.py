@@ -14,17 +14,18 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-from loopcal.io.core import file_reference
 from loopcal.io.core.limits import COUNT_LIMITS, LIMITS
 from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
-from loopcal.io.exports import list_shipped_profiles
-from loopcal.io.exports.profile import ColumnSource, ProfileRecord
+from loopcal.io.exports.profile import ColumnSource, ProfileRecord, list_shipped_profiles
+from loopcal.io.robot import robot_file as file_reference
 from loopcal.io.runs.run_folder import MADE_BY
-from loopcal.measure import KINDS, Column, Kind
-from loopcal.mechanism import FAMILIES, RobotRecord
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.kind import Column, Kind
+from loopcal.mechanism.families import FAMILIES
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.studies.files.study_file import LEVELS, StudySettings
 from loopcal.studies.specification.levels import Question, Scores
 from loopcal.studies.specification.scores import list_columns

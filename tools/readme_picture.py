@@ -12,9 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import loopcal as lc
-from loopcal.apply import Validation
-from loopcal.report.scene.robot_parts import list_parts
-from loopcal.report.scene.scene import PoseErrors, compute_pose_errors
+from loopcal.apply.validation import Validation
+from loopcal.report.scene.scene import PoseErrors, compute_pose_errors, list_parts
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "pictures" / "demo.png"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import click
 
-from loopcal.cli import command_line
+from loopcal.cli.entry_point import command_line
 from tools.site_docstrings import escape_markup
 
 UNDERLINES = "=-"

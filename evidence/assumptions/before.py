@@ -13,8 +13,8 @@ from multiprocessing import get_context
 from typing import Any
 
 import loopcal.diagnose
-from loopcal.estimate import Identification
-from loopcal.measure import Measurements
+from loopcal.estimate.result import Identification
+from loopcal.measure.measurements import Measurements
 
 
 def keep_uncertainty(fit: Identification, _: Measurements) -> Identification:

@@ -18,13 +18,20 @@ import numpy as np
 from evidence.assumptions.cases import OUTLIERS, Case, Setup, list_cases
 from evidence.assumptions.levels import name_group
 from evidence.assumptions.simulation import Array, BoolArray, Simulation, simulate_case
-from loopcal.apply import pose_uncertainty
-from loopcal.diagnose import adjust_uncertainty, check_clusters, check_heavy_tails, find_outliers
-from loopcal.estimate import FitOptions, LeastSquares, identify, identify_trials
+from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty, check_heavy_tails
+from loopcal.diagnose.cluster_covariance import check_clusters
+from loopcal.diagnose.outliers import find_outliers
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.findings import Severity
-from loopcal.io import load_robot
-from loopcal.mechanism import Mechanism, forward, forward_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
 
 FITS, EXAMINED = 400, 25
 """Fits of a case; those of them that are searched for outliers and common errors, where these

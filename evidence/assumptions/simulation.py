@@ -9,20 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evidence.assumptions.cases import Case, Setup
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Sensor,
-    Trials,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
-from loopcal.studies.simulation.effects import AlteredNoise
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.studies.simulation.preparation import AlteredNoise
 from loopcal.studies.specification.levels import EffectsLevel, Outliers
 
 Array = NDArray[np.float64]

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.engine import CONVERGED, Engine, Program, State, select_engine
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from tests.engine.cases import Case, make_case
 
 ROWS, INPUTS = 1000, 1_000_000

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.studies.execution import Executor
-from loopcal.studies.execution.interface import Answer, R, T
-from loopcal.studies.simulation.poses import CellPoses
-from loopcal.studies.simulation.tasks import BlockResult, PosesTask, compute_task
+from loopcal.studies.execution.executors import Answer, Executor, R, T
+from loopcal.studies.simulation.block import BlockResult, PosesTask, compute_task
+from loopcal.studies.simulation.machines import CellPoses
 from loopcal.studies.specification.scores import COLUMNS
 
 

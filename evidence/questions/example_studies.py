@@ -13,11 +13,13 @@ from typing import Any
 import loopcal
 from loopcal.report.pictures import render_figure
 from loopcal.report.tables import Table
-from loopcal.studies.results.question_view import tabulate_answers
-from loopcal.studies.results.questions import AnsweredQuestion
-from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.results.summary import CellSummary, Interval
-from loopcal.studies.results.summary_view import FRAMES, tabulate_medians
+from loopcal.studies.results.questions import (
+    FRAMES,
+    AnsweredQuestion,
+    tabulate_answers,
+    tabulate_medians,
+)
+from loopcal.studies.results.study_result import CellSummary, Interval, StudyResult
 
 STUDIES = Path(__file__).resolve().parents[2] / "examples" / "studies"
 

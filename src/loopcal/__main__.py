@@ -19,7 +19,7 @@ def run() -> int:
     """Run the command line and return its exit code."""
     gc.set_threshold(COLLECTED_AFTER)
     try:
-        from loopcal.cli import main
+        from loopcal.cli.entry_point import main
 
         return main()
     except KeyboardInterrupt:  # before the first command ran, or after the last word was printed

@@ -1,39 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of a package, and entries of a registry, that are imported when they are first used.
+"""A registry whose entries are imported when they are looked up.
 
-A package that re-exports the names of its modules would import all of them for whoever needs one. A
-command that calibrates needs half of the modules of loopcal, and spends as long on importing as on
-computing. So a package states its names twice: for type checkers as imports, and for Python as a
-table, from which `__getattr__` imports. A test compares the two.
+A command that calibrates needs half of the modules; importing takes as long as computing.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
-
-
-def import_lazily(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package.
-
-    Parameters
-    ----------
-    package : its name. names : module -> names of the package in it, between blanks.
-    """
-    modules = {name: module for module, listed in names.items() for name in listed.split()}
-
-    def load(name: str) -> Any:
-        if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(modules[name]), name)
-        setattr(sys.modules[package], name, value)
-        return value
-
-    return load
 
 
 class LazyRegistry(Mapping[str, T]):

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 
 def draw(name: str, *arguments: object) -> Figure:
-    """Return the figure that a function of `loopcal.report.figures` draws."""
-    return getattr(import_module("loopcal.report.figures"), name)(*arguments)
+    """Return the figure that `module.function` of `loopcal.report.figures` draws."""
+    module, _, function = name.partition(".")
+    return getattr(import_module(f"loopcal.report.figures.{module}"), function)(*arguments)
 
 
 class HtmlResult:
@@ -67,16 +68,16 @@ class FitFigures:
         """Draw the residuals by pose and component, as histogram and normal plot, and against
         actuator readings, time and temperatures.
         """
-        return draw("draw_residuals", self._fit)
+        return draw("fit_figures.draw_residuals", self._fit)
 
     def parameters(self) -> Figure:
         """Draw the shift of each parameter in tolerances with its 95 % interval."""
-        return draw("draw_parameters", self._fit)
+        return draw("fit_figures.draw_parameters", self._fit)
 
     def correlation(self) -> Figure:
         """Draw the correlations of the parameters as a matrix of colors."""
-        return draw("draw_correlation", self._fit)
+        return draw("fit_figures.draw_correlation", self._fit)
 
     def convergence(self) -> Figure:
         """Draw the sum of squares and the parameters by step of the iteration."""
-        return draw("draw_convergence", self._fit)
+        return draw("fit_figures.draw_convergence", self._fit)

@@ -10,13 +10,14 @@ import pytest
 from scipy.stats import chi2
 
 from loopcal import geometry, load_robot
-from loopcal.apply import accuracy_map, pose_uncertainty
-from loopcal.apply.accuracy_simulation import simulate_accuracy
-from loopcal.diagnose import find_frame_motions
+from loopcal.apply.accuracy import accuracy_map, pose_uncertainty, simulate_accuracy
+from loopcal.diagnose.frame_motions import find_frame_motions
 from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, LeastSquares, identify
-from loopcal.measure import sample_truth, simulate
-from loopcal.mechanism import forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker
 
 TEST_POSES = hexapod_poses(5, seed=11)

@@ -8,33 +8,29 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply import ErrorBudget, compute_error_budget, pose_uncertainty
-from loopcal.apply.covariance_sources import split_covariance
-from loopcal.apply.error_budget import SourceBudget
-from loopcal.diagnose import adjust_uncertainty
-from loopcal.estimate import (
-    MAP,
-    FitOptions,
-    Identification,
-    LeastSquares,
-    Ridge,
-    TruncatedSVD,
-    identify,
+from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.apply.error_budget import (
+    ErrorBudget,
+    SourceBudget,
+    compute_error_budget,
+    split_covariance,
 )
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.measure import (
-    Component,
-    Distance,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    StatedValue,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import Mechanism, differentiate_pose, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.estimate.result import Identification
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import StatedValue
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import UM, URAD, noise
 
 PLACES = np.array([[0.03, -0.02, 0.05], [-0.04, 0.02, 0.05], [0.0, 0.05, 0.06]])
@@ -264,8 +260,8 @@ def test_fits_with_one_source_switched_off_lack_its_part():
     second = Sensor(Distance(), noise(6 * UM))
     silent = Sensor(Component(("x", "y", "z")), noise(*[1e-9] * 3))
     truth = sample_truth(robot, 300, 5)
-    from loopcal.estimate import identify_trials
-    from loopcal.measure import simulate_trials
+    from loopcal.estimate.trial_identification import identify_trials
+    from loopcal.measure.simulation import simulate_trials
 
     trials = simulate_trials(robot, truth, coordinates, Instrument((first, second)), 5)
     quiet = simulate_trials(robot, truth, coordinates, Instrument((silent, second)), 5)

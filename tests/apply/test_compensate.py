@@ -11,9 +11,12 @@ import pytest
 from loopcal import geometry, load_robot
 from loopcal.apply.compensation import Reach, compensate
 from loopcal.errors import DataError
-from loopcal.estimate import LeastSquares, identify
-from loopcal.io.runs.compensation_file import format_compensation
-from loopcal.mechanism import compare_coordinates, forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.runs.result_files import format_compensation
+from loopcal.mechanism.platform_coordinates import compare_coordinates
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses
 
 ROBOTS = ("hexapod-42", "3-prs", "linear-delta", "ru-pus-prs", "five-bar")

@@ -8,15 +8,23 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
-from loopcal.apply import Decision, judge_estimate, judge_largest_error, validate
-from loopcal.apply.conformity import judge_limits, report_conformity
+from loopcal.apply.conformity import (
+    Decision,
+    judge_estimate,
+    judge_largest_error,
+    judge_limits,
+    report_conformity,
+)
+from loopcal.apply.validation import validate
 from loopcal.errors import EstimationError
-from loopcal.estimate import identify
+from loopcal.estimate.identification import identify
 from loopcal.findings import Severity
-from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Component, Instrument, Sensor, sample_truth, simulate
-from loopcal.mechanism import Mechanism
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
 from loopcal.report.validation_view import view_validation
 from loopcal.units import find_unit
 from tests.estimate.problems import UM, noise

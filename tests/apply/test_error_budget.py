@@ -9,28 +9,22 @@ import pytest
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.apply import ErrorBudget, compute_error_budget, pose_uncertainty
+from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.apply.error_budget import ErrorBudget, compute_error_budget
 from loopcal.diagnose.error_frames import solve_home
-from loopcal.estimate import (
-    MAP,
-    FitOptions,
-    Identification,
-    LeastSquares,
-    identify,
-    identify_trials,
-)
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.result import Identification
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
 from tests.estimate.problems import UM, URAD, noise
 

@@ -10,14 +10,26 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-from loopcal.apply import HeightErrors, map_height_errors
-from loopcal.apply.height_errors import measures_only_heights, restore_heights, store_heights
-from loopcal.estimate import identify
-from loopcal.measure import Gaussian, Instrument, Measurements, Observations, Sensor, simulate
-from loopcal.measure.kinds import Component, Plane, Position
-from loopcal.mechanism import Mechanism, forward, sample_workspace
-from loopcal.report.figures import draw_height_errors
-from loopcal.report.height_view import build_height_map, build_height_summary, view_heights
+from loopcal.apply.height_errors import (
+    HeightErrors,
+    map_height_errors,
+    measures_only_heights,
+    restore_heights,
+    store_heights,
+)
+from loopcal.estimate.identification import identify
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.report.calibration_view import build_height_map, build_height_summary, view_heights
+from loopcal.report.figures.result_figures import draw_height_errors
 from loopcal.report.tables import Table
 
 

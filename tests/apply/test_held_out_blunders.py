@@ -7,24 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply import validate
-from loopcal.diagnose import check_held_out_rows
-from loopcal.estimate import identify
-from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
+from loopcal.apply.validation import validate
+from loopcal.diagnose.blunders import check_held_out_rows
+from loopcal.estimate.fit_linearization import collect_uncertainty
+from loopcal.estimate.identification import identify
 from loopcal.findings import Quantity, report_finding
-from loopcal.io import load_robot, load_run, save_run
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import sample_workspace
-from loopcal.workflow import CalibrationOptions, Verdict, calibrate
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.runs.run_folder import load_run, save_run
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.verdict import Verdict
 from tests.estimate.problems import UM
 from tests.findings.expectations import get_finding, list_codes
 

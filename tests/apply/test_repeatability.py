@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.repeatability import compute_repeatability, describe_visits
-from loopcal.apply.repeatability_result import Estimate, VisitedPose
+from loopcal.apply.repeatability import (
+    Estimate,
+    VisitedPose,
+    compute_repeatability,
+    describe_visits,
+)
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
 from tests.estimate.problems import UM, hexapod_poses, tracker

@@ -8,28 +8,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply import report_reused_rows
+from loopcal.apply.validation import report_reused_rows
 from loopcal.errors import DataError
-from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from, recalibrate
 from loopcal.estimate.fit_input import exclude_poses
-from loopcal.estimate.inference.posterior import posterior_from_arrays
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.posterior import posterior_from_arrays
+from loopcal.estimate.prior import prior_from
+from loopcal.estimate.recalibration import recalibrate
 from loopcal.findings import Severity
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    collect_fitted_rows,
-    fitted_rows_from_arrays,
-    simulate,
-)
-from loopcal.measure.kinds import Kind
-from loopcal.mechanism import sample_workspace
-from loopcal.workflow import CalibrationOptions, calibrate
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.fitted_rows import collect_fitted_rows, fitted_rows_from_arrays
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, list_codes
 

@@ -7,25 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply import validate
-from loopcal.diagnose import compute_noise_floor, compute_row_errors, find_moved_setups
+from loopcal.apply.validation import validate
+from loopcal.diagnose.conventions.convention_check import find_moved_setups
+from loopcal.diagnose.row_errors import compute_noise_floor, compute_row_errors
 from loopcal.errors import DataError
-from loopcal.estimate import identify
-from loopcal.io import load_robot
+from loopcal.estimate.identification import identify
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import (
-    KINDS,
-    Gaussian,
-    Instrument,
-    Observations,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.measure.kinds.error_groups import list_error_groups
-from loopcal.mechanism import sample_workspace
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.kind import list_error_groups
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.workspace import sample_workspace
 from tests import zoo
 from tests.estimate.problems import (
     UM,

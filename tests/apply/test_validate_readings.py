@@ -6,22 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply import validate
+from loopcal.apply.validation import validate
 from loopcal.errors import DataError, FileError
-from loopcal.estimate import FitOptions, identify
-from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Observations,
-    Position,
-    Sensor,
-    simulate,
-)
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.validation_view import view_validation
-from loopcal.workflow import CalibrationOptions, Verdict, calibrate, split_data
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions, split_data
+from loopcal.workflow.verdict import Verdict
 from tests.estimate.problems import UM, hexapod, hexapod_data, hexapod_poses
 from tests.estimate.uncertain_reading_problems import build_hexapod_with_seven_legs
 from tests.findings.expectations import get_finding, list_codes

@@ -5,11 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import MechanismError
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.measure import KINDS
-from loopcal.mechanism import AngleTolerance, LengthTolerance, Workspace, standard_deviation
+from loopcal.measure.kinds import KINDS
+from loopcal.mechanism.families.records import (
+    AngleTolerance,
+    LengthTolerance,
+    Workspace,
+    standard_deviation,
+)
 
 ROBOT = find_robot_file("hexapod-42").read_text()
 PROFILE = Path("examples/exports/cmm-spheres.yaml").read_text("utf-8")

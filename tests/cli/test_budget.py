@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 
 DATA = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
 

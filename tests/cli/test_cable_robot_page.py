@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_measurements, load_robot
+from loopcal.cli.entry_point import main
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import load_robot
 from tests.cable_robot import NAMES, TRUTH, format_samples, load_real_samples
 from tests.cli.printed_tables import read_report, read_table_rows
 

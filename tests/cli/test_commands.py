@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_measurements, load_robot
-from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots
+from loopcal.cli.entry_point import main
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
 from loopcal.io.runs.run_folder import load_run
-from loopcal.mechanism import forward
+from loopcal.mechanism.solutions import forward
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"  # noqa: E501

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 
 DRAW = "--draw 16 --kind position --sigma-position 10um"
 

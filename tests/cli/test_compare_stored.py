@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from tests.cli.delta_printers import read_records
 from tests.io.formats.printers import format_printer_cfg
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_robot
+from loopcal.cli.entry_point import main
 from loopcal.io.core.csv_table import read_table
-from loopcal.mechanism import forward, inverse
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.solutions import forward, inverse
 from loopcal.units import Dimension
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"

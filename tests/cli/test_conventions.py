@@ -6,13 +6,16 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
-from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import Component, Gaussian, Instrument, Pose, Sensor, simulate
-from loopcal.mechanism import sample_workspace
-from loopcal.workflow import calibrate
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.workflow.calibration import calibrate
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
 from loopcal.cli.commands import robot_commands
+from loopcal.cli.entry_point import main
 
 DEFECTS = {
     "RecursionError": "f()",
@@ -23,7 +23,7 @@ DEFECTS = {
 SCRIPT = """
 import sys
 import numpy as np
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.cli.commands import robot_commands
 np.seterr(divide="raise")
 f = lambda: f()

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.apply.validation_findings import ErrorChange
-from loopcal.cli import main
+from loopcal.apply.validation import ErrorChange
+from loopcal.cli.entry_point import main
 from loopcal.findings.wording import fill_template
-from loopcal.io import load_robot
-from loopcal.mechanism import sample_workspace
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.validation_view import _compare
 
 NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf|infinity)(?!\w)", re.IGNORECASE)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_robot
+from loopcal.cli.entry_point import main
+from loopcal.io.robot.robot_file import load_robot
 from tests.cli.printed_tables import read_report, read_table_rows
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.io.formats.delta_printers.probe_reports import read_reports
+from loopcal.cli.entry_point import main
+from loopcal.io.formats.delta_gcode import read_reports
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, make_truth, probe, write_g30
 
 NOISE = 0.02

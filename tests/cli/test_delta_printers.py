@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.io.runs.run_folder import load_run
 from tests.cli.delta_printers import (
     list_stored_geometry,

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.cli.entry_point import main
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
 from tests.io.test_probe_reports import MARLIN, POINTS, REPRAP, TRUE, probe, write_g30
 
 NOISE = 0.02

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
 from loopcal.cli.commands.exchange_commands import WRITTEN_FORMATS
-from loopcal.io import load_robot, load_run, save_robot
-from loopcal.io.runs.run_verdict import FAILED_ROBOT, ROBOT, find_run_failure
-from loopcal.mechanism import inverse
+from loopcal.cli.entry_point import main
+from loopcal.io.robot.robot_file import load_robot, save_robot
+from loopcal.io.runs.run_folder import FAILED_ROBOT, ROBOT, find_run_failure, load_run
+from loopcal.mechanism.solutions import inverse
 
 STEP = 0.0125
 """Length of a motor step [mm]."""

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.diagnose.error_frames import fit_frames
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import find_robot_file
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
 
 DATA = """\
 # kind: {kind}

@@ -7,10 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.cli import main
 from loopcal.cli.commands.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
-from loopcal.io import load_measurements, load_robot
+from loopcal.cli.entry_point import main
+from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.formats import FORMATS
+from loopcal.io.robot.robot_file import load_robot
 from tests.cli.delta_printers import list_stored_geometry, read_records
 from tests.io.formats.printers import format_printer_cfg
 

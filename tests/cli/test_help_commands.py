@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.io.example_folders import list_examples
 
 
@@ -99,7 +99,7 @@ def complete(words: str, tmp_path: Path) -> list[str]:
         "COMP_CWORD": str(len(parts) - 1),
     }
     done = subprocess.run(
-        [sys.executable, "-c", "from loopcal.cli import main; main([])"],
+        [sys.executable, "-c", "from loopcal.cli.entry_point import main; main([])"],
         env=environment,
         capture_output=True,
         text=True,

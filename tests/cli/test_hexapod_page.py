@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.geometry.alignment import align_point_sets
-from loopcal.io import load_robot
-from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+from loopcal.cli.entry_point import main
+from loopcal.geometry import align_point_sets
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import FloatArray
 from tests.cli.page_commands import list_commands
 

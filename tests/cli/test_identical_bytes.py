@@ -44,7 +44,7 @@ reproduce hexapod-42 -o study --trials 2"""
 WORK = """
 import contextlib, io, sys
 from pathlib import Path
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 for n, command in enumerate(sys.argv[1].splitlines()):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

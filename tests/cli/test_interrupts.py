@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from loopcal.cli import entry_point, main
-from loopcal.cli.interrupts import repeat_lost_interrupts
+from loopcal.cli import entry_point
+from loopcal.cli.entry_point import main, repeat_lost_interrupts
 
 
 class _Callback:

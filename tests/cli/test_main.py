@@ -9,9 +9,9 @@ from pathlib import Path
 import click
 import pytest
 
-from loopcal.cli import command_line, main
 from loopcal.cli.commands import robot_commands
 from loopcal.cli.commands.study_commands import study
+from loopcal.cli.entry_point import command_line, main
 from loopcal.errors import MechanismError
 
 NAMES = sorted(command_line.list_commands(click.Context(command_line)))
@@ -71,13 +71,13 @@ UNUSED = {
     *("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.sparse", "scipy.linalg"),
     *("loopcal.planning", "loopcal.sampling", "loopcal.studies", "loopcal.documents"),
     *("loopcal.report.figures", "loopcal.mechanism.families.limbs", "loopcal.apply.compensation"),
-    *("loopcal.diagnose.model_choice", "loopcal.apply.run_comparison.comparison"),
-    *("loopcal.mechanism.stages.chain_state", "loopcal.mechanism.actuation.summed_drives"),
-    *("loopcal.mechanism.closure.open_closure", "loopcal.mechanism.compilation.chain_compilation"),
-    *("loopcal.estimate.poses.uncertain", "loopcal.estimate.poses.estimate"),
-    *("loopcal.estimate.poses.components", "loopcal.estimate.poses.initialization"),
+    *("loopcal.diagnose.cross_validation", "loopcal.apply.run_comparison"),
+    *("loopcal.mechanism.chains", "loopcal.mechanism.actuation"),
+    *("loopcal.mechanism.open_closure", "loopcal.mechanism.compilation"),
+    *("loopcal.estimate.uncertain_poses", "loopcal.estimate.pose_estimate"),
+    *("loopcal.estimate.uncertain_poses", "loopcal.estimate.pose_start"),
     *("loopcal.measure.instrument", "loopcal.measure.simulation", "loopcal.measure.initial_values"),
-    *("loopcal.measure.kinds.points.position", "loopcal.measure.kinds.surfaces.plane"),
+    *("loopcal.measure.kinds.position", "loopcal.measure.kinds.surfaces"),
 }
 """Packages that an ordinary calibration does not need, each of which takes time to import."""
 
@@ -87,7 +87,7 @@ def test_ordinary_calibration_imports_only_what_it_needs(tmp_path) -> None:
     example = Path("examples/hexapod-42/measurements.csv").resolve()
     words = ["calibrate", "hexapod-42", str(example), "-o", str(tmp_path / "run")]
     code = (
-        "import sys; from loopcal.cli import main; "
+        "import sys; from loopcal.cli.entry_point import main; "
         f"code = main({[*words, '--hold-out', '0.25']}); "
         f"print(code, sorted({UNUSED} & set(sys.modules)))"
     )
@@ -127,7 +127,7 @@ def test_user_error_prints_one_sentence_and_gives_exit_code_1(
 
 
 def test_closed_output_pipe_causes_no_traceback() -> None:
-    code = "import sys; from loopcal.cli import main; sys.exit(main(['check', 'hexapod-42']))"
+    code = "import sys; from loopcal.cli.entry_point import main; sys.exit(main(['check', 'hexapod-42']))"
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:

@@ -3,10 +3,9 @@
 
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism import FAMILIES
+from loopcal.cli.entry_point import main
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.mechanism.families import FAMILIES
 
 
 @pytest.fixture(autouse=True)

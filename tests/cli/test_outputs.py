@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import write_text
 from loopcal.io.robot.robot_file import find_robot_file

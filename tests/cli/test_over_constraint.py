@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from tests.over_constrained import EXECHON, close_by_least_squares
 
 CAUSE = "limb right prevents translation along y and rotation about z, as left does"

@@ -9,7 +9,8 @@ import sys
 
 import pytest
 
-from loopcal.cli import main, terminal
+from loopcal.cli import terminal
+from loopcal.cli.entry_point import main
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.plain_text import find_not_plain
 

@@ -7,10 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_measurements, load_robot
-from loopcal.measure import sample_truth
-from loopcal.mechanism import forward, inverse, sample_workspace
+from loopcal.cli.entry_point import main
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.simulation import sample_truth
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 
 SMALL = ["--poses", "8", "--hold-out", "3", "--candidates", "24", "--kind", "position"]
 

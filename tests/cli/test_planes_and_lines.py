@@ -11,9 +11,11 @@ import pytest
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.cli import main
-from loopcal.io import load_robot
-from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+from loopcal.cli.entry_point import main
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 
 ROBOT = "hexapod-nategh-agheli"
 

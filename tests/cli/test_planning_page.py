@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_robot
+from loopcal.cli.entry_point import main
+from loopcal.io.robot.robot_file import load_robot
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 

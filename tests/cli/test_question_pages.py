@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from evidence.questions.example_studies import find_cell
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.studies.files.study_file import load_study
 from tests.cli.page_commands import list_commands
 

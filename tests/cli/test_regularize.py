@@ -8,7 +8,7 @@ import json
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.io.runs.run_folder import read_run_folder, write_run_folder
 from loopcal.units import find_unit
 

@@ -8,20 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_robot, save_measurements
-from loopcal.measure import (
-    Gaussian,
-    Inclination,
-    Instrument,
-    Measurements,
-    Pose,
-    Sensor,
-    StatedValue,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import sample_workspace
+from loopcal.cli.entry_point import main
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.directions import Inclination
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import StatedValue
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.workspace import sample_workspace
 
 SD = "tracker.x: {start: 0 mm, sd: 1 mm}"
 

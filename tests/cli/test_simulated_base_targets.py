@@ -4,7 +4,7 @@
 import json
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from tests.io.test_base_target_files import BASE, POSES, ROBOT
 
 

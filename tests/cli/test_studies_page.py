@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.studies.files.study_file import MOST_TRIALS, load_study
 from tests.cli.page_commands import list_commands
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from evidence.study_interruption import read_contents
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import load_robot
 from loopcal.studies.files.store import NAME, open_store
 from loopcal.studies.results.study_result import StudyResult
 from tests.studies.small_study import CELLS, write_study
@@ -193,9 +193,9 @@ def test_ctrl_c_leaves_a_folder_that_is_continued(tmp_path) -> None:
 
 FULL = """
 import os
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import load_robot
 code = main("study run small.yaml -o disk/f --workers 1".split())
 print(code, flush=True)
 os.unlink("disk/filler")
@@ -306,7 +306,7 @@ def test_joined_folders_of_two_studies_are_both_named(run, tmp_path) -> None:
 
 
 def test_durations_have_two_digits_in_the_unit_that_is_printed() -> None:
-    from loopcal.cli.options.study_options import round_duration
+    from loopcal.cli.commands.study_commands import round_duration
 
     words = [round_duration(seconds) for seconds in (0.0123, 19.4, 340.0, 7000.0, 500000.0)]
     assert words == ["0.012 s", "19 s", "5.7 min", "1.9 h", "140 h"]

@@ -8,19 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import sample_workspace
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.workspace import sample_workspace
 
 LENGTH, ANGLE = 5e-6, 25e-6
 """Stated noise [m], [rad]."""

@@ -12,14 +12,23 @@ from scipy.special import stdtrit
 from scipy.stats import binom
 
 import loopcal as lc
-from loopcal.diagnose import adjust_uncertainty
-from loopcal.diagnose.residuals.correlated_errors import RHO, SHARE, estimate_correlated_errors
-from loopcal.diagnose.residuals.residual_patterns import FALSE_ALARMS
-from loopcal.diagnose.residuals.residual_rows import collect_residual_rows
-from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+from loopcal.diagnose.residual_patterns import (
+    FALSE_ALARMS,
+    RHO,
+    SHARE,
+    collect_residual_rows,
+    estimate_correlated_errors,
+)
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
 from loopcal.findings import Severity
-from loopcal.mechanism import differentiate_pose, forward, sample_workspace
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
 PATTERNS = {

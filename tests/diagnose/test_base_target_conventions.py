@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import report_base_targets
-from loopcal.mechanism import resolve_poses
+from loopcal.diagnose.frame_drift import report_base_targets
+from loopcal.mechanism.workspace import resolve_poses
 
 ROBOT = lc.load_robot("linear-delta")
 PLACES = np.array([[0.3, -0.25, 0.0], [0.2, 0.35, 0.05], [-0.35, 0.05, 0.02]])

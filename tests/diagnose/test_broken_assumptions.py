@@ -13,12 +13,11 @@ from evidence.assumptions.evaluation import evaluate_case, is_met
 from evidence.assumptions.levels import STATED_LEVELS, name_group
 from evidence.assumptions.simulation import describe_noise, simulate_case
 from loopcal import load_robot
-from loopcal.diagnose import find_outliers
-from loopcal.diagnose.residuals import residual_patterns
-from loopcal.estimate.inference import residual_test
-from loopcal.estimate.methods import prior_conflict
-from loopcal.measure import Gaussian
-from loopcal.studies.simulation.effects import AlteredNoise
+from loopcal.diagnose import residual_patterns
+from loopcal.diagnose.outliers import find_outliers
+from loopcal.estimate import prior_conflict, residual_test
+from loopcal.measure.instrument import Gaussian
+from loopcal.studies.simulation.preparation import AlteredNoise
 
 SCRIPTS = {"linear-delta": "delta", "five-bar": "five_bar", "hexapod-42": "hexapod"}
 

@@ -12,20 +12,27 @@ import pytest
 from scipy.linalg import sqrtm
 from scipy.stats import binom
 
-from loopcal.diagnose import adjust_uncertainty, examine_fit
-from loopcal.diagnose.error_frames import FITTED
-from loopcal.diagnose.fit_checks.cluster_covariance import (
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty, check_heavy_tails
+from loopcal.diagnose.cluster_covariance import (
     LIMIT,
+    Clusters,
     check_clusters,
     compute_robust_spread,
+    divide_into_clusters,
 )
-from loopcal.diagnose.fit_checks.independent_units import Clusters, divide_into_clusters
-from loopcal.diagnose.residuals.heavy_tails import check_heavy_tails
-from loopcal.diagnose.tool_errors import linearize_tool_errors, locate_measured_poses
-from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
+from loopcal.diagnose.error_frames import FITTED, linearize_tool_errors, locate_measured_poses
+from loopcal.diagnose.fit_examination import examine_fit
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import Instrument, Measurements, Pose, Position, Sensor, simulate
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of
+from loopcal.estimate.result import Identification
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_poses, noise
 

@@ -9,18 +9,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose.conventions import (
-    compare_conventions,
+from loopcal.diagnose.conventions.convention_check import compare_conventions
+from loopcal.diagnose.conventions.interpretations import (
     list_interpretations,
+    list_orders,
     list_reading_interpretations,
 )
-from loopcal.diagnose.conventions.interpretations.actuator_orders import select_measured
-from loopcal.diagnose.conventions.interpretations.reading_interpretations import list_orders
-from loopcal.diagnose.conventions.selection import ALLOWED
+from loopcal.diagnose.conventions.misfit import ALLOWED
+from loopcal.diagnose.conventions.selection import select_measured
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.measure import Component, Gaussian, Instrument, Measurements, Pose, Position, Sensor
-from loopcal.measure import simulate as simulate_measurements
-from loopcal.mechanism import compute_readings, sample_workspace
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate as simulate_measurements
+from loopcal.mechanism.kinematics import compute_readings
+from loopcal.mechanism.workspace import sample_workspace
 from tests.diagnose.test_conventions import (
     change_values,
     has_slip,

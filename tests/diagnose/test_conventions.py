@@ -12,37 +12,33 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.diagnose.conventions import (
+from loopcal.diagnose.conventions import misfit
+from loopcal.diagnose.conventions.convention_check import (
     IMPLAUSIBLE,
     ConventionCheck,
     check_conventions,
     compare_conventions,
+)
+from loopcal.diagnose.conventions.interpretations import (
     list_interpretations,
     list_reading_interpretations,
-    misfit,
 )
-from loopcal.diagnose.conventions.judgement import BETTER
-from loopcal.diagnose.conventions.selection import ALLOWED
+from loopcal.diagnose.conventions.misfit import ALLOWED, BETTER
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import (
-    KINDS,
-    Bearing,
-    Component,
-    Distance,
-    Gaussian,
-    Inclination,
-    Instrument,
-    JointSensor,
-    Kind,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    simulate,
-)
-from loopcal.mechanism import sample_workspace
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.bearing import Bearing
+from loopcal.measure.kinds.directions import Inclination
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.kinds.joints import JointSensor
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 from tests.zoo import load_cached_robot
@@ -473,7 +469,7 @@ def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None
     """The hexapod study prints Rz(a) Ry(b) Rx(c), but its Table 4 was computed with the opposite
     order.
     """
-    from loopcal.measure import Observations
+    from loopcal.measure.observations import Observations
     from loopcal.papers.hexapod_42.published import (
         MM,
         TO_PRINTED,

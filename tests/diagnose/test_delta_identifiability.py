@@ -12,13 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.diagnose import identifiability, suggest_measurements
-from loopcal.estimate import FitOptions, LeastSquares, identify
-from loopcal.io.formats.delta_printers import klipper
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.formats import klipper
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
-from loopcal.measure import Measurements, Observations
-from loopcal.mechanism import Mechanism
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
 from tests.cli.delta_printers import read_records
 from tests.io.formats.printers import format_printer_cfg
 

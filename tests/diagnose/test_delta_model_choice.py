@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import choose_model, find_outliers, list_parameter_sets
+from loopcal.diagnose.cross_validation import choose_model, list_parameter_sets
+from loopcal.diagnose.outliers import find_outliers
 from loopcal.errors import FileError
-from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
 from loopcal.findings import Severity
-from loopcal.measure import Measurements, Observations, sample_truth
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import sample_truth
 from tests.diagnose.test_delta_identifiability import (
     GEOMETRY,
     WITH_DISTANCES,

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from loopcal import geometry, load_robot, pose_uncertainty
-from loopcal.diagnose import estimate_calibration_gain, frame_motions
+from loopcal.diagnose import frame_motions
 from loopcal.diagnose.error_frames import (
     choose_error_frame,
     fit_unfixed_frames,
@@ -17,15 +17,25 @@ from loopcal.diagnose.error_frames import (
     refer_errors,
     reference_poses,
 )
+from loopcal.diagnose.fit_examination import estimate_calibration_gain
 from loopcal.diagnose.frame_motions import probe_readings
 from loopcal.errors import EstimationError
-from loopcal.estimate import FitOptions, Identification, LeastSquares, identify, prior_from
 from loopcal.estimate.frame_freedoms import frame_twists
-from loopcal.estimate.inference.measured_frames import MeasuredFrames
-from loopcal.estimate.inference.posterior import posterior_from_arrays
-from loopcal.measure import KINDS, Gaussian, Instrument, Sensor, StatedValue, sample_truth, simulate
-from loopcal.mechanism import find_directly_reachable, forward, inverse, sample_workspace
-from loopcal.planning import PlanOptions, plan
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.posterior import MeasuredFrames, posterior_from_arrays
+from loopcal.estimate.prior import prior_from
+from loopcal.estimate.result import Identification
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.nuisance import StatedValue
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.kinematics import find_directly_reachable
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.pose_planning import plan
 
 SIGMA = 5e-6
 PLACES = np.array([[0.06, 0.0, 0.01], [-0.03, 0.05, 0.01], [-0.03, -0.05, 0.02]])

@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from loopcal.diagnose import adjust_uncertainty, examine_fit
-from loopcal.diagnose.residuals.heavy_tails import assess_tails, check_heavy_tails
-from loopcal.diagnose.residuals.residual_rows import ResidualRows
-from loopcal.estimate import Huber, identify
+from loopcal.diagnose.adjusted_uncertainty import (
+    adjust_uncertainty,
+    assess_tails,
+    check_heavy_tails,
+)
+from loopcal.diagnose.fit_examination import examine_fit
+from loopcal.diagnose.residual_patterns import ResidualRows
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber
 from loopcal.findings import Severity
 from loopcal.serialization import to_json
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure

@@ -8,15 +8,18 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.diagnose import identifiability
-from loopcal.diagnose.observability import compute_observability
+from loopcal.diagnose.identifiable_parameters import compute_observability, identifiability
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.inference.null_space import Combination, describe_null_space
+from loopcal.estimate.null_space import Combination, describe_null_space
 from loopcal.findings import Finding
-from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Component, Inclination, Instrument, Pose, Position, Sensor, Separation
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.directions import Inclination
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
 from loopcal.numerics.decomposition import decompose
 from tests.estimate.problems import UM, five_dof, fold_rows, hexapod, hexapod_data, noise, tracker
 
@@ -194,7 +197,7 @@ def test_collected_factor_equals_the_factor_of_a_fit_without_setup_parameters():
 
 
 def test_elimination_of_dependent_columns_is_the_projection_onto_their_complement():
-    from loopcal.numerics.column_elimination import eliminate_from_factor
+    from loopcal.numerics.elimination import eliminate_from_factor
 
     rng = np.random.default_rng(1)
     F, A = rng.normal(size=(20, 3)), rng.normal(size=(20, 4))

@@ -8,15 +8,15 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.diagnose import choose_identifiable_subset, identifiability
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.diagnose.parameter_subset import choose_identifiable_subset
 from loopcal.errors import MechanismError
 from loopcal.estimate.information import observe_poses
 from loopcal.findings import Finding
-from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
-from loopcal.io.robot.derived_robots import format_reduced_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import Instrument, Pose, Sensor
+from loopcal.io.robot.robot_file import format_reduced_robot, list_shipped_robots, load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 

@@ -6,19 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply import validate
-from loopcal.diagnose import compute_kind_errors
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Instrument,
-    Measurements,
-    Observations,
-    Position,
-    Sensor,
-    simulate,
-)
-from loopcal.mechanism import forward, sample_workspace
+from loopcal.apply.validation import validate
+from loopcal.diagnose.row_errors import compute_kind_errors
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import UM, hexapod, hexapod_data, noise
 
 MM = 1e-3

@@ -6,10 +6,11 @@ problem.
 import numpy as np
 import pytest
 
-from loopcal.diagnose import build_regularization_path, score_leave_one_out
-from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
+from loopcal.diagnose.cross_validation import build_regularization_path, score_leave_one_out
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.problem_construction import problem_of
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.estimate.problem import problem_of
 from tests.estimate.problems import hexapod, hexapod_data, tracker
 
 DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))

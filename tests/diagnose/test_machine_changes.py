@@ -13,21 +13,23 @@ from loopcal.diagnose.machine_changes import (
     estimate_cause,
     explain_change,
 )
-from loopcal.estimate import MAP, LeastSquares, Posterior, Ridge, identify, identify_trials
-from loopcal.estimate.inference.covariance_parts import CovariancePart
-from loopcal.estimate.inference.data_information import fold_information
-from loopcal.estimate.inference.posterior import compute_posterior, posterior_from_arrays
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Instrument,
-    Measurements,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-    simulate_trials,
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
+from loopcal.estimate.posterior import (
+    CovariancePart,
+    Posterior,
+    compute_posterior,
+    fold_information,
+    posterior_from_arrays,
 )
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import UM, noise
 
 ROBOTS = {name: load_robot(name) for name in ("linear-delta", "five-bar")}

@@ -8,13 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose import choose_model, cross_validate, nest_parameter_sets
-from loopcal.diagnose.cross_validation import draw_folds
+from loopcal.diagnose.cross_validation import (
+    choose_model,
+    cross_validate,
+    draw_folds,
+    nest_parameter_sets,
+)
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import FitOptions, LeastSquares, StepControl, identify
-from loopcal.io import load_robot
-from loopcal.measure import simulate
-from loopcal.workflow import CalibrationOptions, calibrate
+from loopcal.estimate.descent import StepControl
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.simulation import simulate
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, tracker
 

@@ -10,35 +10,34 @@ import pytest
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.apply import pose_uncertainty
-from loopcal.diagnose import adjust_uncertainty
-from loopcal.diagnose.fit_checks.held_out_rows import Predictor
-from loopcal.diagnose.residuals.model_discrepancy import (
+from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+from loopcal.diagnose.blunders import Predictor
+from loopcal.diagnose.error_frames import locate_measured_poses
+from loopcal.diagnose.model_discrepancy import (
     SlowErrorRows,
     add_slow_errors,
     detect_slow_errors,
     find_slow_errors,
 )
-from loopcal.diagnose.residuals.residual_patterns import LEVEL
-from loopcal.diagnose.tool_errors import locate_measured_poses
-from loopcal.estimate import MAP, FitOptions, Identification, LeastSquares, identify
-from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
-from loopcal.estimate.inference.model_discrepancy import DISCREPANCY
-from loopcal.estimate.poses.smooth_errors import describe_smooth_errors
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import Mechanism, differentiate_pose, forward, inverse, sample_workspace
-from loopcal.numerics.variance_component import compute_component_tail
+from loopcal.diagnose.residual_patterns import LEVEL
+from loopcal.estimate.fit_linearization import collect_uncertainty, linearize_fit
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.posterior import DISCREPANCY
+from loopcal.estimate.result import Identification
+from loopcal.estimate.smooth_errors import describe_smooth_errors
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.statistics import compute_component_tail
 from tests.estimate.problems import UM, URAD
 
 SIGMA = 10 * UM
@@ -308,7 +307,7 @@ def test_slow_rotations_are_stated_as_orientation():
 
 
 def test_a_run_folder_keeps_the_discrepancy(tmp_path):
-    from loopcal.estimate.inference.posterior import posterior_from_arrays
+    from loopcal.estimate.posterior import posterior_from_arrays
 
     _, adjusted, _ = bent_fit()
     arrays: dict[str, Any] = {**adjusted.arrays()}

@@ -7,13 +7,19 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from loopcal.diagnose import find_outliers
-from loopcal.diagnose.fit_checks.outlier_search import fit_without
-from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.io import load_robot
-from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.diagnose.outliers import find_outliers, fit_without
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber, Tukey
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from tests.diagnose.test_outliers import measure_five_bar, move_row
 from tests.estimate.problems import UM, noise
 

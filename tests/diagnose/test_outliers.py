@@ -9,33 +9,34 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from loopcal.diagnose import OutlierCheck, examine_fit, find_outliers
-from loopcal.diagnose.fit_checks import outlier_search, outliers
-from loopcal.diagnose.fit_checks.influence import Influence, compute_influence
-from loopcal.diagnose.fit_checks.outlier_search import (
+from loopcal.diagnose import outliers
+from loopcal.diagnose import outliers as outlier_search
+from loopcal.diagnose.fit_examination import examine_fit
+from loopcal.diagnose.influence import Influence, compute_influence
+from loopcal.diagnose.outliers import (
+    OutlierCheck,
     PartialFit,
+    _summarize,
+    find_outliers,
     fit_without,
     list_suspected_in_turn,
     search_suspects,
 )
-from loopcal.diagnose.fit_checks.outliers import _summarize
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.methods.losses import block_limit
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Instrument,
-    Measurements,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber, Tukey, block_limit
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import decompose
 from tests import zoo
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, measure

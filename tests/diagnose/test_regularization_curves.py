@@ -6,19 +6,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopcal.diagnose import compute_regularization_curves, cross_validate
-from loopcal.estimate import (
-    GCV,
-    FitOptions,
-    MarginalLikelihood,
-    Ridge,
-    TruncatedSVD,
-    TruncationGCV,
-    identify,
-)
-from loopcal.io import load_robot
-from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.diagnose.cross_validation import cross_validate
+from loopcal.diagnose.regularization_curves import compute_regularization_curves
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import GCV, MarginalLikelihood, Ridge, TruncatedSVD, TruncationGCV
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import noise
 
 

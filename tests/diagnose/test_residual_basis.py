@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopcal.diagnose.residuals.residual_rows import span_columns
+from loopcal.diagnose.residual_patterns import span_columns
 
 
 @pytest.mark.parametrize("rows", [12, 300, 6000])

@@ -10,14 +10,18 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
-from loopcal.diagnose.residuals.residual_effects import list_effects
-from loopcal.diagnose.residuals.residual_patterns import find_patterns
-from loopcal.diagnose.residuals.residual_patterns import test_correlation as compute_correlation
-from loopcal.diagnose.residuals.residual_patterns import test_effect as compute_tail
-from loopcal.diagnose.residuals.residual_rows import ResidualRows, collect_residual_rows
-from loopcal.estimate import LeastSquares, Ridge, identify
+from loopcal.diagnose.residual_patterns import (
+    ResidualRows,
+    collect_residual_rows,
+    find_patterns,
+    list_effects,
+)
+from loopcal.diagnose.residual_patterns import test_correlation as compute_correlation
+from loopcal.diagnose.residual_patterns import test_effect as compute_tail
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.numerics.multiple_tests import compute_any_probability, compute_single_level
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares, Ridge
+from loopcal.numerics.statistics import compute_any_probability, compute_single_level
 from tests.diagnose.correlated_data import ROBOTS, draw_errors, measure
 
 

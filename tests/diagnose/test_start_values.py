@@ -4,11 +4,13 @@
 import numpy as np
 import pytest
 
-from loopcal.diagnose import StartVerdict, check_start_values
-from loopcal.estimate import FitOptions, Huber, Tukey, identify
+from loopcal.diagnose.start_values import StartVerdict, check_start_values
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.inference.prior import Prior
-from loopcal.estimate.problem_construction import problem_of
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber, Tukey
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.prior import Prior
+from loopcal.estimate.problem import problem_of
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_data
 

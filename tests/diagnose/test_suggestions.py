@@ -3,10 +3,12 @@
 
 import pytest
 
-from loopcal.diagnose import identifiability, suggest_measurements
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import KINDS, Instrument, Pose, Sensor
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.poses import Pose
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 

@@ -9,23 +9,22 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.diagnose import compare_conventions, explain_outside_strokes
-from loopcal.diagnose.conventions.selection import ALLOWED
-from loopcal.errors import DataError
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Inclination,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    check_targets_move,
-    simulate,
+from loopcal.diagnose.conventions.convention_check import (
+    compare_conventions,
+    explain_outside_strokes,
 )
-from loopcal.mechanism import forward, sample_workspace
+from loopcal.diagnose.conventions.misfit import ALLOWED
+from loopcal.errors import DataError
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.data_checks import check_targets_move
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.directions import Inclination
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
 from tests.diagnose.test_conventions import change_values, load_cached_robot, simulate_data
 from tests.mistakes.machines import HELIOSTAT
 

@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.diagnose import identifiability, judge_useful_accuracy
+from loopcal.cli.entry_point import main
 from loopcal.diagnose.frame_motions import interpret_combinations
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.diagnose.parameter_subset import judge_useful_accuracy
 from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, FitOptions, LeastSquares, identify_trials
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.units import Dimension
 from tests.findings.expectations import list_codes
 

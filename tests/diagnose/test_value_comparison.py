@@ -11,14 +11,18 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from loopcal.apply import validate
-from loopcal.diagnose import compare_with_truth, compare_with_values
+from loopcal.apply.validation import validate
+from loopcal.diagnose.value_comparison import compare_with_truth, compare_with_values
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import MAP, FitOptions, LeastSquares, TruncatedSVD, identify
-from loopcal.io import load_robot
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares, TruncatedSVD
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Component, Instrument, Noise, Pose, Sensor, sample_truth, simulate
-from loopcal.mechanism import sample_workspace
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Noise, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.workspace import sample_workspace
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise
 

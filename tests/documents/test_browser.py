@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.documents.printing import find_browser, is_root
+from loopcal.cli.entry_point import main
+from loopcal.documents import find_browser, is_root
 
 BROWSER = find_browser()
 playwright = pytest.importorskip("playwright.sync_api")

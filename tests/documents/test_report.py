@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.documents.sources import load_record
+from loopcal.cli.entry_point import main
+from loopcal.documents import load_record
 from loopcal.errors import FileError
-from loopcal.report.document.calibration_document import SECTIONS, build_document
-from loopcal.report.document.elements import Document, Picture
+from loopcal.report.document.calibration_document import SECTIONS, build_calibration_document
+from loopcal.report.document.elements import Document, Picture, render_html
 from loopcal.report.document.figures import thin_rows
-from loopcal.report.document.page import render_html
-from loopcal.report.scene.scene_data import load_script
+from loopcal.report.scene.scene import load_script
 from loopcal.report.tables import Table
 from loopcal.report.validation_view import READING_NOISE, view_errors
 
@@ -164,7 +163,7 @@ def test_what_a_run_lacks_is_stated_in_one_sentence(run) -> None:
         validation=None,
         residuals=(),
     )
-    text = re.sub(r"\s+", " ", render_html(build_document(lacking)))
+    text = re.sub(r"\s+", " ", render_html(build_calibration_document(lacking)))
     for sentence in (
         "No pose was held out of this fit",
         "does not contain the labels of its residuals",
@@ -186,7 +185,7 @@ def test_failed_fit_has_no_values_for_a_machine(run) -> None:
         validation=None,
         posterior=None,
     )
-    text = render_html(build_document(failed))
+    text = render_html(build_calibration_document(failed))
     assert "setp genhexkins" not in text
     assert "the report states no values for a controller" in text
     assert "A quality gate is not met. Do not write these values to a machine." in text

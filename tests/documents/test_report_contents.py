@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.documents.sources import load_record
-from loopcal.report.document.calibration_document import build_document
-from loopcal.report.document.elements import Document, Listing, Picture, Section
-from loopcal.report.document.stored_options import describe_call, list_options
+from loopcal.documents import load_record
+from loopcal.report.document.calibration_document import build_calibration_document
+from loopcal.report.document.elements import (
+    Document,
+    Listing,
+    Picture,
+    Section,
+    describe_call,
+    list_options,
+)
 from loopcal.report.tables import Table
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 
@@ -40,7 +46,7 @@ def report(robot, data) -> lc.CalibrationReport:  # noqa: F811
 
 @pytest.fixture(scope="module")
 def document(report) -> Document:
-    return build_document(load_record(report))
+    return build_calibration_document(load_record(report))
 
 
 def get_section(document: Document, name: str) -> Section:

@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.documents.sources import load_record
-from loopcal.documents.view_writing import open_page
+from loopcal.cli.entry_point import main
+from loopcal.documents import load_record, open_page
 from loopcal.errors import FileError
-from loopcal.report.document.page import render_html
-from loopcal.report.document.view_document import build_calibration_view
+from loopcal.report.document.elements import render_html
+from loopcal.report.document.other_documents import build_calibration_view
 
 
 def read_scene(page: Path) -> dict:

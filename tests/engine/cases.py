@@ -24,8 +24,8 @@ from loopcal.engine import (
     State,
     TwistRows,
 )
-from loopcal.io import load_robot
-from loopcal.mechanism import Mechanism
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.model import Mechanism
 
 Array = NDArray[np.float64]
 

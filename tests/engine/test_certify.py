@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED
-from loopcal.io import load_robot
-from loopcal.mechanism.analysis.modes import find_assembly_modes
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.modes import find_assembly_modes
 from tests import zoo
 from tests.engine.cases import actuated_joint_values, make_case
 

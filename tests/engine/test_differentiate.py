@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.engine import CONVERGED
 from loopcal.geometry import pose_difference
-from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import load_robot
 from tests.engine.cases import (
     Array,
     Case,

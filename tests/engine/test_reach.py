@@ -10,9 +10,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.engine import CONVERGED, NOT_FINITE, Target
-from loopcal.io import load_robot
-from loopcal.mechanism import pose_from_coordinates
-from loopcal.mechanism.platform_coordinates import state_target
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.platform_coordinates import pose_from_coordinates, state_target
 from tests import zoo
 from tests.engine.cases import actuated_joint_values, make_case
 

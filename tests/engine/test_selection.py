@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from loopcal import engine
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.engine import Engine, select_engine, selection
 from loopcal.errors import MissingPackageError
 from tests.engine.conftest import HAS_NATIVE

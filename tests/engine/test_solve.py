@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
 from loopcal.engine import CONVERGED, EXHAUSTED, NEAR_GOAL, NOT_FINITE, STALLED, Slot
-from loopcal.io import load_robot
-from loopcal.mechanism import build
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.compilation import build
 from tests import zoo
 from tests.engine.cases import (
     actuated_joint_values,

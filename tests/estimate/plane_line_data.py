@@ -7,8 +7,11 @@ from functools import cache
 import numpy as np
 
 import loopcal as lc
-from loopcal.measure import Instrument, Measurements, Observations, sample_truth, simulate_contacts
-from loopcal.mechanism import Mechanism
+from loopcal.measure.instrument import Instrument
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import sample_truth, simulate_contacts
+from loopcal.mechanism.model import Mechanism
 from loopcal.planning.plane_line_planning import SurfacePlan
 
 ROBOT = "hexapod-nategh-agheli"

@@ -6,17 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal.engine import fold
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Observations,
-    Pose,
-    Sensor,
-    simulate,
-)
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.parameters import ParameterTable
 from tests import zoo

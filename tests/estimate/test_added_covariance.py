@@ -4,15 +4,18 @@
 import numpy as np
 import pytest
 
-from loopcal.apply import pose_uncertainty
-from loopcal.estimate import FitOptions, LeastSquares, TruncatedSVD, identify
-from loopcal.estimate.inference.added_covariance import add_covariance
-from loopcal.estimate.inference.covariance_parts import CovariancePart
-from loopcal.estimate.inference.fit_uncertainty import collect_uncertainty
-from loopcal.estimate.inference.posterior import posterior_from_arrays
-from loopcal.estimate.inference.prior import prior_from
+from loopcal.apply.accuracy import pose_uncertainty
+from loopcal.estimate.added_covariance import add_covariance
+from loopcal.estimate.fit_linearization import collect_uncertainty
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares, TruncatedSVD
+from loopcal.estimate.posterior import CovariancePart, posterior_from_arrays
+from loopcal.estimate.prior import prior_from
 from loopcal.findings import report_finding
-from loopcal.measure import Pose, Sensor, simulate
+from loopcal.measure.instrument import Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import simulate
 from tests import zoo
 from tests.estimate.problems import (
     UM,

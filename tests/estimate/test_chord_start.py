@@ -7,31 +7,19 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
-from loopcal.estimate import (
-    GCV,
-    MAP,
-    FitOptions,
-    InflatedTolerances,
-    LeastSquares,
-    Ridge,
-    identify_trials,
-)
 from loopcal.estimate import problem as problem_module
 from loopcal.estimate import trial_identification as module
-from loopcal.estimate.identified_trials import IdentifiedTrials
-from loopcal.estimate.minimization.chord_start import ACCEPTED_STEP
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Pose,
-    Position,
-    Sensor,
-    Trials,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import GCV, MAP, LeastSquares, Ridge
+from loopcal.estimate.tolerance_components import InflatedTolerances
+from loopcal.estimate.trial_identification import ACCEPTED_STEP, IdentifiedTrials, identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 
 HEXAPOD, DELTA = load_robot("hexapod-42"), load_robot("rotary-delta")
 

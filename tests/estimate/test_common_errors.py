@@ -6,13 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.diagnose import identifiability
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.engine import fold
 from loopcal.errors import FileError, MechanismError
-from loopcal.estimate import MAP, LeastSquares, Ridge, identify
-from loopcal.io import load_robot
-from loopcal.measure import Component, Gaussian, Instrument, Sensor, sample_truth, simulate
-from loopcal.mechanism import Mechanism, forward, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import decompose, empty_factor
 
 RODS = "{name: batch of rods, of: [arm*.length], length: {sd: 0.6}}"

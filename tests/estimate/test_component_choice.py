@@ -10,31 +10,34 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from loopcal.errors import EstimationError
-from loopcal.estimate import (
-    MAP,
-    FitOptions,
-    Huber,
-    Identification,
-    InflatedTolerances,
-    LeastSquares,
-    identify,
-    identify_trials,
-)
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.methods.component_choice import (
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.prior_conflict import LEVEL
+from loopcal.estimate.prior_inflation import (
     VARIANCES,
     ComponentSearch,
     compute_evidence,
+    find_information,
     predict,
 )
-from loopcal.estimate.methods.detectable_deviations import find_information
-from loopcal.estimate.methods.prior_conflict import LEVEL
-from loopcal.estimate.methods.tolerance_components import ToleranceComponent, list_components
-from loopcal.io import load_robot
-from loopcal.measure import Component, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
-from loopcal.mechanism import forward_trials, sample_workspace
+from loopcal.estimate.result import Identification
+from loopcal.estimate.tolerance_components import (
+    InflatedTolerances,
+    ToleranceComponent,
+    list_components,
+)
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import decompose
-from loopcal.numerics.multiple_tests import compute_any_probability
+from loopcal.numerics.statistics import compute_any_probability
 from loopcal.report.calibration_view import view_fit
 from tests.estimate.problems import fold_rows
 from tests.findings.expectations import get_finding

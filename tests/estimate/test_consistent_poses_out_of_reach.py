@@ -4,8 +4,10 @@
 import warnings
 
 from loopcal import engine
-from loopcal.estimate import MAP, identify
-from loopcal.io import load_measurements, load_robot
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import load_robot
 from loopcal.numerics.gauss_newton import DescentStatus
 
 ROWS = """\

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from loopcal.estimate.fit_findings import report_status
+from loopcal.estimate.descent import FunctionProblem, StepControl, descend
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
-from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
-from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of_trials
-from loopcal.io import load_robot
-from loopcal.measure import Distance, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
+from loopcal.estimate.problem import Problem, problem_of_trials
+from loopcal.estimate.result import report_status
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.gauss_newton import DescentStatus
 from tests.estimate.problems import fold_rows
 

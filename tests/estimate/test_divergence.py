@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose import StartVerdict, check_start_values
-from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
-from loopcal.estimate.inference.prior import prior_from
-from loopcal.estimate.minimization.descent import StepControl
-from loopcal.mechanism.kinematics import batch_kinematics
+from loopcal.diagnose.start_values import StartVerdict, check_start_values
+from loopcal.estimate.descent import StepControl
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.prior import prior_from
+from loopcal.mechanism import kinematics as batch_kinematics
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.expectations import expect_refusal, get_finding, list_codes
 

@@ -10,14 +10,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal.estimate.problem as problem_module
-from loopcal.estimate import LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import Gaussian, Instrument, Plane, Sensor, simulate
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.problem import problem_of
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.simulation import simulate
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT
-from loopcal.numerics.elimination_tree import EliminationTree, build_tree
-from loopcal.numerics.tree_elimination import NodeFactors, eliminate_tree
+from loopcal.numerics.elimination import EliminationTree, NodeFactors, build_tree, eliminate_tree
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
 

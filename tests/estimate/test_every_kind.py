@@ -31,27 +31,24 @@ from evidence.kinds import (
     select_most_unknown,
 )
 from loopcal import geometry
-from loopcal.diagnose import identifiability
-from loopcal.estimate import MAP, FitOptions, LeastSquares, identify, identify_trials
-from loopcal.io import load_robot
-from loopcal.measure import (
-    KINDS,
-    Bearing,
-    Component,
-    Gaussian,
-    Inclination,
-    Instrument,
-    Locked,
-    Plane,
-    Pose,
-    Position,
-    Sensor,
-    Separation,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import inverse, sample_workspace
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.bearing import Bearing
+from loopcal.measure.kinds.directions import Inclination
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.joints import Locked
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.workspace import sample_workspace
 
 EXACT = 1e-9
 """[share of the robot's size, rad]: ranks are decided at 1e-11, and 1e-13 of rounding comes back

@@ -9,20 +9,15 @@ import pytest
 
 import loopcal.estimate.problem as problem_module
 from loopcal.errors import EstimationError
-from loopcal.estimate import (
-    MAP,
-    DescentStatus,
-    FitOptions,
-    LeastSquares,
-    Ridge,
-    StepControl,
-    TruncatedSVD,
-    identify,
-    identify_trials,
-)
+from loopcal.estimate.descent import StepControl
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import sample_truth, simulate, simulate_trials
-from loopcal.mechanism import forward
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.solutions import forward
+from loopcal.numerics.gauss_newton import DescentStatus
 from tests import zoo
 from tests.estimate.problems import (
     bed_points,

@@ -8,13 +8,20 @@ from scipy import optimize, stats
 from evidence.assumptions.cases import SETUPS, Case
 from evidence.assumptions.simulation import simulate_case
 from loopcal import load_robot
-from loopcal.diagnose import adjust_uncertainty
-from loopcal.diagnose.residuals.correlated_errors import RHO, SHARE, estimate_correlated_errors
-from loopcal.diagnose.residuals.residual_patterns import test_correlation as measure_correlation
-from loopcal.diagnose.residuals.residual_rows import collect_residual_rows
-from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+from loopcal.diagnose.residual_patterns import (
+    RHO,
+    SHARE,
+    collect_residual_rows,
+    estimate_correlated_errors,
+)
+from loopcal.diagnose.residual_patterns import test_correlation as measure_correlation
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.mechanism import forward
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.tolerance_components import InflatedTolerances
+from loopcal.mechanism.solutions import forward
 from tests.estimate.dense_delta import NOMINAL, TOLERANCE, fit_delta, locate_nozzle
 
 SETUP, ROBOT = SETUPS["linear-delta"], load_robot("linear-delta")

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from loopcal.engine import fold
-from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.methods.fixed_penalty import fix_penalty
-from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, Ridge, TruncatedSVD
-from loopcal.estimate.minimization.descent import FunctionProblem, descend
-from loopcal.estimate.minimization.linear_model import (
+from loopcal.estimate.descent import (
+    FunctionProblem,
     SpectralModel,
     TriangularModel,
+    descend,
     make_linear_model,
 )
+from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.penalties import MAP, LeastSquares, Method, Ridge, TruncatedSVD, fix_penalty
 from loopcal.numerics.decomposition import RANK_TOLERANCE, empty_factor
 
 P, M, T = 13, 40, 4

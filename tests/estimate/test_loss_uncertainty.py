@@ -4,8 +4,10 @@
 import numpy as np
 import pytest
 
-from loopcal.estimate import Huber, LeastSquares, Tukey, identify
+from loopcal.estimate.identification import identify
 from loopcal.estimate.loss_uncertainty import compute_loss_variance
+from loopcal.estimate.losses import Huber, Tukey
+from loopcal.estimate.penalties import LeastSquares
 from tests.estimate.test_machine_change import DELTA, measure
 from tests.findings.expectations import list_codes
 

@@ -7,14 +7,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from loopcal.estimate import FitOptions, LeastSquares, identify, prior_from, recalibrate
-from loopcal.estimate.inference.posterior import posterior_from_arrays
-from loopcal.estimate.inference.prior import with_shown_noise
-from loopcal.estimate.recalibration import CHANGE_LEVEL, Change
-from loopcal.io import load_robot
-from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate
-from loopcal.mechanism import Mechanism, sample_workspace
-from loopcal.numerics.chi_square import compute_averaged_tail
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.posterior import posterior_from_arrays
+from loopcal.estimate.prior import prior_from, with_shown_noise
+from loopcal.estimate.recalibration import CHANGE_LEVEL, Change, recalibrate
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.numerics.statistics import compute_averaged_tail
 from tests.estimate.problems import UM, noise
 
 DELTA = load_robot("linear-delta")

@@ -4,11 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.estimate.inference.measured_frames import (
-    InstrumentFrame,
-    MeasuredFrames,
-    frames_from_arrays,
-)
+from loopcal.estimate.posterior import InstrumentFrame, MeasuredFrames, frames_from_arrays
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

@@ -9,27 +9,24 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import loopcal.mechanism.kinematics.batch_kinematics as trials_module
-from loopcal.estimate import identify
+import loopcal.mechanism.kinematics as trials_module
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.poses.estimate import report_doubtful_readings
-from loopcal.estimate.poses.measured import measure_poses
-from loopcal.estimate.poses.states import PoseStates
-from loopcal.estimate.poses.uncertain import UncertainPoses
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Distance,
-    Instrument,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import find_directly_reachable, forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.pose_estimate import report_doubtful_readings
+from loopcal.estimate.pose_linearization import PoseStates
+from loopcal.estimate.pose_start import measure_poses
+from loopcal.estimate.problem import problem_of
+from loopcal.estimate.uncertain_poses import UncertainPoses
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.kinematics import find_directly_reachable
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.gauss_newton import Halving
 from tests.estimate.problems import UM, noise
 

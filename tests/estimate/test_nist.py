@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.estimate.methods.penalties import LeastSquares
-from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
+from loopcal.estimate.descent import FunctionProblem, StepControl, descend
+from loopcal.estimate.penalties import LeastSquares
 from loopcal.numerics.gauss_newton import DescentStatus
 from tests.estimate.nist import (
     MODELS,

@@ -9,18 +9,16 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 import loopcal as lc
-from loopcal.apply import pose_uncertainty
+from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, FitOptions, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.inference.covariance_parts import combine_degrees
-from loopcal.estimate.inference.residual_test import (
-    count_sigma_degrees,
-    coverage_factor,
-    run_residual_test,
-)
-from loopcal.measure import sample_truth, simulate
-from loopcal.mechanism import forward, inverse
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.estimate.posterior import combine_degrees
+from loopcal.estimate.residual_test import count_sigma_degrees, coverage_factor, run_residual_test
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.solutions import forward, inverse
 from loopcal.numerics.decomposition import decompose
 from tests import zoo
 from tests.estimate.problems import UM, hexapod, hexapod_data, hexapod_poses, tracker

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import find_frame_motions, identifiability
+from loopcal.diagnose.frame_motions import find_frame_motions
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import EstimationError, LoopcalError
-from loopcal.estimate import Identification, LeastSquares, identify
-from loopcal.estimate.poses.open_poses import find_open_poses
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.pose_estimate import find_open_poses
+from loopcal.estimate.result import Identification
 from loopcal.measure.initial_values import guess_nuisance_values_batch
-from loopcal.mechanism import forward_trials
+from loopcal.mechanism.kinematics import forward_trials
 
 FILE = Path(lc.__file__).parent / "robots" / "cable-4.yaml"
 

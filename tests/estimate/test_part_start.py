@@ -7,43 +7,34 @@ import numpy as np
 import pytest
 
 import loopcal.estimate.problem as problem_module
-from loopcal.diagnose import check_start_values
+from loopcal.diagnose.start_values import check_start_values
 from loopcal.errors import EstimationError
-from loopcal.estimate import (
-    MAP,
-    FitOptions,
-    Huber,
-    Identification,
-    LeastSquares,
-    StepControl,
-    TruncatedSVD,
-    frame_freedoms,
-    identify,
-    prior_from,
-)
 from loopcal.estimate import fit_descent as module
+from loopcal.estimate import fit_descent as part_start
+from loopcal.estimate import frame_freedoms
+from loopcal.estimate.descent import StepControl
+from loopcal.estimate.fit_descent import FEWEST_POSES, SHARE, select_part, spread_poses
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.minimization import part_start
-from loopcal.estimate.minimization.part_start import FEWEST_POSES, SHARE, select_part, spread_poses
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber
 from loopcal.estimate.observation_rows import BLOCK
-from loopcal.estimate.problem_construction import problem_of, problem_of_trials
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    JointSensor,
-    Kind,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    Separation,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares, TruncatedSVD
+from loopcal.estimate.prior import prior_from
+from loopcal.estimate.problem import problem_of, problem_of_trials
+from loopcal.estimate.result import Identification
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.joints import JointSensor
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 
 DELTA = load_robot("linear-delta")
 MANY = FEWEST_POSES

@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
-from loopcal.estimate.methods.regularization_rules import GCV, MarginalLikelihood, TruncationGCV
+from loopcal.estimate.penalties import (
+    GCV,
+    MAP,
+    LeastSquares,
+    MarginalLikelihood,
+    Ridge,
+    TruncatedSVD,
+    TruncationGCV,
+)
 from loopcal.numerics.decomposition import decompose
 from tests.estimate.problems import fold_rows
 

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal.apply import validate
+from loopcal.apply.validation import validate
 from loopcal.errors import DataError
-from loopcal.estimate.poses.prediction import predict_from_readings
-from loopcal.io import load_robot
-from loopcal.measure import Instrument, Position, Sensor, simulate
-from loopcal.mechanism import forward, inverse, sample_workspace
+from loopcal.estimate.pose_estimate import predict_from_readings
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import MM, UM, noise
 
 

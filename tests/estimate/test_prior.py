@@ -8,11 +8,13 @@ import pytest
 from scipy.stats import chi2
 
 from loopcal.errors import EstimationError
-from loopcal.estimate import FitOptions, LeastSquares, identify
-from loopcal.estimate.inference.posterior import posterior_from_arrays
-from loopcal.estimate.inference.prior import limb_parameters, prior_from
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.posterior import posterior_from_arrays
+from loopcal.estimate.prior import limb_parameters, prior_from
 from loopcal.estimate.recalibration import recalibrate
-from loopcal.measure import simulate
+from loopcal.measure.simulation import simulate
 from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker

@@ -8,18 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.estimate import (
-    MAP,
-    FitOptions,
-    InflatedTolerances,
-    LeastSquares,
-    identify,
-    identify_trials,
-)
 from loopcal.estimate.fit_linearization import linearize_fit
-from loopcal.estimate.methods.inflated_tolerances import estimate_excess_noise
-from loopcal.estimate.methods.prior_conflict import assess_prior_conflict, compute_prior_statistic
-from loopcal.measure import sample_truth, simulate_trials
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.prior_conflict import assess_prior_conflict, compute_prior_statistic
+from loopcal.estimate.tolerance_components import InflatedTolerances, estimate_excess_noise
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.simulation import sample_truth, simulate_trials
 from loopcal.numerics.decomposition import decompose
 from loopcal.parameters import ParameterTable
 from tests import zoo

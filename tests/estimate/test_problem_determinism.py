@@ -11,20 +11,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of, problem_of_trials
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Plane,
-    Pose,
-    Position,
-    Sensor,
-    Separation,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
+from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from tests import zoo
 from tests.estimate.problems import UM, hexapod, hexapod_poses
 

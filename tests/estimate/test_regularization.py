@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.estimate import (
+from loopcal.cli.entry_point import main
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
+from loopcal.estimate.information import collect_information
+from loopcal.estimate.penalties import (
     GCV,
     MAP,
     LeastSquares,
@@ -16,10 +19,7 @@ from loopcal.estimate import (
     Ridge,
     TruncatedSVD,
     TruncationGCV,
-    identify,
 )
-from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.information import collect_information
 
 
 @pytest.fixture(scope="module")

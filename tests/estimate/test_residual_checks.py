@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import check_lack_of_fit, estimate_calibration_gain, find_correlated_groups
-from loopcal.estimate import LeastSquares, Tukey, identify
-from loopcal.measure import simulate
+from loopcal.diagnose.fit_examination import estimate_calibration_gain, find_correlated_groups
+from loopcal.diagnose.repeated_poses import check_lack_of_fit
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Tukey
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.measure.simulation import simulate
 from tests import zoo
 from tests.estimate.problems import (
     MM,
@@ -133,7 +136,7 @@ def test_orientation_that_a_delta_cannot_have_neither_decides_nor_appears():
 def test_expected_error_before_calibration_agrees_with_drawn_robots():
     data, robot = hexapod_data(20), hexapod()
     expected = estimate_calibration_gain(identify(robot, data), data)
-    from loopcal.mechanism import forward
+    from loopcal.mechanism.solutions import forward
 
     rng, square = np.random.default_rng(0), []
     still = forward(robot, data.readings).T

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply.stored_validation import restore_validation
-from loopcal.estimate.residuals import residuals_from_arrays
+from loopcal.apply.validation import restore_validation
+from loopcal.estimate.result import residuals_from_arrays
 from loopcal.report.validation_view import describe_improvements, view_errors
 from loopcal.serialization import restore_numbers
 

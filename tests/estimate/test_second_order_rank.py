@@ -9,13 +9,17 @@ import pytest
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.diagnose import identifiability
-from loopcal.estimate import FitOptions, Huber, LeastSquares, identify
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import KINDS
-from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.problem import Problem, problem_of
+from loopcal.measure.kinds import KINDS
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.plane_line_data import plan_groups, simulate_plan
 
 FIRST_ORDER, PARAMETERS = 33, 42

@@ -15,21 +15,19 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.estimate import FitOptions, LeastSquares, identify
-from loopcal.measure import (
-    Bearing,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Plane,
-    Pose,
-    Position,
-    Sensor,
-    collect_nuisance_parameters,
-    simulate,
-)
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds import setup_parameters
-from loopcal.mechanism import sample_workspace
+from loopcal.measure.kinds.bearing import Bearing
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
 

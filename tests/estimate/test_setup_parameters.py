@@ -11,28 +11,25 @@ from numpy.testing import assert_allclose
 import loopcal as lc
 import loopcal.estimate.problem as problem_module
 from loopcal import geometry
-from loopcal.apply import validate
-from loopcal.cli import main
-from loopcal.diagnose import find_outliers
-from loopcal.estimate import MAP, FitOptions, LeastSquares, identify, identify_trials
+from loopcal.apply.validation import validate
+from loopcal.cli.entry_point import main
+from loopcal.diagnose.outliers import find_outliers
+from loopcal.estimate.elimination import NuisanceElimination
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
 from loopcal.estimate.information import observe_poses, observe_rows
-from loopcal.estimate.nuisance.elimination import NuisanceElimination
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    JointSensor,
-    Pose,
-    Position,
-    Sensor,
-    Separation,
-    collect_nuisance_parameters,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.joints import JointSensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.workspace import sample_workspace
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracker
 

@@ -8,24 +8,20 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import MAP, FitOptions, InflatedTolerances, LeastSquares, identify_trials
 from loopcal.estimate import problem as problem_module
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.observation_rows import BLOCK
-from loopcal.estimate.problem_construction import problem_of_trials
-from loopcal.estimate.trial_identification import divide_trials
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Pose,
-    Position,
-    Sensor,
-    Trials,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.problem import problem_of_trials
+from loopcal.estimate.tolerance_components import InflatedTolerances
+from loopcal.estimate.trial_identification import divide_trials, identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.workspace import sample_workspace
 
 DELTA = load_robot("rotary-delta")
 POSES = BLOCK // 4

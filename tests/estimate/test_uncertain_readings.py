@@ -11,27 +11,30 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 from scipy.stats import binom, chi2
 
-import loopcal.estimate.poses.components as components_module
 import loopcal.estimate.problem as problem_module
-from loopcal.apply import validate
-from loopcal.diagnose import cross_validate, examine_fit, find_outliers, identifiability
+import loopcal.estimate.uncertain_poses as components_module
+from loopcal.apply.validation import validate
+from loopcal.diagnose.cross_validation import cross_validate
+from loopcal.diagnose.fit_examination import examine_fit
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.diagnose.outliers import find_outliers
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import FitOptions, Huber, LeastSquares, Tukey, identify, identify_trials
 from loopcal.estimate.fit_input import exclude_poses
-from loopcal.io import load_robot
-from loopcal.measure import (
-    Instrument,
-    JointSensor,
-    Measurements,
-    Pose,
-    Position,
-    Sensor,
-    Separation,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber, Tukey
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.joints import JointSensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests.estimate.problems import UM, hexapod, hexapod_poses, noise, tracker
 from tests.estimate.uncertain_reading_problems import (
     build_hexapod_with_seven_legs,

@@ -10,22 +10,18 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy.stats import chi2
 
-from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.poses.linearization import coordinate_derivative
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import (
-    Instrument,
-    Measurements,
-    Pose,
-    Sensor,
-    Separation,
-    guess_nuisance_values,
-    simulate,
-)
-from loopcal.numerics.column_elimination import eliminate_columns
-from loopcal.numerics.rounding import ROUNDING, without_rounding
+from loopcal.estimate.pose_linearization import coordinate_derivative
+from loopcal.estimate.problem import problem_of
+from loopcal.measure.initial_values import guess_nuisance_values
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.numerics.elimination import ROUNDING, eliminate_columns, without_rounding
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, noise
 

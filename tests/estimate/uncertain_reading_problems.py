@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from loopcal.measure import Instrument, Measurements, Pose, Sensor, simulate
-from loopcal.mechanism import LinearMap, Mechanism, build, forward_trials
-from loopcal.mechanism import PoseRecord as HomePose
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.assembly import LinearMap
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.families.records import PoseRecord as HomePose
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.estimate.problems import UM, hexapod_poses, noise, with_tolerance

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from loopcal.geometry.alignment import minimize_over_rotations
+from loopcal.geometry import minimize_over_rotations
 
 SEEDS = range(5)
 

@@ -20,21 +20,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal import apply, diagnose, estimate, geometry, measure, planning
-from loopcal.diagnose import compare_conventions, suggest_measurements
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import (
-    KINDS,
-    Gaussian,
-    Instrument,
-    Sensor,
-    StatedValue,
-    collect_nuisance_parameters,
-)
-from loopcal.mechanism import build, differentiate_pose, forward, inverse, sample_workspace
+from loopcal.diagnose.conventions.convention_check import compare_conventions
+from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.nuisance import StatedValue, collect_nuisance_parameters
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
-from loopcal.planning.design import A, D, PriorInformation, coordinate_exchange, fedorov_exchange
-from loopcal.planning.plane_line_groups import PlaneLineGroups
+from loopcal.planning.design_space import A, D, PriorInformation
+from loopcal.planning.exchange import coordinate_exchange, fedorov_exchange
+from loopcal.planning.plane_line_planning import PlaneLineGroups
 from loopcal.planning.problem import prepare_problem
 from loopcal.units import Dimension
 
@@ -305,7 +304,7 @@ def make_method(name: str, value: Any = None) -> Any:
     """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd,
     tsvd-gcv.
     """
-    from loopcal.estimate.methods.inflated_tolerances import InflatedTolerances
+    from loopcal.estimate.tolerance_components import InflatedTolerances
 
     makers = {
         "ls": estimate.LeastSquares,
@@ -460,7 +459,7 @@ def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> 
 
 def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
     """Identify leg by leg."""
-    from loopcal.estimate.published_methods.per_leg import identify_per_leg
+    from loopcal.estimate.published_steps import identify_per_leg
 
     result = identify_per_leg(machine, data, steps)
     return {"values": result.robot.values, "conditions": result.conditions}
@@ -888,7 +887,7 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
     """Run raw ridge estimation and truncated SVD, and the library's methods, on one machine with
     the printed noise.
     """
-    from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penalize_truncated
+    from loopcal.estimate.published_steps import penalize_ridge, penalize_truncated
     from loopcal.papers.tsvd_2016 import cases
     from loopcal.papers.tsvd_2016.steps import iterate, linearize
 

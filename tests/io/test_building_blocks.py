@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
-from loopcal.mechanism import compare_coordinates, forward, inverse, sample_workspace
+from loopcal.mechanism.platform_coordinates import compare_coordinates
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tools.robot_pictures import PICTURES, read_blocks
 
 BLOCKS = read_blocks()

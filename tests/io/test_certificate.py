@@ -11,8 +11,7 @@ import pytest
 import loopcal as lc
 from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io.runs.certificate import format_certificate
-from loopcal.io.runs.certificate_settings import TEMPLATE, load_administration
+from loopcal.io.runs.certificate import TEMPLATE, format_certificate, load_administration
 from loopcal.io.runs.run_folder import load_run_or_robot
 from tests.io.test_instruments import FACTS, data, robot, with_instrument  # noqa: F401
 

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from loopcal.io import load_robot
 from loopcal.io.core.csv_table import format_row, read_table
 from loopcal.io.data.columns import TextColumn, find_open_column, is_context, list_columns
-from loopcal.measure import Component, Pose
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.kinds.poses import Component, Pose
 
 ROBOT = load_robot("hexapod-42")
 COLUMNS = list_columns(ROBOT, [Component(("z",)), Pose("quaternion")])

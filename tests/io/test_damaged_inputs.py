@@ -12,7 +12,8 @@ from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
 from loopcal.io.formats.urdf.closures import read_mechanism
 from loopcal.io.formats.urdf.tree import read
 from loopcal.io.robot.robot_file import build_robot, find_robot_file
-from loopcal.measure import KINDS, Observations
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.observations import Observations
 from tests.io.changed_documents import change_value, list_places
 
 ROBOTS = ("hexapod-42", "linear-delta", "3-prs", "five-bar")

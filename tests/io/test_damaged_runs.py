@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.apply import HeightErrors
-from loopcal.apply.height_errors import store_heights
-from loopcal.cli import main
+from loopcal.apply.height_errors import HeightErrors, store_heights
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError, LoopcalError
-from loopcal.estimate.poses.smooth_errors import describe_smooth_errors
-from loopcal.io.runs.run import Run
-from loopcal.io.runs.run_arrays import (
+from loopcal.estimate.smooth_errors import describe_smooth_errors
+from loopcal.io.runs.run_folder import Run
+from loopcal.io.runs.run_result import (
     DISCREPANCY,
     FINITE,
     FITTED,
@@ -31,9 +30,9 @@ from loopcal.io.runs.run_arrays import (
     POSITIVE,
     RULES,
     find_problem,
+    read_result,
 )
-from loopcal.io.runs.run_result import read_result
-from loopcal.report.budget_view import view_budget
+from loopcal.report.calibration_view import view_budget
 from loopcal.units import find_unit
 from tests.io.changed_documents import change_value, list_places
 

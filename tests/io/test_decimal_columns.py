@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import read_table
-from loopcal.io.core.decimal_columns import CHUNK, MOST_DIGITS, parse_decimals
-from loopcal.io.core.numbers import format_exact, parse_exact
+from loopcal.io.core.csv_table import (
+    COLUMN_CHUNK,
+    MOST_DIGITS,
+    format_exact,
+    parse_decimals,
+    parse_exact,
+    read_table,
+)
 from loopcal.units import Dimension
 
 FACTORS = (1.0, 1e-3, 1e-6, 1e-9, 0.0254, 5 / 9, 3600.0, math.pi / 180, math.pi / 648000)
@@ -60,10 +65,10 @@ def test_everything_else_is_left_to_the_caller(cell) -> None:
 
 
 def test_columns_longer_than_a_chunk_and_empty_ones_are_read() -> None:
-    cells = [str(i) for i in range(CHUNK + 3)]
+    cells = [str(i) for i in range(COLUMN_CHUNK + 3)]
     parsed, is_plain = parse_decimals(cells, 1.0)
     assert is_plain.all()
-    assert (parsed == np.arange(CHUNK + 3)).all()
+    assert (parsed == np.arange(COLUMN_CHUNK + 3)).all()
     assert len(parse_decimals([], 1.0)[0]) == 0
 
 

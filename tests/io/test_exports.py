@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
-from loopcal.io import load_measurements, load_robot
-from loopcal.io.exports import convert_export, read_profile
-from loopcal.measure import evaluate_measurements, guess_nuisance_values, whiten_rows
-from loopcal.mechanism import forward
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.exports.conversion import convert_export
+from loopcal.io.exports.profile import read_profile
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.initial_values import evaluate_measurements, guess_nuisance_values, whiten_rows
+from loopcal.mechanism.solutions import forward
 
 EXAMPLES = Path("examples/exports").resolve()
 CASES = {

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.data.measurement_writer import format_measurements
-from loopcal.measure import check_instruments
+from loopcal.measure.observations import check_instruments
 
 FACTS = {
     "name": "AT960",

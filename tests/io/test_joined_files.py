@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
-from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.data.measurement_file import list_measurement_files
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Inclination,
-    Instrument,
-    Measurements,
-    Observations,
-    Sensor,
-    simulate,
-)
+from loopcal.io.data.measurement_file import list_measurement_files, load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.directions import Inclination
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import simulate
 
 Q = ",".join(f"q{i} [mm]" for i in range(1, 7))
 POSES = f'pose,{Q}\na,0,0,0,0,0,0\nb,1,1,1,1,1,1\n"c, ""third"" #1",2,2,2,2,2,2\nλ1,3,3,3,3,3,3\n'

@@ -12,9 +12,8 @@ import click
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.cli.entry_point import SECTIONS, find_command
-from loopcal.cli.options.shared_options import Count
+from loopcal.cli.entry_point import SECTIONS, find_command, main
+from loopcal.cli.options import Count
 from loopcal.errors import FileError, MechanismError
 from loopcal.io.core import limits
 from loopcal.io.core.csv_table import read_table
@@ -22,7 +21,7 @@ from loopcal.io.core.json_text import read_json
 from loopcal.io.core.text_file import read_bytes, read_text, sha256
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.robot_file import find_robot_file, load_robot
-from loopcal.io.runs.arrays_file import read_arrays
+from loopcal.io.runs.run_result import read_arrays
 
 FIVE_BAR = find_robot_file("five-bar").read_text("utf-8")
 SMALL = limits.FileLimit("size", 0.01, "MB", "a test", "shorten it", 10**6)

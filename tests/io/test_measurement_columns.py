@@ -8,19 +8,16 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, LoopcalError
-from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.core.numbers import format_exact, parse_exact
-from loopcal.io.data.measurement_writer import format_data_sheet
-from loopcal.measure import (
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Observations,
-    Position,
-    Sensor,
-    StatedValue,
-)
+from loopcal.io.core.csv_table import format_exact, parse_exact
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import format_data_sheet, save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import StatedValue
+from loopcal.measure.observations import Observations
 
 LABELS = ("a", "b,1", 'say "c"', "#d", "λ")
 UNKNOWNS = (

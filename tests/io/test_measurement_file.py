@@ -5,22 +5,17 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, LoopcalError
-from loopcal.io import load_measurements, load_robot, save_measurements
 from loopcal.io.data.kind_settings import list_kind_settings
-from loopcal.io.data.measurement_file import load_poses
-from loopcal.io.data.measurement_writer import format_template
-from loopcal.measure import (
-    KINDS,
-    Component,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Observations,
-    Pose,
-    Sensor,
-    simulate,
-)
-from loopcal.mechanism import inverse
+from loopcal.io.data.measurement_file import load_measurements, load_poses
+from loopcal.io.data.measurement_writer import format_template, save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.solutions import inverse
 
 EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples() if kind.columns]
 IDS = [f"{kind.name}-{i}" for i, kind in enumerate(EXAMPLES)]

@@ -6,11 +6,13 @@ import re
 
 import pytest
 
-from loopcal.cli import main
-from loopcal.diagnose import check_conventions
+from loopcal.cli.entry_point import main
+from loopcal.diagnose.conventions.convention_check import check_conventions
 from loopcal.errors import FileError, LoopcalError
-from loopcal.io import load_measurements, load_robot
-from loopcal.io.exports import convert_export, read_profile
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.exports.conversion import convert_export
+from loopcal.io.exports.profile import read_profile
+from loopcal.io.robot.robot_file import load_robot
 
 BY_NAME = """format: 1
 delimiter: comma

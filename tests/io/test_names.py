@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io import load_measurements, load_robot
 from loopcal.io.core.csv_table import read_settings, read_table
-from loopcal.io.core.names import (
+from loopcal.io.core.limits import (
     LONGEST_COMPOSED,
     LONGEST_NAME,
     find_fault,
@@ -19,10 +18,11 @@ from loopcal.io.core.names import (
     make_name,
 )
 from loopcal.io.core.yaml_file import parse_yaml, read_yaml
+from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export
-from loopcal.io.exports.profile_reader import read_profile
+from loopcal.io.exports.profile import read_profile
 from loopcal.io.formats.urdf import tree as urdf_tree
-from loopcal.io.robot.robot_file import find_robot_file
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
 
 CONTROLS = ["\x1b[31m", "\x07", "\x9b31m", "\x7f", "\u202e", "\u2066", "\u200b", "\ufeff", "\ud800"]
 LINES = ["a\nG28", "a\rG28", "a\u2028b", "a\x85b"]

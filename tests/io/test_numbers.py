@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_robot, save_measurements, save_robot
-from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
-from loopcal.measure import sample_truth
+from loopcal.cli.entry_point import main
+from loopcal.io.core.csv_table import format_exact, format_scaled, parse_exact
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import load_robot, save_robot
+from loopcal.measure.simulation import sample_truth
 from tests.io.test_measurement_columns import draw_measurements
 
 FACTORS = (1.0, 1e-3, 1e-6, 1e-9, 0.0254, np.pi / 180, np.pi / 10800, np.pi / 648000)

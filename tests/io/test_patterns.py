@@ -10,8 +10,7 @@ import pytest
 from loopcal.errors import FileError
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.exports.conversion import convert_export
-from loopcal.io.exports.patterns import PatternClock, compile_pattern, refuse_pattern
-from loopcal.io.exports.profile_reader import read_profile
+from loopcal.io.exports.profile import PatternClock, compile_pattern, read_profile, refuse_pattern
 
 PROFILE = """delimiter: semicolon
 ignore: '{ignore}'

@@ -9,11 +9,15 @@ import pytest
 
 import loopcal as lc
 from loopcal.errors import DataError, FileError
-from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.data.measurement_file import list_unfilled_files
-from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor, simulate
-from loopcal.mechanism import sample_workspace
-from loopcal.workflow.data_split import split_data
+from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.workflow.calibration_options import split_data
 
 POSES = 24
 HELD_OUT = ("3", "7", "11", "19", "20")

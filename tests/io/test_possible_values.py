@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from loopcal import load_measurements, save_robot
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.findings import Severity
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
-from loopcal.measure import Gaussian
-from loopcal.mechanism import find_impossible_values, forward
+from loopcal.measure.instrument import Gaussian
+from loopcal.mechanism.compilation import find_impossible_values
+from loopcal.mechanism.solutions import forward
 from loopcal.units import SI_SYMBOLS
 
 ROBOTS = tuple(list_shipped_robots())

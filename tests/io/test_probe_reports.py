@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
-from loopcal.mechanism import forward, inverse
+from loopcal.cli.entry_point import main
+from loopcal.mechanism.solutions import forward, inverse
 
 MARLIN = "M665 L220.00 R105.00 H300.00 X0.00 Y0.00 Z0.00\nM666 X-0.10 Y0.00 Z-0.20\n"
 REPRAP = "M665 L220:220:220 R105 H300 X0 Y0 Z0 B85\nM666 X0.1 Y-0.1 Z0\n"

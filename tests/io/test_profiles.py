@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io import load_measurements, load_robot
-from loopcal.io.exports import Conversion, convert_export, read_profile
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.exports.conversion import Conversion, convert_export
+from loopcal.io.exports.profile import read_profile
+from loopcal.io.robot.robot_file import load_robot
 
 PROFILE = """format: 1
 delimiter: semicolon

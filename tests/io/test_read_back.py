@@ -16,11 +16,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io import load_measurements, load_robot, save_measurements, save_robot
-from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.measure import Measurements, Observations, Position
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.units import find_unit
 
 FIVE_BAR = find_robot_file("five-bar").read_text()

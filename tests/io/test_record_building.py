@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from loopcal.io import load_robot
 from loopcal.io.core import records
 from loopcal.io.core.record_building import NoFitError, make_builder
-from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.io.runs.run_result import StoredResult
 
 WRONG = (
@@ -160,7 +159,7 @@ def test_what_lacks_every_key_is_left_to_pydantic() -> None:
 
 def test_a_robot_is_read_without_importing_pydantic() -> None:
     code = (
-        "import sys; from loopcal.io import load_robot; load_robot('hexapod-42'); "
+        "import sys; from loopcal.io.robot.robot_file import load_robot; load_robot('hexapod-42'); "
         "print('pydantic' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
-from loopcal.io import load_measurements, load_robot
-from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.measure import Measurements
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
+from loopcal.measure.measurements import Measurements
 
 HEAD = "# kind: component\n# components: [x]\n# noise: {x: 1 um}\n"
 READINGS = "pose,left [deg],right [deg]\na,100,30\nb,101,31\n"

@@ -6,7 +6,7 @@ import pytest
 
 from loopcal.errors import FileError, LoopcalError, MechanismError
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot, save_robot
-from loopcal.mechanism import build
+from loopcal.mechanism.compilation import build
 
 HEXAPOD = find_robot_file("hexapod-42").read_text()
 

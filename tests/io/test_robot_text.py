@@ -7,12 +7,19 @@ import re
 import numpy as np
 import pytest
 
-from loopcal.cli import main
-from loopcal.io import load_measurements, load_run
+from loopcal.cli.entry_point import main
 from loopcal.io.core.yaml_file import parse_yaml
-from loopcal.io.robot.derived_robots import format_reduced_robot
-from loopcal.io.robot.identified_table import add_table, format_table
-from loopcal.io.robot.robot_file import find_robot_file, get_source, load_robot, save_robot
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import (
+    add_table,
+    find_robot_file,
+    format_reduced_robot,
+    format_table,
+    get_source,
+    load_robot,
+    save_robot,
+)
+from loopcal.io.runs.run_folder import load_run
 
 FIVE_BAR = find_robot_file("five-bar").read_text()
 CONTENT = parse_yaml(FIVE_BAR, "five-bar.yaml", "robot file").content

@@ -9,13 +9,13 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.core.json_text import to_json
-from loopcal.io.runs.run_arrays import FIT, LATER
 from loopcal.io.runs.run_folder import (
     MADE_BY,
     collect_provenance,
     read_run_folder,
     write_run_folder,
 )
+from loopcal.io.runs.run_result import FIT, LATER
 from loopcal.units import Dimension
 
 RESULT = {

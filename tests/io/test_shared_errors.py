@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import adjust_uncertainty
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
 from loopcal.errors import FileError
-from loopcal.estimate import identify
-from loopcal.io import load_measurements, save_measurements
+from loopcal.estimate.identification import identify
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
 from tests.diagnose.correlated_data import LENGTH, ROBOTS, draw_errors, measure
 
 DELTA = ROBOTS["linear-delta"]

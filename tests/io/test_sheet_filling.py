@@ -13,26 +13,29 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.cli import main
-from loopcal.cli.options.shared_options import SHIPPED_PROFILES
-from loopcal.diagnose import check_conventions, examine_points
+from loopcal.cli.entry_point import main
+from loopcal.cli.options import SHIPPED_PROFILES
+from loopcal.diagnose.conventions.convention_check import check_conventions
+from loopcal.diagnose.point_names import examine_points
 from loopcal.errors import DataError, FileError
-from loopcal.io import load_measurements, load_robot
+from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.data.measurement_writer import format_data_sheet
-from loopcal.io.exports import (
+from loopcal.io.exports.profile import (
     find_profile_file,
     list_shipped_profiles,
     read_profile,
     with_local_settings,
 )
 from loopcal.io.exports.sheet_filling import fill_sheet, save_filled_sheet
-from loopcal.measure import Gaussian, Instrument, Position, Sensor
-from loopcal.workflow.instrument_description import (
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.workflow.simulated_measurements import (
     InstrumentDescription,
     build_instrument,
     place_targets,
+    simulate_measurements,
 )
-from loopcal.workflow.simulated_measurements import simulate_measurements
 
 TARGETS = ("SMR1", "SMR2", "SMR3")
 N = 14

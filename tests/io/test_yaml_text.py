@@ -10,8 +10,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from loopcal.errors import FileError
-from loopcal.io.core.yaml_file import make_round_trip_yaml, parse_yaml
-from loopcal.io.core.yaml_text import add_key, quote_scalar, remove_key
+from loopcal.io.core.yaml_file import (
+    add_key,
+    make_round_trip_yaml,
+    parse_yaml,
+    quote_scalar,
+    remove_key,
+)
 
 ENTRY = "identified:  # delete this table\n  - {name: 'leg #1', value: 1.5, +/-: null, unit: mm}\n"
 ROW = {"name": "leg #1", "value": 1.5, "+/-": None, "unit": "mm"}

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import identifiability
-from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
 from loopcal.estimate.information import collect_information
-from loopcal.estimate.published_methods.plane_line_products import (
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.plane_line_products import (
     Layout,
     PaperRows,
     identify_from_rows,
@@ -23,7 +25,7 @@ from loopcal.estimate.published_methods.plane_line_products import (
 from loopcal.findings import Finding
 from loopcal.papers.cmm_constraint_2011.forms import build_measurements, compare_covariances
 from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
-from loopcal.planning.plane_line_groups import PlaneLineGroups, linearize_surfaces
+from loopcal.planning.plane_line_planning import PlaneLineGroups, linearize_surfaces
 
 MM = 1e-3
 NOISE = 1e-6  # [m]

@@ -7,7 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from loopcal.errors import DataError
-from loopcal.measure import Component, Measurements, Observations
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 
 HEIGHT = Component(("z",), T_platform_tool=np.eye(4))
 POINT = Component(("x", "y", "z"), T_platform_tool=np.eye(4))

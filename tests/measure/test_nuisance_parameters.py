@@ -7,18 +7,15 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure import (
-    Component,
-    Direction,
-    Measurements,
-    Observations,
-    Plane,
-    Position,
-    Separation,
-    collect_nuisance_parameters,
-    evaluate_measurements,
-    whiten_rows,
-)
+from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
+from loopcal.measure.kinds.directions import Direction
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.surfaces import Plane
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.observations import Observations
 
 TRACKER = Position(
     targets=("ball",), places=np.zeros((1, 3)), unknown=("frame", "targets"), frame="tracker"

@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure import Component, Observations, Pose
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.observations import Observations
 
 POINT = Component(("x", "y", "z"), T_platform_tool=np.eye(4))
 POSE = Pose(T_platform_tool=np.eye(4))

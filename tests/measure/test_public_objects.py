@@ -7,20 +7,13 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError
-from loopcal.measure import (
-    KINDS,
-    Gaussian,
-    Instrument,
-    Measurements,
-    Observations,
-    Pose,
-    Position,
-    Sensor,
-    Uniform,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor, Uniform
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from tests import zoo
 
 LINES, CHARACTERS = 20, 1600  # of a screen

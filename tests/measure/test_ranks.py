@@ -9,27 +9,17 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.measure import (
-    Autocollimation,
-    Bearing,
-    Component,
-    Direction,
-    Distance,
-    Gaussian,
-    Inclination,
-    Instrument,
-    Line,
-    Plane,
-    Pose,
-    Position,
-    Sensor,
-    Separation,
-    Sphere,
-    evaluate_measurements,
-    simulate_trials,
-    whiten_rows,
-)
-from loopcal.mechanism import differentiate_pose, forward_trials
+from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.bearing import Bearing
+from loopcal.measure.kinds.directions import Autocollimation, Direction, Inclination
+from loopcal.measure.kinds.distance import Distance, Separation
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.kinds.surfaces import Line, Plane, Sphere
+from loopcal.measure.simulation import simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.sensitivity import differentiate_pose
 from tests import zoo
 
 FIVE = ("x", "y", "z", "phi", "theta")

@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError
-from loopcal.estimate import LeastSquares, identify
-from loopcal.io import load_robot
-from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor, simulate
-from loopcal.mechanism import sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.workspace import sample_workspace
 
 
 def simulate_positions(name, n=20, sigma=None):

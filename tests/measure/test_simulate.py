@@ -8,31 +8,26 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.measure import (
+from loopcal.measure.data_checks import check_actuators, check_duplicates, check_strokes
+from loopcal.measure.instrument import (
     BlockStream,
-    Component,
     Gaussian,
     Instrument,
-    Measurements,
-    Observations,
-    Pose,
-    Position,
     Sensor,
-    Separation,
     Uniform,
-    check_actuators,
-    check_duplicates,
-    check_strokes,
     make_random_stream,
-    sample_truth,
-    simulate,
-    simulate_trials,
-    solve_commanded_poses,
 )
-from loopcal.mechanism import inverse
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.readings import solve_commanded_poses
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.solutions import inverse
 from loopcal.parameters import ParameterTable
 from tests import zoo
 

@@ -20,16 +20,14 @@ from evidence.starts import (
 )
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.geometry.alignment import OCTAHEDRAL_ROTATIONS, solve_trilateration
-from loopcal.measure import (
-    Direction,
-    Distance,
-    Measurements,
-    Observations,
-    Position,
-    collect_nuisance_parameters,
-    guess_nuisance_values,
-)
+from loopcal.geometry import OCTAHEDRAL_ROTATIONS, solve_trilateration
+from loopcal.measure.initial_values import guess_nuisance_values
+from loopcal.measure.kinds.directions import Direction
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.observations import Observations
 
 N = 30
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism import (
+from loopcal.mechanism.platform_coordinates import (
     check_coordinates,
     compare_coordinates,
     pose_from_coordinates,

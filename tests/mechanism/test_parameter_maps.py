@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism import (
+from loopcal.mechanism.assembly import Actuator
+from loopcal.mechanism.transmission import (
     TERMS,
-    Actuator,
     harmonic_frequencies,
     joint_slopes,
     joints_from_readings,

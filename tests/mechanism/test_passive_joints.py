@@ -5,15 +5,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from loopcal.mechanism import (
-    PoseRecord,
-    build,
-    differentiate_passive_joints,
-    forward,
-    forward_trials,
-    make_solution,
-)
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.families.records import PoseRecord
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.sensitivity import differentiate_passive_joints
+from loopcal.mechanism.solutions import forward, make_solution
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian

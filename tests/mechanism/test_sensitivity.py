@@ -10,7 +10,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Address, LinearMap, build, differentiate_pose, forward_trials
+from loopcal.mechanism.assembly import Address, LinearMap
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.sensitivity import differentiate_pose
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo

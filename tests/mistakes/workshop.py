@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 
 Files = dict[str, str]
 

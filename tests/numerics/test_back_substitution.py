@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 
-from loopcal.numerics.back_substitution import substitute_backward, substitute_transposed
+from loopcal.numerics.decomposition import substitute_backward, substitute_transposed
 
 
 @pytest.fixture(params=[1.0, 1e-4, 1e-9])

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from loopcal.numerics.chi_square import compute_chi_square_quantile, compute_chi_square_tail
+from loopcal.numerics.statistics import compute_chi_square_quantile, compute_chi_square_tail
 
 
 def test_tail_of_two_degrees_of_freedom_is_exponential():

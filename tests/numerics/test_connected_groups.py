@@ -6,7 +6,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from loopcal.numerics.elimination_tree import find_connected_groups
+from loopcal.numerics.elimination import find_connected_groups
 
 
 @pytest.mark.parametrize("seed", range(20))

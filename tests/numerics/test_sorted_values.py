@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from loopcal.numerics.sorted_values import compute_median, find_distinct
+from loopcal.numerics.statistics import compute_median, find_distinct
 
 ARRAYS = (
     np.array([3, 1, 3, 2, 1]),
@@ -46,7 +46,7 @@ def test_the_median_is_that_of_numpy_to_the_last_bit(values) -> None:
 
 def test_masked_arrays_are_not_imported() -> None:
     code = (
-        "import sys, numpy as np; from loopcal.numerics import sorted_values as own; "
+        "import sys, numpy as np; from loopcal.numerics import statistics as own; "
         "own.find_distinct(np.array([2, 1, 2])); own.compute_median(np.array([0.1, 0.2])); "
         "print('numpy.ma' in sys.modules)"
     )

@@ -4,8 +4,13 @@
 import numpy as np
 import pytest
 
-from loopcal.numerics.decomposition import RANK_TOLERANCE
-from loopcal.numerics.triangular_systems import MARGIN, ROUNDING, solve_regular, solve_triangles
+from loopcal.numerics.decomposition import (
+    MARGIN,
+    RANK_TOLERANCE,
+    ROUNDING,
+    solve_regular,
+    solve_triangles,
+)
 
 T = 5
 

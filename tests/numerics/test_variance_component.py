@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from loopcal.numerics.variance_component import compute_component_tail, estimate_variance_component
+from loopcal.numerics.statistics import compute_component_tail, estimate_variance_component
 
 WEIGHTS = np.geomspace(5.0, 1e-3, 12)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.papers.printed import last_digit
 from loopcal.papers.reproduction import Verdict
 

@@ -14,14 +14,15 @@ import pytest
 from scipy.stats import beta
 
 from loopcal import geometry
-from loopcal.estimate import LeastSquares
-from loopcal.estimate.published_methods.plane_line_products import (
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.plane_line_products import (
     PaperRows,
     identify_from_rows,
     linearize_products,
     map_displacements,
 )
-from loopcal.mechanism import forward, forward_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.solutions import forward
 from loopcal.papers import PAPERS
 from loopcal.papers.cmm_constraint_2011.calibrations import (
     BEFORE,

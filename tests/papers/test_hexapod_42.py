@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.estimate import LeastSquares, identify_trials
-from loopcal.estimate.published_methods.per_leg import LegForm
-from loopcal.mechanism import forward
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.published_steps import LegForm
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.mechanism.solutions import forward
 from loopcal.papers.hexapod_42.noise_study import (
     PRESUMED,
     STATED,

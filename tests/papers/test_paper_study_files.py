@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal.cli import main
-from loopcal.estimate.published_methods.plane_line_products import (
-    Layout,
-    PaperRows,
-    identify_from_rows,
-)
-from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penalize_truncated
-from loopcal.measure import make_random_stream
+from loopcal.cli.entry_point import main
+from loopcal.estimate.plane_line_products import Layout, PaperRows, identify_from_rows
+from loopcal.estimate.published_steps import penalize_ridge, penalize_truncated
+from loopcal.measure.instrument import make_random_stream
 from loopcal.papers import PAPERS, cmm_constraint_2011, hexapod_42, tsvd_2016
 from loopcal.papers.cmm_constraint_2011.calibrations import METHODS
 from loopcal.papers.cmm_constraint_2011.published import read_published as read_cmm
@@ -35,9 +31,16 @@ from loopcal.papers.tsvd_2016.machines import (
 )
 from loopcal.papers.tsvd_2016.situations import LAMBDAS, SHORT
 from loopcal.papers.tsvd_2016.steps import iterate
-from loopcal.studies import OUTCOMES, StudyResult, list_tasks, load_study
-from loopcal.studies.simulation.block import make_stream
-from loopcal.studies.simulation.calibrated_cells import calibrate_cells, find_cells, set_size
+from loopcal.studies.files.study_file import load_study
+from loopcal.studies.results.study_result import StudyResult
+from loopcal.studies.simulation.block import (
+    calibrate_cells,
+    find_cells,
+    list_tasks,
+    make_stream,
+    set_size,
+)
+from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.specification.levels import PosesLevel
 
 

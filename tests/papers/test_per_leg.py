@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import EstimationError
-from loopcal.estimate import identify
-from loopcal.estimate.published_methods.per_leg import identify_per_leg
-from loopcal.io import load_robot
-from loopcal.measure import Instrument, sample_truth, simulate, simulate_trials
+from loopcal.estimate.identification import identify
+from loopcal.estimate.published_steps import identify_per_leg
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Instrument
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
 from tests import zoo
 from tests.estimate.problems import bed_points, hexapod, hexapod_poses, simulate_heights, tracker
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.json_text import to_json
 from loopcal.papers import PAPERS, Paper, paper

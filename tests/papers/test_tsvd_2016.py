@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.estimate.published_methods.raw_steps import (
+from loopcal.estimate.published_steps import (
     EPSILON,
     LIMIT,
     penalize_none,
     penalize_ridge,
     penalize_truncated,
 )
-from loopcal.measure import Noise, Uniform
-from loopcal.mechanism import forward_trials
+from loopcal.measure.instrument import Noise, Uniform
+from loopcal.mechanism.kinematics import forward_trials
 from loopcal.papers import PAPERS
 from loopcal.papers.tsvd_2016.cases import PRIOR, WHITENED, space_lambdas
 from loopcal.papers.tsvd_2016.draw_tables import DIVERGED, make_median_curves, make_medians

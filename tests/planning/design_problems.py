@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.planning.design import PriorInformation
+from loopcal.planning.design_space import PriorInformation
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]

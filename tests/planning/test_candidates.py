@@ -6,9 +6,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError, MechanismError
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.mechanism import analyze_singularity, check_limits, workspace_ranges
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
+from loopcal.mechanism.singularities import analyze_singularity
+from loopcal.mechanism.workspace import check_limits, workspace_ranges
 from loopcal.planning.candidates import check_listed_poses, draw_candidates
 from loopcal.planning.constraints import Constraints, LineOfSight
 from tests.findings.expectations import expect_refusal

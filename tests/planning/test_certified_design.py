@@ -9,19 +9,18 @@ import pytest
 
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
-from loopcal.io import load_robot
-from loopcal.mechanism import sample_workspace
-from loopcal.planning.design import (
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.design_space import (
     A,
     D,
     I,
     PriorInformation,
-    choose_design,
     compute_efficiency,
     evaluate_criterion,
     factor_design,
-    fedorov_exchange,
 )
+from loopcal.planning.exchange import choose_design, fedorov_exchange
 from tests.planning.design_problems import Array, draw_rows
 
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]

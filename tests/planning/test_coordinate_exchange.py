@@ -7,17 +7,18 @@ import pytest
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
-from loopcal.io import load_robot
-from loopcal.mechanism import inverse, sample_workspace
-from loopcal.planning.design import (
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.design_space import (
     A,
     Criterion,
     D,
     PriorInformation,
-    coordinate_exchange,
     evaluate_criterion,
     factor_design,
 )
+from loopcal.planning.exchange import coordinate_exchange
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import Array, Places, polynomial_rows
 

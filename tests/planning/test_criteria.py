@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.planning.design import (
+from loopcal.planning.design_space import (
     A,
     D,
     E,
@@ -14,8 +14,8 @@ from loopcal.planning.design import (
     evaluate_criterion,
     factor_design,
     find_observable_space,
+    require_enough,
 )
-from loopcal.planning.design.design_space import require_enough
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import compute_covariance, draw_rows, make_prior
 

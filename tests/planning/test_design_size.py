@@ -4,12 +4,8 @@
 import numpy as np
 import pytest
 
-from loopcal.planning.design import A, Criterion, D, PriorInformation
-from loopcal.planning.design.certified_design import (
-    compute_design_curve,
-    find_smallest_design,
-    search_size,
-)
+from loopcal.planning.design_space import A, Criterion, D, PriorInformation
+from loopcal.planning.exchange import compute_design_curve, find_smallest_design, search_size
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import draw_rows, polynomial_rows
 

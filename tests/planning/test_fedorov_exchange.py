@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
-from loopcal.planning.design import (
+from loopcal.planning.design_space import (
     A,
     Criterion,
     D,
     E,
     I,
     PriorInformation,
-    choose_design,
     evaluate_criterion,
     factor_design,
-    fedorov_exchange,
 )
+from loopcal.planning.exchange import choose_design, fedorov_exchange
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import draw_rows, make_grid, make_prior, polynomial_rows
 

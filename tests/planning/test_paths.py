@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.mechanism import check_limits, inverse, trace_singularity
+from loopcal.io.robot.robot_file import find_robot_file, load_robot
+from loopcal.mechanism.singularities import trace_singularity
+from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.workspace import check_limits
 from loopcal.planning import path
 from loopcal.planning.candidates import draw_candidates
 from loopcal.planning.constraints import Constraints, build_checker

@@ -12,11 +12,14 @@ import loopcal as lc
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
-from loopcal.io import load_robot
-from loopcal.measure import KINDS, sample_truth
-from loopcal.mechanism import sample_workspace
-from loopcal.planning import PlanOptions, path
-from loopcal.planning.design import D, PriorInformation, choose_design, exchange, factor_design
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.simulation import sample_truth
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning import exchange, path
+from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.design_space import D, PriorInformation, factor_design
+from loopcal.planning.exchange import choose_design
 from loopcal.planning.pose_groups import (
     MOST,
     combine_prior,
@@ -25,8 +28,7 @@ from loopcal.planning.pose_groups import (
     list_groups,
 )
 from loopcal.planning.pose_planning import plan_poses
-from loopcal.planning.problem import prepare_problem
-from loopcal.planning.sample_size import find_sample_size
+from loopcal.planning.problem import find_sample_size, prepare_problem
 from tests.findings.expectations import expect_refusal
 
 UM, URAD = 1e-6, 1e-6
@@ -98,7 +100,7 @@ def test_rows_of_pose_groups_equal_those_of_identification(name, kind, settings)
 
 def _keep_all_directions(free, units):
     """Return all directions of machine and nuisance parameters."""
-    from loopcal.planning.design import find_observable_space
+    from loopcal.planning.design_space import find_observable_space
 
     return find_observable_space(
         units.rows, PriorInformation.from_tolerances(len(free), len(units.nuisance))

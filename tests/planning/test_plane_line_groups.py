@@ -9,9 +9,11 @@ import pytest
 
 import loopcal as lc
 from loopcal.errors import EstimationError
-from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.planning.design import D, PriorInformation, coordinate_exchange
-from loopcal.planning.plane_line_groups import (
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.planning.design_space import D, PriorInformation
+from loopcal.planning.exchange import coordinate_exchange
+from loopcal.planning.plane_line_planning import (
     PlaneLineGroups,
     eliminate_surfaces,
     linearize_surfaces,

@@ -10,13 +10,12 @@ from numpy.testing import assert_allclose
 import loopcal as lc
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses
-from loopcal.io import load_robot
-from loopcal.measure import KINDS
-from loopcal.mechanism import sample_workspace
-from loopcal.planning import PlanOptions
-from loopcal.planning.problem import prepare_problem
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.kinds import KINDS
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.problem import find_sample_size, prepare_problem
 from loopcal.planning.result import round_shortfall
-from loopcal.planning.sample_size import find_sample_size
 from tests.findings.expectations import expect_refusal
 
 UM, URAD = 1e-6, 1e-6

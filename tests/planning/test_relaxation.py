@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from loopcal.planning.design import (
+from loopcal.planning.design_space import (
     A,
     Criterion,
     D,
@@ -14,8 +14,8 @@ from loopcal.planning.design import (
     PriorInformation,
     evaluate_criterion,
     factor_design,
-    relax_design,
 )
+from loopcal.planning.relaxation import relax_design
 from tests.findings.expectations import expect_refusal
 from tests.planning.design_problems import Array, draw_rows, make_grid, make_prior, polynomial_rows
 

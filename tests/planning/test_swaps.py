@@ -4,15 +4,20 @@
 import numpy as np
 import pytest
 
-from loopcal.planning.design import A, Criterion, D, I, PriorInformation, find_observable_space
-from loopcal.planning.design.relaxation import differentiate_score
-from loopcal.planning.design.scoring import (
+from loopcal.planning.design_space import (
+    A,
+    Criterion,
+    D,
+    I,
+    PriorInformation,
     Scoring,
     build_scoring,
     compute_swap_terms,
+    find_observable_space,
     score_additions,
     score_swaps,
 )
+from loopcal.planning.relaxation import differentiate_score
 from tests.planning.design_problems import Array, draw_rows
 
 CRITERIA = (D(), A(), I(np.random.default_rng(1).normal(size=(9, 4)), 3))

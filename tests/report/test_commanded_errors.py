@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.measure import Instrument, Pose, Sensor, sample_truth, simulate
-from loopcal.mechanism import sample_workspace
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.report.calibration_view import view_calibration
-from loopcal.report.text_page import render_text
+from loopcal.report.tables import render_text
 from loopcal.report.validation_view import describe_commanded
 from tests.estimate.problems import UM, URAD, noise
 

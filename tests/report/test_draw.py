@@ -8,12 +8,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
-from loopcal.io import load_robot
 from loopcal.io.core.text_file import write_bytes
-from loopcal.mechanism import inverse
-from loopcal.report.figures import draw_robot
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.solutions import inverse
+from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.pictures import save_figure
 from tests import zoo
 

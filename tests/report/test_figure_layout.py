@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from loopcal.report.figures.figure_layout import make_layout
+from loopcal.report.figures.notebook_figure import make_layout
 from loopcal.report.figures.style import add_legend, finish_figure, label_axes, label_poses
 
 

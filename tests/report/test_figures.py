@@ -16,8 +16,7 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.report import figures
-from loopcal.report.figures.parameter_figures import compute_correlation
-from loopcal.report.figures.residual_series import list_series
+from loopcal.report.figures.fit_figures import compute_correlation, list_series
 from loopcal.report.figures.style import label_poses, shorten, start_figure
 from loopcal.report.pictures import render_figure
 

@@ -4,14 +4,18 @@
 import pytest
 
 from loopcal.report.calibration_view import build_parameter_table
-from loopcal.report.numbers import (
+from loopcal.report.tables import (
+    Column,
+    Table,
+    build_table,
     format_exact_beside,
     format_number,
     format_uncertainty,
     format_with_uncertainty,
+    render_text,
+    word_column,
+    wrap_text,
 )
-from loopcal.report.tables import Column, Table, build_table, word_column
-from loopcal.report.text_page import render_text, wrap_text
 
 TABLE = Table(
     "Errors",

@@ -6,7 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from loopcal.report.scene.scene_data import SCRIPT, load_script
+from loopcal.report.scene.scene import SCRIPT, load_script
 
 
 def test_script_and_sources_have_the_recorded_hashes(root: Path) -> None:

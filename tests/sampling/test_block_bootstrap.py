@@ -9,12 +9,14 @@ from scipy.linalg import sqrtm
 from scipy.optimize import least_squares
 
 import loopcal as lc
-from loopcal.diagnose.fit_checks.independent_units import Clusters
+from loopcal.diagnose.cluster_covariance import Clusters
 from loopcal.errors import EstimationError
-from loopcal.estimate import FitOptions, identify, prior_from
 from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.prior import prior_from
 from loopcal.estimate.resampling import Resamples, fit_resamples
-from loopcal.sampling.block_errors import compute_block_errors
+from loopcal.sampling.bootstrap import compute_block_errors
 from tests.diagnose.test_cluster_covariance import (
     EIGHT_TARGETS,
     KNOWN_POSE,

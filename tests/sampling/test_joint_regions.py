@@ -10,8 +10,9 @@ from scipy.stats import chi2, f, multivariate_normal, norm, t
 
 import loopcal as lc
 from loopcal.errors import EstimationError
-from loopcal.estimate import FitOptions, identify
-from loopcal.estimate.inference.covariance_parts import CovariancePart
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.posterior import CovariancePart
 from tests.diagnose.test_cluster_covariance import THREE_TARGETS, measure
 from tests.estimate.problems import hexapod, hexapod_data
 

@@ -9,12 +9,14 @@ from scipy.stats import genpareto, t
 
 import loopcal as lc
 from loopcal.errors import EstimationError
-from loopcal.estimate import FitOptions, identify, prior_from
-from loopcal.measure import fill_in_reading_sigma
-from loopcal.mechanism import Mechanism
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.prior import prior_from
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.model import Mechanism
 from loopcal.parameters import ParameterTable
 from loopcal.sampling import posterior_sample
-from loopcal.sampling.weighted_sample import (
+from loopcal.sampling.intervals import (
     effective_size,
     fit_tail_shape,
     normalize_weights,

@@ -12,7 +12,6 @@ from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.studies.files.store import read_store
 from loopcal.studies.files.study_folder import StudySource, load_specification, open_study
 from loopcal.studies.results.study_result import StudyResult, find_columns
-from loopcal.studies.specification.cells import Cell
 from loopcal.studies.specification.levels import (
     InstrumentLevel,
     MethodLevel,
@@ -21,7 +20,7 @@ from loopcal.studies.specification.levels import (
     Question,
     Robot,
 )
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import Cell, Study
 
 Scores = dict[str, np.ndarray]
 """Name of a score -> its values (t,)."""

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.studies import Study, compute_block, list_tasks
+from loopcal.studies.simulation.block import compute_block, list_tasks
 from loopcal.studies.specification.levels import (
     InstrumentLevel,
     MethodLevel,
@@ -16,6 +16,7 @@ from loopcal.studies.specification.levels import (
     Robot,
     Scores,
 )
+from loopcal.studies.specification.study import Study
 from loopcal.typing import FloatArray
 
 CAMERA = InstrumentLevel(("component",), ("x", "y", "z"), sigma_position=2e-5)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from loopcal.studies import compute_block, list_tasks
+from loopcal.studies.simulation.block import compute_block, list_tasks
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     InstrumentLevel,

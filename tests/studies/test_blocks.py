@@ -14,13 +14,17 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
-from loopcal.apply import pose_uncertainty
+from loopcal.apply.accuracy import pose_uncertainty
 from loopcal.errors import DataError
-from loopcal.estimate import FitOptions, LeastSquares, identify
-from loopcal.measure import Measurements, Observations, make_random_stream
-from loopcal.mechanism import forward, inverse
-from loopcal.studies import OUTCOMES, compute_block, list_tasks, replay_trial
-from loopcal.studies.simulation.block import make_stream
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.measure.instrument import make_random_stream
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.studies.simulation.block import compute_block, list_tasks, make_stream, replay_trial
+from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.specification.levels import (
     ErrorsLevel,
     InstrumentLevel,
@@ -207,7 +211,7 @@ def test_a_trial_that_fails_does_not_change_the_others():
 
 CHILD = """
 import hashlib, sys
-from loopcal.studies import compute_block, list_tasks
+from loopcal.studies.simulation.block import compute_block, list_tasks
 from tests.studies.studies import make_study
 study = make_study(replicates=12)
 tasks = list(list_tasks(study))[:: int(sys.argv[1])]

@@ -12,7 +12,7 @@ import pytest
 
 from evidence.study_interruption import Contents, read_contents
 from loopcal.errors import FileError
-from loopcal.studies.execution import Dask, Executor, Ray, Serial
+from loopcal.studies.execution.executors import Dask, Executor, Ray, Serial
 from loopcal.studies.running import read_source, run_study
 from tests.studies.block_functions import (
     die_once,

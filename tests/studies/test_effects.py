@@ -8,16 +8,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import loopcal as lc
-from loopcal.measure import (
-    Disturbance,
-    Gaussian,
-    Uniform,
-    make_random_stream,
-    sample_truth,
-    simulate_trials,
-)
-from loopcal.mechanism import forward_trials, sample_workspace
-from loopcal.studies.simulation.effects import (
+from loopcal.measure.instrument import Gaussian, Uniform, make_random_stream
+from loopcal.measure.simulation import Disturbance, sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.studies.simulation.preparation import (
     AlteredNoise,
     alter_noise,
     draw_motion,
@@ -25,7 +20,7 @@ from loopcal.studies.simulation.effects import (
 )
 from loopcal.studies.specification.levels import Backlash, EffectsLevel, Outliers, ThermalGrowth
 from loopcal.units import Dimension
-from loopcal.workflow.instrument_description import InstrumentDescription, build_instrument
+from loopcal.workflow.simulated_measurements import InstrumentDescription, build_instrument
 from tests.studies.studies import compute_cells, make_study
 
 SIGMA = np.array([1e-5, 2e-5])

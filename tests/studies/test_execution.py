@@ -20,8 +20,15 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError, StudyError
-from loopcal.studies.execution import Answer, Dask, Executor, Processes, Ray, Serial
-from loopcal.studies.execution.interface import MOST_LOSSES
+from loopcal.studies.execution.executors import (
+    MOST_LOSSES,
+    Answer,
+    Dask,
+    Executor,
+    Processes,
+    Ray,
+    Serial,
+)
 from tests.findings.expectations import expect_refusal
 from tests.studies.block_functions import (
     NumberTask,
@@ -142,7 +149,7 @@ def test_closed_iteration_leaves_no_process() -> None:
 
 
 UNGUARDED = """
-from loopcal.studies.execution import Processes
+from loopcal.studies.execution.executors import Processes
 from tests.studies.block_functions import draw_numbers, list_tasks
 list(Processes(1).map_blocks(draw_numbers, list_tasks(2)))
 """
@@ -162,7 +169,7 @@ def test_script_without_guard_gets_a_sentence_instead_of_endless_processes(tmp_p
 
 
 ORPHAN = """
-from loopcal.studies.execution import Processes
+from loopcal.studies.execution.executors import Processes
 from tests.studies.block_functions import count_threads, list_tasks
 if __name__ == "__main__":
     for answer in Processes(2).map_blocks(count_threads, list_tasks(10_000)):

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from loopcal.studies.results.questions import FRAMES, view_summary
 from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.results.summary_view import FRAMES, view_summary
-from loopcal.studies.specification.cells import Cell
 from loopcal.studies.specification.levels import MethodLevel, NoiseLevel, PosesLevel, Question
 from loopcal.studies.specification.levels import Scores as ScoreSettings
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import Cell, Study
 from tests.studies.stored_scores import Scores, make_study, store_scores
 
 CHOICES = {

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.studies import BlockResult
 from loopcal.studies.driver import run_blocks
-from loopcal.studies.execution import Answer, Serial
+from loopcal.studies.execution.executors import Answer, Serial
 from loopcal.studies.files.study_folder import StudySource, open_study
-from loopcal.studies.simulation.poses import CellPoses
-from loopcal.studies.simulation.tasks import PosesTask
+from loopcal.studies.simulation.block import BlockResult, PosesTask
+from loopcal.studies.simulation.machines import CellPoses
 from tests.studies.studies import make_study
 
 BLOCK = 50

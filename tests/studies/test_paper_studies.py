@@ -11,12 +11,18 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import FileError
-from loopcal.estimate.published_methods.per_leg import identify_per_leg
-from loopcal.studies import OUTCOMES, load_study, replay_trial
-from loopcal.studies.simulation.calibrated_cells import calibrate_cells, find_cells, set_size
+from loopcal.estimate.published_steps import identify_per_leg
+from loopcal.studies.files.study_file import load_study
+from loopcal.studies.simulation.block import (
+    calibrate_cells,
+    find_cells,
+    list_tasks,
+    replay_trial,
+    set_size,
+)
+from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.simulation.machines import draw_machines
 from loopcal.studies.simulation.preparation import prepare_cell
-from loopcal.studies.simulation.tasks import list_tasks
 from loopcal.studies.specification.levels import (
     ErrorsLevel,
     InstrumentLevel,

@@ -12,20 +12,19 @@ import pytest
 from scipy.stats import binom
 
 from loopcal.errors import DataError
-from loopcal.report.text_page import render_text
+from loopcal.report.tables import render_text
 from loopcal.studies.files.study_folder import StudySource, open_study
-from loopcal.studies.results.question_view import say_answer, view_answers
-from loopcal.studies.results.questions import AnsweredQuestion, decide
+from loopcal.studies.results.questions import AnsweredQuestion, decide, say_answer, view_answers
 from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.specification.cells import Cell
-from loopcal.studies.specification.level_chains import list_chains
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     InstrumentLevel,
     Outliers,
     PosesLevel,
     Question,
+    list_chains,
 )
+from loopcal.studies.specification.study import Cell
 from tests.studies.stored_scores import Scores, make_study, store_scores
 
 SHARES = {"10": 0.5, "20": 0.93, "40": 0.999}

@@ -8,11 +8,16 @@ from typing import Any
 
 import pytest
 
-from loopcal.studies import BlockTask, Study, list_tasks
-from loopcal.studies.schedule import KEPT_POSES, MOST_WAITING, MissingBlock, Schedule
-from loopcal.studies.simulation.poses import CellPoses
-from loopcal.studies.simulation.tasks import PosesTask, compute_task
-from loopcal.studies.specification.keys import compute_key, describe_block
+from loopcal.studies.driver import (
+    KEPT_POSES,
+    MOST_WAITING,
+    MissingBlock,
+    Schedule,
+    estimate_time,
+    view_estimate,
+)
+from loopcal.studies.simulation.block import BlockTask, PosesTask, compute_task, list_tasks
+from loopcal.studies.simulation.machines import CellPoses
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,
@@ -21,7 +26,7 @@ from loopcal.studies.specification.levels import (
     NoiseLevel,
     PosesLevel,
 )
-from loopcal.studies.time_estimate import estimate_time, view_estimate
+from loopcal.studies.specification.study import Study, compute_key, describe_block
 from tests.studies.studies import make_study
 
 POSES = CellPoses([[0.1, 0.2]], [[0.3, 0.4]])

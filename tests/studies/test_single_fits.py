@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal.studies import OUTCOMES
+from loopcal.studies.simulation.fits import OUTCOMES
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     InstrumentLevel,

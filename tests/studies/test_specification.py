@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.studies import Study, compute_block, list_varied_factors, load_study
-from loopcal.studies.simulation.tasks import list_tasks
+from loopcal.studies.files.study_file import load_study
+from loopcal.studies.simulation.block import compute_block, list_tasks
 from loopcal.studies.specification.levels import (
     EffectsLevel,
     ErrorsLevel,
@@ -21,6 +21,7 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Scores,
 )
+from loopcal.studies.specification.study import Study, list_varied_factors
 from tests.studies.studies import CAMERA, make_study, read_robot
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "studies").glob("*.yaml"))

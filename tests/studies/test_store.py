@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.studies.files import file_systems
-from loopcal.studies.files.file_systems import find_type, is_network, parse_statfs
+from loopcal.studies.files import store as file_systems
 from loopcal.studies.files.store import (
     NAME,
     StoreHeader,
+    find_type,
     is_driven,
+    is_network,
     make_store,
     open_store,
+    parse_statfs,
     read_store,
 )
-from loopcal.studies.specification.changes import list_conflicts
-from loopcal.studies.specification.keys import dump_json
 from loopcal.studies.specification.levels import (
     ErrorsLevel,
     MethodLevel,
@@ -35,7 +35,7 @@ from loopcal.studies.specification.levels import (
     PosesLevel,
     Robot,
 )
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import Study, dump_json, list_conflicts
 from tests.findings.expectations import expect_refusal
 
 HEADER = StoreHeader("{}", ("outcome", "position", "rank"), {"numerics": "1"})

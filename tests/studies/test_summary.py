@@ -14,22 +14,21 @@ from scipy.stats import beta, binom
 
 from loopcal.errors import DataError
 from loopcal.report.pictures import render_figure
-from loopcal.report.text_page import render_text
+from loopcal.report.tables import render_text
 from loopcal.studies.files.store import read_store
-from loopcal.studies.results.figure_layout import choose_layout
-from loopcal.studies.results.study_result import StudyResult
-from loopcal.studies.results.summary import (
+from loopcal.studies.results.questions import list_shown, view_summary, write_summary
+from loopcal.studies.results.study_result import (
     MEMORY,
+    StudyResult,
     compute_binomial_interval,
     estimate_mean,
     estimate_quantile,
     estimate_share,
     summarize_study,
 )
-from loopcal.studies.results.summary_drawing import render_figures
-from loopcal.studies.results.summary_view import list_shown, view_summary, write_summary
+from loopcal.studies.results.summary_drawing import choose_layout, render_figures
 from loopcal.studies.simulation.fits import OUTCOMES
-from loopcal.studies.specification.cells import Cell
+from loopcal.studies.specification.study import Cell
 from tests.studies.stored_scores import Scores, make_study, store_scores
 
 FAILED, RATE = 1, 0.1
@@ -235,7 +234,7 @@ def test_scores_that_are_read_a_few_at_a_time_have_the_same_summary(
 ) -> None:
     whole = result.summarize()
     monkeypatch.setattr(
-        "loopcal.studies.results.summary.MEMORY", 8 * 400 * 3
+        "loopcal.studies.results.study_result.MEMORY", 8 * 400 * 3
     )  # three scores of a cell
     assert result.summarize() == whole
 

@@ -40,7 +40,7 @@ def test_unknown_and_ambiguous_types_are_reported_with_the_text_of_pyright():
 def test_types_of_the_command_line_are_not_checked():
     assert (
         list_incomplete_types(
-            build_report(build_symbol("loopcal.cli.options.shared_options.Quantity", known=False))
+            build_report(build_symbol("loopcal.cli.options.Quantity", known=False))
         )
         == []
     )

@@ -6,10 +6,10 @@ import re
 
 import pytest
 
-from loopcal.cli import main
-from loopcal.io.core import file_reference as reference
-from loopcal.measure import KINDS
-from loopcal.mechanism import FAMILIES
+from loopcal.cli.entry_point import main
+from loopcal.io.robot import robot_file as reference
+from loopcal.measure.kinds import KINDS
+from loopcal.mechanism.families import FAMILIES
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from tools import file_reference
 from tools.markdown import find_blocks

@@ -11,7 +11,7 @@ import pytest
 from docutils.core import publish_string
 
 import loopcal
-from loopcal.cli import command_line
+from loopcal.cli.entry_point import command_line
 from tools import check_site, site_commands, site_docstrings, site_pages
 from tools.api_reference import SECTIONS
 

@@ -14,15 +14,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 import loopcal as lc
-from loopcal.diagnose import estimate_frame_drifts, interpret_fit, report_base_targets
-from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit
-from loopcal.diagnose.frame_drift import compare_shapes
+from loopcal.diagnose.frame_drift import compare_shapes, estimate_frame_drifts, report_base_targets
+from loopcal.diagnose.frame_motions import interpret_fit
+from loopcal.diagnose.repeated_poses import check_lack_of_fit
 from loopcal.errors import DataError
-from loopcal.estimate import MAP, FitOptions
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP
 from loopcal.findings import Finding
-from loopcal.measure import sample_truth
-from loopcal.mechanism import forward, resolve_poses
-from loopcal.workflow import Verdict
+from loopcal.measure.simulation import sample_truth
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import resolve_poses
+from loopcal.workflow.verdict import Verdict
 from tests.estimate.dense_delta import NOMINAL, TOLERANCE, locate_nozzle
 
 ROBOT = lc.load_robot("linear-delta")

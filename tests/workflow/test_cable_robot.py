@@ -15,19 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal.diagnose import (
-    compare_with_values,
-    compute_reading_errors,
-    examine_fit,
-    identifiability,
-    suggest_measurements,
-)
-from loopcal.estimate import FitOptions, Identification, LeastSquares, identify
+from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
+from loopcal.diagnose.identifiable_parameters import identifiability
+from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.diagnose.value_comparison import compare_with_values
+from loopcal.estimate.identification import identify
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.result import Identification
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
-from loopcal.measure import Measurements, Observations
-from loopcal.mechanism import Mechanism
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
 from tests.cable_robot import (
     NAMES,
     TRUTH,

@@ -12,16 +12,20 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import MAP
 from loopcal.estimate.observation_rows import BLOCK, EXACT_BLOCK
+from loopcal.estimate.penalties import MAP
 from loopcal.findings import Quantity, Severity, report_finding
-from loopcal.io import load_run, save_run
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Gaussian, Instrument, Pose, Position, Sensor, sample_truth, simulate
-from loopcal.workflow import CalibrationOptions, Verdict, calibrate, split_data
-from loopcal.workflow.verdict import choose_next_step, decide_verdict
+from loopcal.io.runs.run_folder import load_run, save_run
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions, split_data
+from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
 from tests.estimate.problems import hexapod, hexapod_data
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"

@@ -10,11 +10,20 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.estimate import MAP, FitOptions, Huber, Identification, LeastSquares, identify
-from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor
+from loopcal.estimate.identification import identify
+from loopcal.estimate.losses import Huber
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.result import Identification
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
 from loopcal.report.calibration_view import view_calibration, view_fit
-from loopcal.report.text_page import render_text
-from loopcal.workflow import CalibrationOptions, CalibrationReport, Verdict, calibrate
+from loopcal.report.tables import render_text
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.calibration_report import CalibrationReport
+from loopcal.workflow.verdict import Verdict
 from tests.estimate.problems import hexapod, hexapod_data
 
 

@@ -9,18 +9,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from loopcal.estimate import LeastSquares, identify, identify_trials
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Measurements,
-    Pose,
-    Sensor,
-    sample_truth,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import Mechanism, forward
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
 from tests.over_constrained import EXECHON, FOUR_BAR, close_by_least_squares
 from tests.robot_texts import load_text
 

@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.estimate import MAP, FitOptions, LeastSquares
-from loopcal.workflow import CalibrationOptions, Verdict, calibrate
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.verdict import Verdict
 
 TARGETS = ("A", "B", "C")
 HEADER = """# format: 1

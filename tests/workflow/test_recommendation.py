@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.diagnose import adjust_uncertainty, compute_kind_errors
-from loopcal.estimate import identify
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+from loopcal.diagnose.row_errors import compute_kind_errors
+from loopcal.estimate.identification import identify
 from loopcal.findings import Quantity, report_finding
-from loopcal.measure import Measurements, Observations
-from loopcal.measure.kinds import Component
-from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.workflow import Verdict
-from loopcal.workflow.recommendation import recommend_values
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.workflow.verdict import Verdict, recommend_values
 
 SIGMA = 20e-6
 """Noise of the probe [m]."""

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from loopcal.estimate import LeastSquares, identify_trials
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
-from loopcal.mechanism import sample_workspace
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.workspace import sample_workspace
 from tests.zoo import load_cached_robot
 
 DRAWS, POSES = 20, 40

@@ -12,20 +12,19 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from loopcal.errors import DataError
-from loopcal.estimate import LeastSquares, identify
-from loopcal.io import load_measurements, save_measurements
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    JointSensor,
-    Measurements,
-    Position,
-    Sensor,
-    Separation,
-    sample_truth,
-    simulate,
-)
-from loopcal.mechanism import Mechanism, forward, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.distance import Separation
+from loopcal.measure.kinds.joints import JointSensor
+from loopcal.measure.kinds.position import Position
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
+from loopcal.mechanism.workspace import sample_workspace
 from tests.denavit_hartenberg import ARM_6R, join, multiply_denavit_hartenberg
 from tests.zoo import load_cached_robot
 

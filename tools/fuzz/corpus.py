@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from loopcal.cli import main
-from loopcal.io.runs.certificate_settings import TEMPLATE as CERTIFICATE_FACTS
-from loopcal.measure import KINDS
+from loopcal.cli.entry_point import main
+from loopcal.io.runs.certificate import TEMPLATE as CERTIFICATE_FACTS
+from loopcal.measure.kinds import KINDS
 from tools.fuzz.sources import SOURCES
 
 ROOT = Path(__file__).resolve().parent.parent.parent

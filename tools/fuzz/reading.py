@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import LoopcalError
-from loopcal.io import load_measurements, load_robot, load_run
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.runs.run_folder import load_run
 from tools.fuzz.cases import Case
 from tools.fuzz.verdict import normalize
 

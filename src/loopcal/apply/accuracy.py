@@ -14,27 +14,52 @@ is known, and that of Student's t for the effective degrees of freedom where it 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal import geometry
-from loopcal.diagnose import NO_MOTION, ErrorFrame, choose_error_frame, twist_weights
-from loopcal.diagnose.error_frames import FITTED, RELATIVE, list_error_twists
-from loopcal.diagnose.fit_checks.expected_errors import ROUNDING
+from loopcal.diagnose.error_frames import (
+    FITTED,
+    RELATIVE,
+    ErrorFrame,
+    choose_error_frame,
+    fit_unfixed_frames,
+    list_error_twists,
+    solve_home,
+)
+from loopcal.diagnose.fit_examination import ROUNDING
+from loopcal.diagnose.frame_motions import NO_MOTION, twist_weights
+from loopcal.engine import State
 from loopcal.errors import EstimationError
-from loopcal.estimate.inference.covariance_parts import NOISE, combine_degrees
-from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.inference.residual_test import coverage_factor
+from loopcal.estimate.penalties import LeastSquares, Method
+from loopcal.estimate.posterior import NOISE, Posterior, combine_degrees
+from loopcal.estimate.residual_test import coverage_factor
 from loopcal.estimate.result import Identification
+from loopcal.estimate.trial_identification import (
+    IdentifiedTrials,
+    compute_trial_posterior,
+    identify_trials,
+)
 from loopcal.findings import Finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
-from loopcal.numerics.chi_square import compute_f_quantile
-from loopcal.presentation import TableResult
-from loopcal.typing import FloatArray
+from loopcal.measure.instrument import Instrument
+from loopcal.measure.simulation import Trials, sample_truth, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import Solution, forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import resolve_poses
+from loopcal.numerics.statistics import compute_f_quantile
+from loopcal.presentation import TableResult, draw
+from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COMPONENT_LEVEL = 0.954499736103642
 """Coverage of the expanded uncertainty of a component: that of k = 2 for normal errors (JCGM 100,
@@ -333,3 +358,230 @@ def transport(robot: Mechanism, T: FloatArray, axes: Axes, point: Point) -> Floa
     R = T[:, :3, :3]
     arm = R @ robot.tool[:3, 3] if point == "tool" else np.zeros((len(T), 3))
     return geometry.transport_matrix(arm, R.swapaxes(1, 2) if axes == "platform" else None)
+
+
+# --- Uncertainty of poses over the workspace, compared with that of the measured poses.
+
+
+@dataclass(frozen=True, eq=False)
+class AccuracyMap(TableResult):
+    """Uncertainty over the workspace, and at the measured poses.
+
+    Attributes
+    ----------
+    coordinates : (n, c) controlled coordinates [m, rad]; `names` names them.
+    uncertainty : of these n poses. measured : of the measured poses.
+    """
+
+    names: tuple[str, ...]
+    coordinates: FloatArray
+    uncertainty: PoseUncertainty
+    measured: PoseUncertainty
+
+    @property
+    def position_ratio(self) -> FloatArray:
+        """(n,) position uncertainty divided by the largest at the measured poses.
+
+        Above 1 the map extrapolates.
+        """
+        return _ratio(self.uncertainty.position, self.measured.position)
+
+    @property
+    def orientation_ratio(self) -> FloatArray:
+        """(n,) orientation uncertainty divided by the largest at the measured poses."""
+        return _ratio(self.uncertainty.orientation, self.measured.orientation)
+
+    @property
+    def extrapolated(self) -> BoolArray:
+        """(n,) poses that are less certain than every measured pose."""
+        return (self.position_ratio > 1.0) | (self.orientation_ratio > 1.0)
+
+    def plot(self) -> Figure:
+        """Draw the uncertainty in slices of the workspace, beside the measured poses."""
+        return draw("result_figures.draw_accuracy_map", self)
+
+    def __str__(self) -> str:
+        """Return medians and maxima, and how many poses are extrapolated."""
+        n = len(self.coordinates)
+        lines = [f"Pose uncertainty (rms) at {n} poses: {self.uncertainty.frame}"]
+        for name, factor, symbol in (("position", 1e3, "mm"), ("orientation", 1e3, "mrad")):
+            values, measured = (
+                factor * getattr(u, name) for u in (self.uncertainty, self.measured)
+            )
+            ratio = getattr(self, f"{name}_ratio")
+            lines.append(
+                f"{name:<12} median {np.nanmedian(values):.3g} {symbol}, largest "
+                f"{np.nanmax(values):.3g} {symbol}; largest at measured poses "
+                f"{np.nanmax(measured):.3g} {symbol} (ratio up to {np.nanmax(ratio):.3g})"
+            )
+        lines.append(
+            f"{int(self.extrapolated.sum())} of {n} poses are less certain than every measured pose"
+        )
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the map by name for JSON, SI."""
+        return {
+            "names": list(self.names),
+            "coordinates": self.coordinates,
+            **self.uncertainty.to_dict(),
+            "position_ratio": self.position_ratio,
+            "orientation_ratio": self.orientation_ratio,
+            "extrapolated": int(self.extrapolated.sum()),
+        }
+
+
+def accuracy_map(
+    fit: Identification | Posterior,
+    measured: ArrayLike,
+    poses: ArrayLike | int = 400,
+    seed: int = 0,
+    axes: Axes = "base",
+    frame: str = FITTED,
+) -> AccuracyMap:
+    """Compute the uncertainty of poses over the workspace, and compare it with the measured poses.
+
+    Parameters
+    ----------
+    fit : the identification, or the posterior of a run folder.
+    measured : (m, a) readings of the measured poses, as in `Measurements.readings` [m, rad].
+    poses : (n, c) controlled coordinates, for instance a grid, or the number of poses to draw from
+        the robot's workspace.
+    seed : of that draw. axes : of the components. frame : see `pose_uncertainty`; "relative" means
+        relative to the home pose.
+
+    Raises
+    ------
+    MechanismError : poses are to be drawn, and the robot states no workspace.
+    """
+    robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
+    coordinates = resolve_poses(robot, poses, seed)
+    home = solve_home(robot)
+    compute = partial(
+        pose_uncertainty, fit, axes=axes, frame=frame, origin=home, origin_name="home"
+    )
+    return AccuracyMap(
+        names=robot.controlled,
+        coordinates=coordinates,
+        uncertainty=compute(poses=coordinates),
+        measured=compute(poses=forward(robot, measured)),
+    )
+
+
+def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return values over the largest reference; 1 where both are infinite or both are zero."""
+    largest = float(np.nanmax(reference))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(values == largest, 1.0, values / largest)
+
+
+# --- Check the linear prediction of pose errors by many simulated calibrations.
+
+BATCH = 250
+"""Trials that are identified at once; progress is reported between them."""
+
+
+@dataclass(frozen=True, eq=False)
+class AccuracySimulation(TableResult):
+    """Predicted and observed errors of n poses.
+
+    Attributes
+    ----------
+    predicted : of the fit of the first trial, with its frame: platform origin, base axes.
+    observed : (n, 6) root mean square error [rad, m].
+    trials, failed : number of fits that converged, and that did not.
+    """
+
+    predicted: PoseUncertainty
+    observed: FloatArray
+    trials: int
+    failed: int
+
+    @property
+    def ratio(self) -> FloatArray:
+        """(n, 6) observed over predicted; NaN where the prediction is infinite or zero."""
+        sd = self.predicted.sd
+        valid = np.isfinite(sd) & (sd > 0.0)
+        return np.divide(self.observed, sd, out=np.full(sd.shape, np.nan), where=valid)
+
+
+def simulate_accuracy(
+    robot: Mechanism,
+    commanded: ArrayLike,
+    instrument: Instrument,
+    poses: ArrayLike,
+    method: Method | None = None,
+    trials: int = 2000,
+    seed: int = 0,
+    progress: Progress = report_no_progress,
+) -> AccuracySimulation:
+    """Compare predicted with observed errors of poses.
+
+    Parameters
+    ----------
+    robot : its tolerances are those of the true errors, which each trial draws anew.
+    commanded : measured poses, (m, 4, 4) or (m, c). instrument : with what they are measured.
+    poses : compared poses, (n, 4, 4) or (n, c), at the readings of the nominal robot.
+    method : default least squares. trials : their number. seed : of all random streams.
+    progress : receives the trials that are done.
+
+    Raises
+    ------
+    EstimationError : no trial converged.
+    """
+    truth = sample_truth(robot, trials, seed)
+    measured = simulate_trials(robot, truth, commanded, instrument, seed)
+    compared = inverse(robot.nominal, poses)
+    method = method or LeastSquares()
+    posterior, squares, converged = None, np.zeros((len(compared.q), 6)), 0
+    for first in range(0, trials, BATCH):
+        progress(first, trials, "calibrating simulated machines")
+        batch = _take_trials(measured, slice(first, first + BATCH))
+        fits = identify_trials(robot, batch, method)
+        valid, errors = _compare_with_truth(fits, batch, compared.q, compared.state)
+        if posterior is None and valid.any():
+            posterior = compute_trial_posterior(fits, batch, int(np.flatnonzero(valid)[0]))
+        if posterior is None:
+            continue
+        frames = fit_unfixed_frames(posterior)
+        if frames.motions.shape[1]:
+            closed, reference = _compare_with_truth(fits, batch, measured.readings)
+            valid &= closed
+            errors = frames.remove(errors, compared.T, reference)
+        errors = errors[valid]
+        squares += (errors**2).sum(axis=0)
+        converged += len(errors)
+    if posterior is None:
+        raise EstimationError(f"none of the {trials} trials converged; check poses and method")
+    predicted = pose_uncertainty(posterior, forward(posterior.robot, compared.q), point="platform")
+    observed = np.sqrt(squares / converged)
+    return AccuracySimulation(predicted, observed, converged, trials - converged)
+
+
+def _take_trials(trials: Trials, chosen: slice) -> Trials:
+    """Return some of the trials."""
+    return replace(
+        trials,
+        measured=tuple(values[chosen] for values in trials.measured),
+        truth=trials.truth[chosen],
+        T=trials.T[chosen],
+        reached=trials.reached[chosen],
+        recorded=None if trials.recorded is None else trials.recorded[chosen],
+    )
+
+
+def _compare_with_truth(
+    fits: IdentifiedTrials, trials: Trials, readings: FloatArray, start: State | None = None
+) -> tuple[BoolArray, FloatArray]:
+    """Return which trials (t,) have a fit and all poses at readings (n, a), and the errors (t, n,
+    6) of these poses.
+    """
+    states = [
+        forward_trials(fits.free_parameters.robot, values, readings[None], start)
+        for values in (fits.values, trials.truth)
+    ]
+    is_closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
+    valid = fits.converged & is_closed[0] & is_closed[1]
+    return valid, geometry.pose_difference(states[0].T, states[1].T)

@@ -19,21 +19,17 @@ from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
-from loopcal.diagnose import twist_weights
 from loopcal.diagnose.error_frames import FITTED, fit_unfixed_frames
+from loopcal.diagnose.frame_motions import twist_weights
 from loopcal.errors import DataError
-from loopcal.estimate.inference.posterior import Posterior
+from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import (
-    Mechanism,
-    Solution,
-    Status,
-    check_limits,
-    forward,
-    inverse,
-    read_coordinates,
-)
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.solutions import Solution, forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import check_limits
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
 from loopcal.units import Dimension

@@ -30,13 +30,12 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose import PoseErrors
+from loopcal.diagnose.row_errors import PoseErrors
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.measure import Observations
-from loopcal.measure.kinds.error_groups import list_error_groups
-from loopcal.numerics.chi_square import compute_chi_square_tail
-from loopcal.numerics.sorted_values import find_distinct
+from loopcal.measure.kinds.kind import list_error_groups
+from loopcal.measure.observations import Observations
+from loopcal.numerics.statistics import compute_chi_square_tail, find_distinct
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray
 from loopcal.units import Unit

@@ -20,12 +20,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.diagnose import PredictionComparison, compare_predictions
-from loopcal.diagnose.row_errors import Statistics, compute_statistics
+from loopcal.diagnose.row_errors import (
+    PredictionComparison,
+    Statistics,
+    compare_predictions,
+    compute_statistics,
+)
 from loopcal.errors import DataError
 from loopcal.estimate.result import Identification
 from loopcal.findings.wording import round_to_digits
-from loopcal.measure import Measurements, Observations, kinds
+from loopcal.measure import kinds
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism.assembly import AXES
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray
@@ -34,7 +40,7 @@ from loopcal.units import Dimension, Unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from loopcal.mechanism import Mechanism
+    from loopcal.mechanism.model import Mechanism
 
 PREFIX = "heights_"
 """Beginning of the names of the stored arrays."""
@@ -84,7 +90,7 @@ class HeightErrors(TableResult):
 
     def plot(self) -> Figure:
         """Draw the errors over x and y before and after calibration, with one scale of colors."""
-        return draw("draw_height_errors", self)
+        return draw("result_figures.draw_height_errors", self)
 
     def __str__(self) -> str:
         """Return one line for the fitted and one for the held-out heights."""

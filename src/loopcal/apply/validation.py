@@ -24,42 +24,317 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.conformity import Conformity, judge_limits, report_conformity
-from loopcal.apply.held_out_blunders import find_blunders, report_blunders
-from loopcal.apply.validation_findings import (
-    ErrorChange,
-    check_limit,
-    check_limits,
-    describe_frame,
-    group_setup,
-    owner_of,
-    report_few_rows,
-    report_left_out,
-    report_moved_setup,
-    report_setup,
-)
-from loopcal.diagnose import (
-    Blunder,
+from loopcal.diagnose.blunders import Blunder, Explanation, check_held_out_rows
+from loopcal.diagnose.conventions.convention_check import find_moved_setups
+from loopcal.diagnose.frame_drift import report_base_targets
+from loopcal.diagnose.row_errors import (
     KindErrors,
     NoiseFloor,
     PoseErrors,
+    PosePredictions,
     PredictionComparison,
+    QuantityErrors,
     compare_predictions,
     compute_noise_floor,
     compute_row_errors,
-    report_base_targets,
+    predict_poses,
 )
 from loopcal.errors import DataError, suggest_names
-from loopcal.estimate.inference.fit_uncertainty import FitUncertainty, collect_uncertainty
+from loopcal.estimate.fit_linearization import FitUncertainty, collect_uncertainty
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Severity
-from loopcal.findings.wording import round_to_digits
-from loopcal.measure import Measurements, check_actuators
-from loopcal.mechanism import Mechanism
+from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.findings.wording import list_names, round_to_digits
+from loopcal.measure.data_checks import check_actuators
+from loopcal.measure.fitted_rows import FittedRows
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import compute_chi_square_quantile, find_distinct
 from loopcal.presentation import TableResult, draw
-from loopcal.units import Unit
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension, Unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+# --- Findings of a validation: limits, setup parameters that moved, and poses that were left out.
+
+FEW_ROWS = 5
+"""Number of rows below which an error cannot be judged.
+
+At 4 rows the rms of noise alone varies by a third.
+"""
+
+
+GREW = 1.1
+"""Factor by which an error must grow to be called larger."""
+
+NOISE_LEVEL = 1e-3
+"""Probability that noise alone exceeds what is called the noise."""
+
+
+@dataclass(frozen=True)
+class ErrorChange:
+    """The rms error of one quantity before and after calibration.
+
+    Attributes
+    ----------
+    before, after, noise_floor : [m], [rad] or [sigma]. values : number of measured components.
+    """
+
+    before: float
+    after: float
+    noise_floor: float
+    values: int
+
+    @property
+    def times(self) -> float:
+        """How many times smaller the error became; infinite where it vanished, NaN if unknown."""
+        if not (np.isfinite(self.before) and np.isfinite(self.after)):
+            return np.nan
+        if self.after > 0.0:
+            return self.before / self.after
+        return np.inf if self.before > 0.0 else 1.0
+
+    @property
+    def largest_noise(self) -> float:
+        """The rms that noise alone exceeds with the probability `NOISE_LEVEL`."""
+        square = compute_chi_square_quantile(max(self.values, 1), NOISE_LEVEL) / max(self.values, 1)
+        return self.noise_floor * float(np.sqrt(square))
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether noise alone explains the error before and after."""
+        return max(self.before, self.after) <= self.largest_noise
+
+    @property
+    def has_grown(self) -> bool:
+        """Whether the error became larger by more than a tenth, and noise does not explain it."""
+        return self.after > GREW * self.before and self.after > self.largest_noise
+
+
+def owner_of(name: str) -> str:
+    """Return the frame, target or surface of a setup parameter: `tracker` of `tracker.x`."""
+    return name.rsplit(".", 1)[0]
+
+
+def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
+    """Return the frames, targets and surfaces that are kept, and those fitted to the rows."""
+    kept = dict.fromkeys(owner_of(n) for n in prediction.setup.table.names if n in prediction.kept)
+    fitted = dict.fromkeys(
+        owner_of(n) for n in prediction.setup.table.names if n not in prediction.kept
+    )
+    return {"kept": tuple(kept), "fitted": tuple(fitted)}
+
+
+def describe_frame(errors: PoseErrors, setup: Sequence[str]) -> str:
+    """Return the frame of errors in words.
+
+    Parameters
+    ----------
+    setup : frames, targets and surfaces that were estimated. Without any, positions and
+        orientations are those in the stated frame of the instrument.
+    """
+    if setup:
+        return f"after the best fit of {list_names(setup, 6)}"
+    if {"position", "orientation"} & errors.quantities.keys():
+        return "in the stated frame"
+    return "without any frame"
+
+
+def report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]:
+    """Report where the setup parameters come from."""
+    before, after = group_setup(first), group_setup(last)
+    only_after = tuple(name for name in after["kept"] if name in before["fitted"])
+    codes = {
+        "validation.setup-kept": after["kept"],
+        "validation.setup-fitted-before": only_after,
+        "validation.setup-fitted": after["fitted"],
+    }
+    return [report_finding(code, names=names) for code, names in codes.items() if names]
+
+
+def report_few_rows(after: PoseErrors) -> list[Finding]:
+    """Report quantities that too few rows measure."""
+    counts = {name: len(find_distinct(errors.rows)) for name, errors in after.quantities.items()}
+    return [
+        report_finding("validation.few-rows", quantity=quantity, count=count)
+        for quantity, count in counts.items()
+        if 0 < count < FEW_ROWS
+    ]
+
+
+def report_left_out(data: Measurements, compared: PredictionComparison) -> list[Finding]:
+    """Report poses with rows that no statistic contains, and poses that were estimated."""
+    has_rows = np.zeros(data.n_poses, dtype=bool)
+    for o in data.observations:
+        has_rows[o.rows[o.weight > 0.0]] = True
+    estimated = compared.estimated & compared.usable
+    cases = {
+        "validation.unreachable-poses": ~compared.usable & compared.predictable,
+        "validation.missing-readings": has_rows & ~compared.predictable,
+        "validation.poses-estimated": estimated,
+    }
+    named = {code: [data.labels[i] for i in np.flatnonzero(out)] for code, out in cases.items()}
+    extra: dict[str, dict[str, Any]] = {
+        "validation.poses-estimated": {"absorbed": int(compared.absorbed.sum())}
+    }
+    return [
+        report_finding(code, names=tuple(f"pose {name}" for name in names), **extra.get(code, {}))
+        for code, names in named.items()
+        if names
+    ]
+
+
+def report_moved_setup(
+    robot: Mechanism, compared: PredictionComparison, kept: Mapping[str, float]
+) -> list[Finding]:
+    """Report kept frames, targets and surfaces that were apparently moved after the fit."""
+    data = compared.data
+    table, rows = data.nuisance_parameters.table, data.observations
+    owner = {p.name: owner_of(p.name) for p in table.entries}
+
+    def measure_errors(refit: tuple[str, ...]) -> tuple[float, int]:
+        """Return the whitened rms error with these fitted again, and the equations left over."""
+        values = {name: v for name, v in kept.items() if owner.get(name) not in refit}
+        try:
+            prediction = predict_poses(robot, data, compared.solution, compared.usable, values)
+        except DataError:  # too few rows to fit it
+            return float("nan"), 0
+        total = 0.0
+        for o, residual in zip(rows, prediction.residuals(rows), strict=True):
+            present = np.where(o.present, residual, 0.0)
+            total += float(((o.whitener @ present[..., None]) ** 2).sum())
+        fitted = sum(p.free and owner[p.name] in refit for p in table.entries)
+        left = sum(o.n_residuals for o in rows) - fitted
+        return float(np.sqrt(total / max(left, 1))), left
+
+    names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
+    moved = find_moved_setups(tuple(names), measure_errors)
+    if moved is None:
+        return []
+    return [report_finding("validation.setup-moved", names=moved.names, times=moved.times)]
+
+
+def check_limit(name: str, limit: float | None) -> None:
+    """Refuse a limit below 0, or NaN: no error could keep it, or exceed it."""
+    if limit is None:
+        return
+    if not limit >= 0.0:
+        raise DataError(f"{name} is {limit}; give a number of metres or radians, 0 or more")
+
+
+def check_limits(
+    after: PoseErrors,
+    poses: tuple[str, ...],
+    limits: Mapping[str, float | None],
+    units: Mapping[str, Unit],
+) -> list[Finding]:
+    """Report limits that the largest error exceeds, and limits on what no row measures."""
+    findings = []
+    for quantity, limit in limits.items():
+        if limit is None:
+            continue
+        errors = after[quantity]
+        if not len(errors.rows):
+            findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
+            continue
+        worst, unit = int(np.argmax(errors.size)), units[quantity]
+        if errors.size[worst] > limit:
+            findings.append(
+                report_finding(
+                    "gates.limit-exceeded",
+                    quantity=quantity,
+                    pose=poses[errors.rows[worst]],
+                    target=errors.targets[worst],
+                    error=Quantity(float(errors.size[worst]) / unit.factor_to_si, unit.symbol),
+                    limit=Quantity(limit / unit.factor_to_si, unit.symbol),
+                )
+            )
+    return findings
+
+
+# --- Held-out poses that do not fit: the search, and findings with their largest errors.
+
+DOMINATES = 2.0
+"""Factor by which an rms error must fall without the blunders to be called dominated by them."""
+
+
+def find_blunders(
+    robot: Mechanism, compared: PredictionComparison, uncertainty: FitUncertainty | None
+) -> tuple[Blunder, ...]:
+    """Return the compared poses that neither the calibration nor the other poses explain.
+
+    Parameters
+    ----------
+    robot : the calibrated one. uncertainty : of the calibration; None where it is not known, then
+        the noise and the other poses decide.
+    """
+    data, after = compared.data.take(compared.usable), compared.after
+    values = dict(zip(after.setup.table.names, after.values[0].tolist(), strict=True))
+    check = check_held_out_rows(robot, data, values, after.kept, uncertainty)
+    if check is None:
+        return ()
+    from loopcal.diagnose.blunders import name_blunders
+
+    return name_blunders(check, data)
+
+
+def report_blunders(
+    blunders: tuple[Blunder, ...], errors: Validation, rest: Validation | None
+) -> list[Finding]:
+    """Return a finding for each blunder, and whether they dominate the errors.
+
+    Parameters
+    ----------
+    errors : of all poses. rest : without the blunders.
+    """
+    largest = _find_largest(blunders, errors)
+    findings = [b.report(**result) for b, result in zip(blunders, largest, strict=True)]
+    if rest is None:
+        return findings
+    poses = tuple(label for blunder in blunders for label in blunder.poses)
+    for quantity, unit in errors.units.items():
+        all_rows, without = (e.after.statistics(quantity).rms for e in (errors, rest))
+        if all_rows > DOMINATES * without or np.isnan(without):
+            error, left = (
+                None if np.isnan(x) else Quantity(x / unit.factor_to_si, unit.symbol)
+                for x in (all_rows, without)
+            )
+            dominated = report_finding(
+                "validation.blunders-dominate",
+                poses=poses,
+                quantity=quantity,
+                error=error,
+                without=left,
+            )
+            return [*findings, dominated]
+    return findings
+
+
+def _find_largest(blunders: Sequence[Blunder], errors: Validation) -> list[dict[str, Any]]:
+    """Return quantity, target and error of the largest error of each blunder, compared with the
+    noise; empty where only actuator readings are compared.
+    """
+    owners: dict[str, list[int]] = {}
+    for i, blunder in enumerate(blunders):
+        for label in blunder.poses:
+            owners.setdefault(label, []).append(i)
+    of_row = [
+        {i for label in poses.split("/") for i in owners.get(label, ())} for poses in errors.poses
+    ]
+    nothing: dict[str, str | Quantity] = {"quantity": "", "target": "", "error": ""}
+    worst, results = [0.0] * len(blunders), [nothing] * len(blunders)
+    for quantity, of_rows in errors.after.quantities.items():
+        floor, unit = errors.noise_floor.rms[quantity], errors.units[quantity]
+        entries = zip(of_rows.rows.tolist(), of_rows.size.tolist(), of_rows.targets, strict=True)
+        for row, size, target in entries:
+            for i in of_row[row]:
+                if size > worst[i] * floor:
+                    worst[i] = size / floor
+                    error = Quantity(size / unit.factor_to_si, unit.symbol)
+                    results[i] = {"quantity": quantity, "target": target, "error": error}
+    return results
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +466,7 @@ class Validation(TableResult):
 
     def plot(self) -> Figure:
         """Draw the errors by pose before and after calibration, with the noise floor and limits."""
-        return draw("draw_validation", self)
+        return draw("result_figures.draw_validation", self)
 
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
@@ -394,3 +669,158 @@ def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, 
         for name, value in values.items()
         if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
     }
+
+
+# --- Rows that a calibration was fitted to are no independent validation.
+
+REFUSED_SHARE = 0.5
+"""Share of reused rows from which data are refused for validation."""
+
+
+def report_reused_rows(fitted: FittedRows | None, data: Measurements) -> Finding | None:
+    """Return the finding that some rows belong to a calibration; None where no row does.
+
+    Parameters
+    ----------
+    fitted : the rows of the calibration; None where they are not known. data : for validation.
+
+    Raises
+    ------
+    DataError : half of the rows or more belong to it.
+    """
+    reused = (fitted or FittedRows()).find_in(data)
+    if not reused.count:
+        return None
+    refused = reused.count >= REFUSED_SHARE * reused.total
+    finding = report_finding(
+        "validation.rows-reused",
+        Severity.REFUSAL if refused else Severity.WARNING,
+        **reused._asdict(),
+    )
+    if refused:
+        raise DataError(finding)
+    return finding
+
+
+# --- A validation in a run folder: its numbers in result.json, and its differences as arrays.
+
+ERRORS = ("before", "after")
+"""Errors whose differences are stored."""
+
+PREFIX = "held_out"
+"""First word of the names of the stored arrays, `held_out_<before or after>_<quantity>`."""
+
+
+def store_differences(validation: Validation) -> dict[str, FloatArray]:
+    """Return the differences (e, 3) [SI] of the errors before and after, by name."""
+    return {
+        f"{PREFIX}_{name}_{quantity}": errors.components
+        for name in ERRORS
+        for quantity, errors in getattr(validation, name).quantities.items()
+    }
+
+
+def restore_validation(
+    content: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot: Mechanism
+) -> Validation | None:
+    """Return the numbers of a stored validation; None where an older version wrote it.
+
+    Findings stay sentences of `content`. Only the errors before and after have differences by
+    component; of the others, the first component is the size.
+
+    Parameters
+    ----------
+    content : `Validation.to_dict()` of the run. arrays : of the run. robot : for units.
+    """
+    if content.get("judged") is None:
+        return None
+    errors = {
+        name: _restore_errors(content[name], arrays, f"{PREFIX}_{name}")
+        for name in ("before", "after", "commanded_before", "commanded_after", "not_compensable")
+    }
+    after = errors["after"]
+    return Validation(
+        poses=tuple(content["poses"]),
+        before=errors["before"],
+        after=after,
+        commanded_before=errors["commanded_before"],
+        commanded_after=errors["commanded_after"],
+        not_compensable=errors["not_compensable"],
+        noise_floor=_restore_floor(content["noise_floor"]),
+        unreachable=tuple(content["failed"]),
+        limit_position=content["limit_position"],
+        limit_angle=content["limit_angle"],
+        units={name: robot.get_unit(e.dimension) for name, e in after.quantities.items()},
+        alignment={key: tuple(names) for key, names in content["alignment"].items()},
+        kinds=_restore_kinds(content["kinds"]),
+        setup_count=content["setup_count"],
+        absorbed=content["absorbed"],
+        judged=content["judged"],
+        blunders=tuple(_restore_blunder(blunder) for blunder in content["blunders"]),
+        without_blunders=_restore_rest(content["without_blunders"], content, robot),
+    )
+
+
+def _restore_rest(
+    rest: Mapping[str, Any] | None, whole: Mapping[str, Any], robot: Mechanism
+) -> Validation | None:
+    """Return the statistics without blunders."""
+    if rest is None:
+        return None
+    unknown = {"commanded_before": {}, "commanded_after": {}, "not_compensable": {}}
+    unknown |= {"blunders": (), "without_blunders": None, "failed": ()}
+    return restore_validation({**whole, **unknown, **rest}, {}, robot)
+
+
+def _restore_errors(
+    content: Mapping[str, Any], arrays: Mapping[str, np.ndarray], name: str
+) -> PoseErrors:
+    """Return the errors by quantity."""
+    quantities = {}
+    for quantity, stored in content.items():
+        components = arrays.get(f"{name}_{quantity}")
+        if components is None:
+            size = np.array(stored["errors"], dtype=float)
+            components = np.column_stack([size, np.full((len(size), 2), np.nan)])
+        quantities[quantity] = QuantityErrors(
+            Dimension[stored["dimension"].upper()],
+            components,
+            np.array(stored["rows"], dtype=np.intp),
+            tuple(stored["targets"]),
+            tuple(stored["components"]),
+        )
+    return PoseErrors(quantities)
+
+
+def _restore_floor(content: Mapping[str, Any]) -> NoiseFloor:
+    """Return the noise floor."""
+    rms, largest = (
+        {quantity: _number(value) for quantity, value in content[key].items()}
+        for key in ("rms", "max")
+    )
+    return NoiseFloor(rms, largest)
+
+
+def _restore_kinds(content: list[Mapping[str, Any]]) -> tuple[KindErrors, ...]:
+    """Return the whitened errors of each kind."""
+    keys = ("before", "after", "noise_floor")
+    return tuple(
+        KindErrors(
+            kind["kind"],
+            kind["count"],
+            *(_number(kind[key]) for key in keys),
+            change=_number(kind.get("change")),
+        )
+        for kind in content
+    )
+
+
+def _restore_blunder(content: Mapping[str, Any]) -> Blunder:
+    """Return a pose that does not fit, without its explanation."""
+    numbers = (_number(content["times"]), _number(content["p_value"]))
+    return Blunder(tuple(content["poses"]), *numbers, Explanation("none"))
+
+
+def _number(value: float | None) -> float:
+    """Return a number of a file, in which null is not finite."""
+    return float("nan") if value is None else float(value)

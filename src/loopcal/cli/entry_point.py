@@ -9,11 +9,21 @@ Nothing heavier than click is imported before a command runs, so that
 
 from __future__ import annotations
 
+import _thread
 import keyword
 import os
+import platform
+import shlex
+import signal
 import sys
-from collections.abc import Sequence
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import click
@@ -21,11 +31,44 @@ import click
 from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
 from loopcal.cli.hints import find_hint, word_hint
-from loopcal.cli.interrupts import repeat_lost_interrupts
 from loopcal.errors import LoopcalError
 from loopcal.findings import Finding
 from loopcal.output_record import record_outputs
 from loopcal.threads import THREADS
+
+# --- Ctrl-C where Python cannot raise it.
+
+DELAY = 0.01
+"""From a lost interrupt to its repetition [s]; by then the callback has ended."""
+
+
+@contextmanager
+def repeat_lost_interrupts() -> Iterator[None]:
+    """Raise an interrupt that a callback lost again, a moment after the callback."""
+    report = sys.unraisablehook
+
+    def repeat_or_report(lost: sys.UnraisableHookArgs) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            _thread.start_new_thread(_interrupt, ())  # raised here, it is lost again
+        else:
+            report(lost)
+
+    sys.unraisablehook = repeat_or_report
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
+
+
+def _interrupt() -> None:
+    """Interrupt the main thread, also while it waits where the operating system has signals."""
+    time.sleep(DELAY)
+    main = threading.main_thread().ident
+    if main is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
 
 SECTIONS = {
     "Describe the robot": {
@@ -72,22 +115,24 @@ SECTIONS = {
 """Headings of the help, and the commands below each."""
 
 MODULES = {
-    "robot_commands": ("new", "check"),
-    "exchange_commands": ("import", "export"),
+    "robot_commands": ("new", "check", "view", "example", "completion"),
+    "exchange_commands": ("import", "export", "gcode", "fill"),
     "measurement_commands": ("identifiability", "simulate"),
     "plan_command": ("plan",),
-    "sheet_commands": ("gcode", "fill"),
-    "certificate_command": ("certificate",),
-    "repeatability_command": ("repeatability",),
-    "calibration_commands": ("calibrate", "budget", "validate", "compensate"),
-    "compare_command": ("compare",),
-    "report_command": ("report",),
-    "view_command": ("view",),
-    "regularize_command": ("regularize",),
+    "calibration_commands": (
+        "certificate",
+        "repeatability",
+        "calibrate",
+        "budget",
+        "validate",
+        "compensate",
+        "compare",
+        "report",
+        "regularize",
+    ),
     "sampling_commands": ("bootstrap", "sample"),
     "study_commands": ("study",),
     "paper_commands": ("reproduce", "per-leg"),
-    "help_commands": ("example", "completion"),
 }
 """Modules of `loopcal.cli.commands`, and the commands in each; imported when they run."""
 
@@ -257,8 +302,6 @@ def _report(
         case MemoryError():
             return _refuse("there is not enough memory for this; use fewer poses at a time.")
         case _:
-            from loopcal.cli.defect_report import DEFECT_CODE, describe_defect
-
             _refuse(describe_defect(error, words))
             return DEFECT_CODE
 
@@ -269,3 +312,92 @@ def _refuse(sentence: str, hint: str | None = None) -> int:
     if hint:
         terminal.print_message(f"Hint: {hint}")
     return 1
+
+
+# --- What the command line does with an exception that is no mistake of the user: a defect report.
+
+PACKAGES = ("loopcal", "numpy", "scipy", "ruamel.yaml", "pydantic", "click")
+"""Packages whose versions a report states."""
+
+PREFIX, SUFFIX = "loopcal-defect-", ".txt"
+"""Beginning and end of the name of a report; the rest is drawn by the operating system."""
+
+DEFECT_CODE = 3
+"""Exit code of a command that ended by a defect of loopcal."""
+
+
+def describe_defect(error: BaseException, words: Sequence[str]) -> str:
+    """Save a report of an unexpected exception, and return the sentence for the screen.
+
+    Parameters
+    ----------
+    error : the exception. words : of the command line after `loopcal`.
+    """
+    sentence = f"this is a defect of loopcal, not of your input ({_name_place(error)})"
+    path = save_report(format_report(error, words))
+    if path is None:
+        return (
+            f"{sentence}; no report could be saved: send the developers this message, the command "
+            f"and the version {_find_version('loopcal')}"
+        )
+    return (
+        f"{sentence}; please read {path}, which contains the command, versions and the Python "
+        "traceback, and send it to the developers together with the input files"
+    )
+
+
+def format_report(error: BaseException, words: Sequence[str]) -> str:
+    """Return the text of a report: command, versions and traceback."""
+    versions = [f"{name} {_find_version(name)}" for name in PACKAGES]
+    trace = "".join(traceback.format_exception(error, limit=-100))
+    machine = platform.uname()
+    lines = (
+        "loopcal stopped because of a defect. This report and the input files make it repeatable.",
+        f"command: {shlex.join(['loopcal', *words])}",
+        f"versions: {', '.join(versions)}, Python {platform.python_version()}",
+        f"system: {machine.system} {machine.release} {machine.machine}",
+        "",
+        trace,
+    )
+    return "\n".join(lines)
+
+
+def save_report(text: str) -> Path | None:
+    """Write a report to a new file in the temporary folder, or where that fails in the current one.
+
+    The name is unpredictable, and the file is made exclusively: nothing is replaced and no symbolic
+    link is followed. None where no file can be written.
+    """
+    for folder in (None, "."):
+        try:
+            number, name = tempfile.mkstemp(SUFFIX, PREFIX, folder)
+        except OSError:
+            continue
+        path = Path(name)
+        try:
+            with os.fdopen(number, "w", encoding="utf-8", errors="backslashreplace") as stream:
+                stream.write(text)
+        except OSError:
+            path.unlink(missing_ok=True)
+            continue
+        return path
+    return None
+
+
+def _name_place(error: BaseException) -> str:
+    """Return the kind of an exception and the innermost line of loopcal that it passed."""
+    package = Path(__file__).resolve().parent.parent
+    frames = traceback.extract_tb(error.__traceback__, limit=-100)
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(package)]
+    if not own:
+        return type(error).__name__
+    place = Path(own[-1].filename).relative_to(package.parent).as_posix()
+    return f"{type(error).__name__} at {place}:{own[-1].lineno}"
+
+
+def _find_version(package: str) -> str:
+    """Return the version of a package; `unknown` where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

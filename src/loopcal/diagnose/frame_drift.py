@@ -22,10 +22,10 @@ import numpy as np
 
 from loopcal import engine, geometry, measure
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.measure import Measurements, Observations
-from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.numerics.decomposition import decompose, empty_factor
-from loopcal.numerics.multiple_tests import compute_any_probability
+from loopcal.numerics.statistics import compute_any_probability, compute_chi_square_tail
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import find_unit
 
@@ -277,7 +277,7 @@ def _order_rows(rows: Observations) -> IntArray:
 
 def _spans_plane(points: FloatArray) -> bool:
     """Return whether at least three of points (k, 3) are measured and not collinear."""
-    from loopcal.geometry.alignment import FLATNESS
+    from loopcal.geometry import FLATNESS
 
     measured = points[np.isfinite(points).all(axis=1)]
     if len(measured) < 3:
@@ -288,7 +288,7 @@ def _spans_plane(points: FloatArray) -> bool:
 
 def _align_each(repeats: _Repeats) -> _Repeats:
     """Return the measurements, each moved to the first one with which it shares enough targets."""
-    from loopcal.geometry.alignment import align_point_sets
+    from loopcal.geometry import align_point_sets
 
     points, whitener = repeats.points.copy(), repeats.whitener.copy()
     for i in range(1, len(points)):

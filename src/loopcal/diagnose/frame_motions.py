@@ -16,20 +16,16 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.null_space import Combination
-from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.information import ObservedPoses, observe_poses
-from loopcal.estimate.poses.states import spread_states
+from loopcal.estimate.null_space import Combination
+from loopcal.estimate.pose_linearization import spread_states
+from loopcal.estimate.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    compute_readings,
-    differentiate_pose,
-    find_directly_reachable,
-    forward_trials,
-)
+from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable, forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.states import Status
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -211,7 +207,7 @@ def _probe_redundant(robot: Mechanism) -> FloatArray:
     Drawn readings would contradict each other, and those of home do so where the values are not
     those that home was computed with.
     """
-    from loopcal.mechanism import solve_at_pose
+    from loopcal.mechanism.actuation import solve_at_pose
 
     scale = np.array([SPREAD_ANGLE] * 3 + [SPREAD_LENGTH * robot.size] * 3)
     twists = np.zeros((1, PROBES, 6))

@@ -23,12 +23,19 @@ from loopcal.diagnose.cross_validation import cross_validate, score_leave_one_ou
 from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD
-from loopcal.estimate.methods.regularization_rules import GCV, MarginalLikelihood, TruncationGCV
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.mechanism import Mechanism
+from loopcal.estimate.penalties import (
+    GCV,
+    MarginalLikelihood,
+    Method,
+    Ridge,
+    TruncatedSVD,
+    TruncationGCV,
+)
+from loopcal.estimate.problem import problem_of
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import FloatArray, Progress, report_no_progress
@@ -114,7 +121,7 @@ class RegularizationCurves(TableResult):
 
     def plot(self) -> Figure:
         """Draw the held-out error against lam and against k, with what rules choose."""
-        return draw("draw_regularization", self)
+        return draw("fit_figures.draw_regularization", self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes for JSON."""

@@ -21,23 +21,20 @@ from loopcal.diagnose.identifiable_parameters import (
 )
 from loopcal.errors import DataError, MechanismError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.null_space import Combination, sparsify_basis
 from loopcal.estimate.information import ObservedPoses, instrument_factor, observe_poses
+from loopcal.estimate.null_space import Combination, sparsify_basis
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import list_names
-from loopcal.measure import (
-    KINDS,
-    Closure,
-    Component,
-    Gaussian,
-    JointSensor,
-    Kind,
-    Measurements,
-    Observations,
-    Sensor,
-)
 from loopcal.measure.array_checks import check_type
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.measure.instrument import Gaussian, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.joints import Closure, JointSensor
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.presentation import HtmlResult
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension

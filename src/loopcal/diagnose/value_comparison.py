@@ -26,21 +26,74 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.diagnose.second_order import draw_readings, measure_second_order
-from loopcal.errors import EstimationError, suggest_names
-from loopcal.estimate.inference.null_space import Combination
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE
+from loopcal.errors import EstimationError, MechanismError, suggest_names
+from loopcal.estimate.null_space import Combination
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.geometry import log_so3
-from loopcal.geometry.alignment import align_point_sets
-from loopcal.mechanism import Mechanism, Status, forward_trials
-from loopcal.numerics.chi_square import compute_chi_square_tail, compute_f_tail
+from loopcal.geometry import align_point_sets, log_so3
+from loopcal.measure.instrument import make_random_stream
+from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.numerics.statistics import compute_chi_square_tail, compute_f_tail
 from loopcal.presentation import TableResult
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
+
+# --- Measure by how much second-order effects of a change of parameters exceed the noise.
+
+POSES, NEAR = 20, 0.05
+"""Poses at which machines are compared; without a stated workspace their distance from home: a
+share of the robot's size, or radians.
+"""
+STEP = 1e-3
+"""Step of the differences that make G [standard deviations]."""
+SMALLEST = 1e-8
+"""Singular values of G below this share of the largest count as zero."""
+DRAWN_POSES = 5  # purpose of a random stream
+
+
+def draw_readings(robot: Mechanism) -> FloatArray:
+    """Return readings (1, POSES, a) [SI] of poses in the workspace, or else near home."""
+    try:
+        target = sample_workspace(robot, POSES, 0).coordinates
+    except MechanismError:
+        home = read_coordinates(robot.home[None], robot.controlled)[0]
+        drawn = make_random_stream(0, 0, DRAWN_POSES).uniform(-1.0, 1.0, (POSES, len(home)))
+        is_length = np.isin(robot.controlled, POSITION)
+        target = home + drawn * np.where(is_length, NEAR * robot.size, NEAR)
+    known = robot.values[None]
+    return compute_readings(robot, known, inverse_trials(robot, known, target[None]))
+
+
+def measure_second_order(posterior: Posterior, change: FloatArray) -> float:
+    """Return the chi-square of the second-order effect of a change (p,) [SI] of the parameters."""
+    robot, places = posterior.robot, posterior.places
+    is_known = posterior.determined & np.isfinite(posterior.variance)
+    sd = np.sqrt(posterior.variance[is_known])
+    steps = STEP * posterior.unit[:, None] * posterior.directions[:, is_known] * sd  # (p, k)
+    changes = np.vstack([np.zeros_like(change), change, -change, *steps.T, *-steps.T])
+    values = np.repeat(robot.values[None], len(changes), axis=0)
+    values[:, places] += changes
+    T = forward_trials(robot, values, draw_readings(robot)).T
+    T = T[:, np.isfinite(T).all(axis=(0, 2, 3))]
+    if not T.shape[1]:
+        return np.inf
+    turned = np.matmul(T[:, :, :3, :3], T[0, :, :3, :3].swapaxes(-1, -2))
+    twists = np.concatenate(
+        [log_so3(turned) * robot.size, T[..., :3, 3] - T[0, :, :3, 3]], axis=-1
+    ).reshape(len(changes), -1)
+    k = len(sd)
+    G = (twists[3 : 3 + k] - twists[3 + k :]).T / (2.0 * STEP)
+    w = np.linalg.lstsq(G, 0.5 * (twists[1] + twists[2]), rcond=SMALLEST)[0]
+    return float(w @ w)
+
 
 TINY = 1e-99
 """Probability below which a sentence states no number."""

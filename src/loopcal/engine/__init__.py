@@ -28,6 +28,7 @@ from loopcal.engine.program import Task as Task
 from loopcal.engine.program import TwistRows as TwistRows
 from loopcal.engine.selection import Engine as Engine
 from loopcal.engine.selection import certify as certify
+from loopcal.engine.selection import collect_versions as collect_versions
 from loopcal.engine.selection import compare_poses as compare_poses
 from loopcal.engine.selection import differentiate as differentiate
 from loopcal.engine.selection import fold as fold
@@ -38,4 +39,3 @@ from loopcal.engine.selection import reach as reach
 from loopcal.engine.selection import select_engine as select_engine
 from loopcal.engine.selection import solve as solve
 from loopcal.engine.selection import solve_triangles as solve_triangles
-from loopcal.engine.versions import collect_versions as collect_versions

@@ -19,7 +19,6 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.engine.memory import keep_freed_memory
 from loopcal.engine.program import (
     ClosureBlocks,
     ParameterMap,
@@ -33,6 +32,26 @@ from loopcal.engine.program import (
 from loopcal.errors import MissingPackageError
 from loopcal.findings import report_finding
 from loopcal.typing import BoolArray, FloatArray
+
+# --- Keep freed memory in the process, where the next temporary array finds it.
+
+LARGE = 3_900_000
+"""Length of an array of float64 that takes 31 MB, just below the 32 MB up to which glibc adapts its
+limits.
+"""
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep up to 64 MB of freed memory.
+
+    glibc returns memory that is freed at the end of its heap to the system if it is more than twice
+    the largest array freed so far. The next arrays then cost a page fault for every 4 kB, up to
+    half of the time of an engine whose temporary arrays are that large. One large array, which
+    is never touched, raises the limit for the rest of the process; it takes microseconds. Other C
+    libraries ignore it.
+    """
+    np.empty(LARGE)
+
 
 VARIABLE, GROUP = "LOOPCAL_ENGINE", "loopcal.engines"
 """The environment variable that names an engine, and the entry points that provide engines."""
@@ -98,8 +117,7 @@ def _make_numpy_engine() -> Engine:
     from loopcal.engine.numpy_engine.closure import linearize
     from loopcal.engine.numpy_engine.householder import fold
     from loopcal.engine.numpy_engine.newton import solve
-    from loopcal.engine.numpy_engine.pose_rows import fold_poses
-    from loopcal.engine.numpy_engine.sensitivity import differentiate
+    from loopcal.engine.numpy_engine.sensitivity import differentiate, fold_poses
     from loopcal.engine.numpy_engine.targets import reach
 
     functions = solve, certify, reach, linearize, fold, differentiate, fold_poses
@@ -263,7 +281,7 @@ def solve_triangles(
     -------
     x : (t, p). growth : (t,) largest entry of M^-1 (1 .. 1)', so that |R^-1|_2 <= sqrt(p) growth.
         A zero on the diagonal gives infinities or NaN. None where the engine leaves this to
-        `loopcal.numerics.triangular_systems`.
+        `loopcal.numerics.decomposition`.
     """
     solve = get_current_engine().solve_triangles
     return None if solve is None else solve(triangle, right)
@@ -281,3 +299,20 @@ def compare_poses(T: FloatArray, reference: FloatArray) -> tuple[FloatArray, Flo
     """
     compare = get_current_engine().compare_poses
     return None if compare is None else compare(T, reference)
+
+
+# --- Versions of what determines the last digits of a result.
+
+
+def collect_versions() -> dict[str, str]:
+    """Return the versions of loopcal, numpy, scipy and Python, and the engine of this process."""
+    import platform
+
+    import numpy
+    import scipy
+
+    import loopcal
+
+    # in place of importlib.metadata, whose import takes a third of the time of that of numpy
+    versions = {package.__name__: package.__version__ for package in (loopcal, numpy, scipy)}
+    return versions | {"python": platform.python_version(), "engine": str(get_current_engine())}

@@ -9,14 +9,15 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError, suggest_names
-from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.penalties import Method
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
-from loopcal.measure import Measurements, check_actuators
 from loopcal.measure.array_checks import check_type
-from loopcal.measure.reading_sigma import weight_reading_sigma
-from loopcal.mechanism import Mechanism
+from loopcal.measure.data_checks import check_actuators
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import weight_reading_sigma
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 
 HUGE = 1e150

@@ -16,28 +16,26 @@ from typing import cast
 import numpy as np
 
 from loopcal import engine, geometry
-from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.measured_frames import (
-    InstrumentFrame,
-    MeasuredFrames,
-    intersect_motions,
-)
-from loopcal.estimate.inference.prior import Prior
-from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.nuisance.elimination import (
+from loopcal.estimate.elimination import (
     EliminatedNuisance,
     divide_among_nodes,
     fold_node_rows,
     list_members,
 )
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.observation_rows import ObservationRows
-from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_rows
+from loopcal.estimate.pose_linearization import LinearizedPoses, linearize_rows
+from loopcal.estimate.posterior import InstrumentFrame, MeasuredFrames, intersect_motions
+from loopcal.estimate.prior import Prior
 from loopcal.estimate.problem import Problem
-from loopcal.measure import Evaluation, Measurements, NuisanceParameters
 from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import Evaluation
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.decomposition import empty_factor
-from loopcal.numerics.sorted_values import find_distinct
-from loopcal.numerics.tree_elimination import NodeFactors
+from loopcal.numerics.elimination import NodeFactors
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
 
 MOTIONS = 12

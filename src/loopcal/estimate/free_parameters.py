@@ -13,9 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
-from loopcal.estimate.poses.smooth_errors import SmoothErrors
+from loopcal.estimate.smooth_errors import SmoothErrors
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism import Mechanism, ParameterUnits, refuse_free_breaking_parameters
+from loopcal.mechanism.model import Mechanism, ParameterUnits
+from loopcal.mechanism.over_constraint import refuse_free_breaking_parameters
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension

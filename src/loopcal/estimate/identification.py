@@ -5,18 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from loopcal.errors import EstimationError
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.descent import Descent
 from loopcal.estimate.fit_descent import descend_to_prior, get_method
-from loopcal.estimate.fit_findings import (
-    report_divergence,
-    report_equations,
-    report_unknown_bias,
-    report_used_poses,
-)
 from loopcal.estimate.fit_input import (
     check_count,
     check_rows,
@@ -27,49 +22,176 @@ from loopcal.estimate.fit_input import (
 )
 from loopcal.estimate.frame_freedoms import FrameRows, describe_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.inference.assumed_noise import choose_noise, name_noise, report_noise
-from loopcal.estimate.inference.null_space import describe_null_space
-from loopcal.estimate.inference.posterior import (
-    VarianceSources,
-    add_data,
-    compute_posterior,
-    find_variance_sources,
-)
-from loopcal.estimate.inference.prior import (
-    collect_used_rows,
-    refuse_reused_rows,
-    report_unknown_rows,
-)
-from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.methods.losses import Loss
-from loopcal.estimate.methods.penalties import LeastSquares, Method, adapt_method
-from loopcal.estimate.methods.regularization import describe_regularization
-from loopcal.estimate.minimization.descent import Descent
-from loopcal.estimate.nuisance.baseline import fit_setup_before
-from loopcal.estimate.nuisance.estimate import (
+from loopcal.estimate.losses import Loss
+from loopcal.estimate.nuisance_estimate import (
     NuisanceEstimate,
     add_followers,
     empty_nuisance_estimate,
     estimate_nuisance,
 )
+from loopcal.estimate.null_space import describe_null_space
 from loopcal.estimate.observation_rows import Residuals, linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.poses.open_poses import find_open_poses
-from loopcal.estimate.poses.states import PoseEstimates
+from loopcal.estimate.penalties import LeastSquares, Method, adapt_method, describe_regularization
+from loopcal.estimate.pose_estimate import find_open_poses, predict_from_readings
+from loopcal.estimate.pose_linearization import PoseEstimates
+from loopcal.estimate.posterior import (
+    VarianceSources,
+    add_data,
+    compute_posterior,
+    find_variance_sources,
+)
+from loopcal.estimate.prior import collect_used_rows, refuse_reused_rows, report_unknown_rows
 from loopcal.estimate.prior_inflation import add_factor_uncertainty, run_prior_tests
-from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.estimate.residuals import label_residuals
-from loopcal.estimate.result import History, Identification, Spectrum
+from loopcal.estimate.problem import Problem, problem_of
+from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest, run_residual_test
+from loopcal.estimate.result import (
+    History,
+    Identification,
+    Spectrum,
+    label_residuals,
+    report_divergence,
+    report_equations,
+    report_unknown_bias,
+    report_used_poses,
+)
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Measurements, fill_in_reading_sigma
-from loopcal.mechanism import Mechanism, find_impossible_values
+from loopcal.measure.kinds.kind import list_error_groups
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.compilation import find_impossible_values
+from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
+from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 if TYPE_CHECKING:
-    from loopcal.estimate.poses.estimate import EstimatedPoses
+    from loopcal.estimate.pose_estimate import EstimatedPoses
+
+
+# --- Frames, targets, surfaces and offsets that fit measurements best at a given geometry.
+
+
+def fit_setup_before(
+    problem: Problem,
+    robot: Mechanism,
+    options: FitOptions,
+    data: Measurements,
+    weights: FloatArray,
+    fit: Descent,
+) -> FloatArray | None:
+    """Return the nuisance parameters (U,) that fit the robot from which a fit starts.
+
+    Parameters
+    ----------
+    weights : (n,) of the poses in the fit.
+
+    Returns
+    -------
+    None without nuisance parameters, or where the fit began with these values: at this robot, with
+    these weights, and with all poses.
+    """
+    is_first = (
+        options.start is None and options.loss is None and np.isfinite(fit.cost_history[0, 0])
+    )
+    if problem.nuisance is None or is_first:
+        return None
+    return fit_setup_alone(robot, data.with_weights(weights), problem.nuisance.local)
+
+
+def fit_setup_alone(
+    robot: Mechanism, data: Measurements, nuisance: NuisanceParameters
+) -> FloatArray:
+    """Return nuisance parameters (U,) [SI] that fit measurements best at the robot's geometry.
+
+    Poses that the geometry does not reach do not count. NaN where the others do not determine the
+    parameters, and no value is stated.
+    """
+    table = nuisance.table
+    unknown = np.where(table.free & np.isnan(table.tolerance), np.nan, nuisance.values())
+    solution, known = predict_from_readings(robot, data)
+    reached = solution.converged & known
+    if not reached.any():
+        return unknown
+    reached_data = data.take(reached)
+    reached_setup = reached_data.nuisance_parameters
+    entries = {entry.name: entry for entry in table.entries}
+    stated = ParameterTable(tuple(entries[name] for name in reached_setup.table.names))
+    nothing = np.zeros(0)
+    fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
+    setup, z = replace(reached_setup, table=stated), nothing[None]
+    problem = problem_of(fixed, reached_data, setup)
+    try:
+        fitted = problem.solve(z, problem.start(z)).nuisance
+    except DataError:  # too few rows for a closed form
+        return unknown
+    values = {} if fitted is None else dict(zip(reached_setup.table.names, fitted[0], strict=True))
+    return np.array([values.get(name, unknown[i]) for i, name in enumerate(table.names)])
+
+
+# --- Noise that nobody stated: a program that wrote the measurements assumed it.
+
+ASSUMED = "assumed"
+
+
+def choose_noise(options: FitOptions, data: Measurements, left: int) -> FitOptions:
+    """Return options that estimate the noise where all of it is assumed.
+
+    Parameters
+    ----------
+    options : of the fit. left : equations less all unknowns of the fit.
+    """
+    is_free = options.noise == "given" and options.prior is None
+    if is_free and data.noise_source == ASSUMED and left >= FEWEST_DEGREES:
+        return replace(options, noise="estimated")
+    return options
+
+
+def name_noise(options: FitOptions, data: Measurements) -> str:
+    """Return how the noise of a fit is known: "given", "estimated" or "assumed"."""
+    is_assumed = options.noise == "given" and data.noise_source != "stated"
+    return ASSUMED if is_assumed else options.noise
+
+
+def report_noise(data: Measurements, robot: Mechanism, test: ResidualTest) -> Finding:
+    """Return the residuals against the noise, with assumed and estimated sigmas where some are."""
+    if data.noise_source == "stated" or not test.converged or test.weighted:
+        return test.finding
+    if test.noise == "estimated":
+        if not test.intervals:
+            return test.finding
+        sigmas = _list_sigmas(data, robot, test.sigma_scale)
+        return report_finding("noise.assumed-replaced", sigmas=sigmas, dof=test.dof)
+    if test.degrees < 0.5 or np.isnan(test.p_value):
+        return report_finding("noise.assumed-untested", sigmas=_list_sigmas(data, robot, 1.0))
+    ratio = float(np.sqrt(test.chi_square / test.degrees))
+    return report_finding(
+        "noise.assumed",
+        sigmas=_list_sigmas(data, robot, ratio),
+        ratio=ratio,
+        degrees=test.degrees,
+        p_value=test.p_value,
+    )
+
+
+def _list_sigmas(data: Measurements, robot: Mechanism, scale: float) -> list[dict[str, Any]]:
+    """Return kind, quantity, assumed and estimated sigma of each quantity with assumed noise."""
+    sigmas: dict[tuple[str, str], dict[str, Any]] = {}
+    for rows in (o for o in data.observations if o.is_noise_assumed and len(o)):
+        variance = np.diagonal(rows.covariance, axis1=1, axis2=2)
+        for group in list_error_groups(rows.kind):
+            sigma = float(np.sqrt(np.median(variance[:, list(group.columns)])))
+            values = (robot.to_quantity(value, group.dimension) for value in (sigma, scale * sigma))
+            assumed, estimated = values
+            sigmas[rows.kind.name, group.quantity] = {
+                "kind": rows.kind.name,
+                "quantity": group.quantity,
+                "assumed": assumed,
+                "estimated": estimated,
+            }
+    return list(sigmas.values())
 
 
 def identify(
@@ -81,7 +203,7 @@ def identify(
     options: FitOptions | None = None,
     progress: Progress = report_no_progress,
 ) -> Identification:
-    """Identify the free parameters of a robot; see `loopcal.estimate.methods.penalties`.
+    """Identify the free parameters of a robot; see `loopcal.estimate.penalties`.
 
     Parameters
     ----------
@@ -285,7 +407,7 @@ def _report_closure(problem: Problem, options: FitOptions, fit: Descent) -> list
         return [report_finding("poses.closure-start-exhausted", steps=options.control.iterations)]
     if options.begin != "closure":
         return []
-    from loopcal.estimate.minimization.closure_start import report_unused_closure
+    from loopcal.estimate.fit_descent import report_unused_closure
 
     unused = report_unused_closure(problem)
     return [] if unused is None else [unused]
@@ -297,7 +419,7 @@ def _estimate_poses(
     """Return the poses that were estimated; None where the readings are exact."""
     if estimates is None:
         return None
-    from loopcal.estimate.poses.estimate import estimate_poses
+    from loopcal.estimate.pose_estimate import estimate_poses
 
     return estimate_poses(estimates, data, excluded)
 
@@ -308,7 +430,7 @@ def _report_poses(
     """Return findings on poses and readings that were estimated."""
     if poses is None:
         return []
-    from loopcal.estimate.poses.estimate import report_doubtful_readings, report_uneven_sigmas
+    from loopcal.estimate.pose_estimate import report_doubtful_readings, report_uneven_sigmas
 
     doubtful = report_doubtful_readings(robot, poses)
     return [*poses.report(), *doubtful, *report_uneven_sigmas(problem)]

@@ -17,12 +17,14 @@ import numpy as np
 from loopcal import engine, measure
 from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_at_readings
-from loopcal.estimate.problem_construction import problem_of
-from loopcal.measure import Measurements, NuisanceParameters, resolve_reading_sigma
-from loopcal.mechanism import Mechanism
-from loopcal.numerics.column_elimination import eliminate_from_factor
+from loopcal.estimate.pose_linearization import LinearizedPoses, linearize_at_readings
+from loopcal.estimate.problem import problem_of
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.measure.readings import resolve_reading_sigma
+from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import empty_factor
+from loopcal.numerics.elimination import eliminate_from_factor
 from loopcal.typing import BoolArray, FloatArray
 
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import engine
-from loopcal.estimate.nuisance.elimination import EliminatedNuisance
-from loopcal.estimate.poses.states import PoseEstimates, PoseStates
+from loopcal.estimate.elimination import EliminatedNuisance
+from loopcal.estimate.pose_linearization import PoseEstimates, PoseStates
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import FloatArray, IntArray
 

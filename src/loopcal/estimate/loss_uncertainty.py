@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.estimate.inference.added_covariance import add_covariance
-from loopcal.estimate.inference.covariance_parts import NOISE
-from loopcal.estimate.inference.residual_test import SIGNIFICANCE
-from loopcal.estimate.methods.losses import Loss
-from loopcal.estimate.minimization.descent import Descent
-from loopcal.estimate.minimization.robust_descent import estimate_scale_of, measure_block_distances
+from loopcal.estimate.added_covariance import add_covariance
+from loopcal.estimate.descent import Descent
+from loopcal.estimate.losses import Loss
+from loopcal.estimate.posterior import NOISE
 from loopcal.estimate.problem import Problem
+from loopcal.estimate.residual_test import SIGNIFICANCE
 from loopcal.estimate.result import Identification
+from loopcal.estimate.robust_descent import estimate_scale_of, measure_block_distances
 from loopcal.findings import report_finding
-from loopcal.numerics.chi_square import compute_chi_square_tail
+from loopcal.numerics.statistics import compute_chi_square_tail
 from loopcal.typing import FloatArray, IntArray
 
 STEP = 1e-4

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.measure import Kind, Measurements
-from loopcal.measure.kinds.rows import MeasuredColumns
-from loopcal.numerics.elimination_tree import find_connected_groups
-from loopcal.numerics.sorted_values import find_distinct
+from loopcal.measure.kinds.kind import Kind, MeasuredColumns
+from loopcal.measure.measurements import Measurements
+from loopcal.numerics.elimination import find_connected_groups
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BLOCK = 2048

@@ -11,13 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate.inference.prior import Prior
-from loopcal.estimate.inference.residual_test import SIGMA_UNCERTAINTY
-from loopcal.estimate.methods.losses import Loss
-from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.minimization.descent import StepControl
-from loopcal.measure import NuisanceParameters
+from loopcal.estimate.descent import StepControl
+from loopcal.estimate.losses import Loss
+from loopcal.estimate.penalties import Method
+from loopcal.estimate.prior import Prior
+from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
 from loopcal.measure.array_checks import check_type
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray
 
@@ -28,7 +28,7 @@ Begin = Literal["kinematics", "closure"]
 """What is linearized first: the predicted poses, or the loop closure at the measured poses."""
 
 METHOD_PARTS = ("required_equations", "unpenalized", "scale", "penalty")
-"""Attributes that make an object a method, see `loopcal.estimate.methods.penalties.Method`."""
+"""Attributes that make an object a method, see `loopcal.estimate.penalties.Method`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class FitOptions:
     noise : "given" takes the sigmas of the data as true, "estimated" up to one common factor.
     sigma_uncertainty : relative standard uncertainty of given sigmas. The residuals correct them
         within it, and intervals account for it; 0 takes them as exact.
-    prior : an earlier calibration, see `loopcal.estimate.prior_from`.
+    prior : an earlier calibration, see `loopcal.estimate.prior.prior_from`.
     start : (p of the robot,) or (t, p of the robot) [SI] values to begin with; None begins with the
         values of the robot.
     begin : "closure" first linearizes the loop closure at the measured poses, for starts far off.

@@ -23,16 +23,16 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.inference.prior import Prior, limb_parameters, prior_from, with_shown_noise
-from loopcal.estimate.methods.penalties import LeastSquares
 from loopcal.estimate.options import FitOptions, merge_options
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.prior import Prior, limb_parameters, prior_from, with_shown_noise
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
-from loopcal.measure import Measurements
-from loopcal.mechanism import Mechanism
-from loopcal.numerics.chi_square import compute_averaged_tail
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import compute_averaged_tail
 from loopcal.presentation import HtmlResult
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
@@ -44,7 +44,7 @@ CHANGE_LEVEL = 0.05
 
 TOO_WELL = 1e-3
 """Probability of a chi-square as small as that of new data which contain rows of the earlier
-calibration in a form that `loopcal.measure.FittedRows` does not recognize.
+calibration in a form that `loopcal.measure.fitted_rows.FittedRows` does not recognize.
 """
 
 EXPLAINED = 0.5

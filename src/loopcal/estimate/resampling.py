@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal.estimate.descent import LeastSquaresProblem, descend
 from loopcal.estimate.fit_linearization import FitLinearization
 from loopcal.estimate.linearization import Linearization, Start
-from loopcal.estimate.methods.penalties import decompose_for
-from loopcal.estimate.minimization.descent import LeastSquaresProblem, descend
+from loopcal.estimate.penalties import decompose_for
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
 from loopcal.numerics.gauss_newton import DescentStatus

@@ -3,31 +3,271 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.estimate.fit_findings import report_status
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.null_space import Combination
-from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
-from loopcal.estimate.methods.penalties import MAP, Method
-from loopcal.estimate.methods.prior_conflict import PriorConflict
-from loopcal.estimate.methods.regularization import Regularization
-from loopcal.estimate.nuisance.estimate import NuisanceEstimate, format_half_width
+from loopcal.estimate.losses import Loss, describe_loss
+from loopcal.estimate.nuisance_estimate import NuisanceEstimate, format_half_width
+from loopcal.estimate.null_space import Combination
 from loopcal.estimate.options import FitOptions
-from loopcal.estimate.residuals import KindResiduals, store_residuals
+from loopcal.estimate.penalties import MAP, Method, Regularization, Ridge
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.prior_conflict import PriorConflict
+from loopcal.estimate.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import Mechanism
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.presentation import FitFigures, TableResult
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    from loopcal.estimate.poses.estimate import EstimatedPoses
+    from loopcal.estimate.observation_rows import ObservationRows, Residuals
+    from loopcal.estimate.pose_estimate import EstimatedPoses
+    from loopcal.estimate.problem import Problem
+
+
+# --- Residuals of a fit with their labels, also as arrays of a run folder.
+
+
+@dataclass(frozen=True, eq=False)
+class KindResiduals:
+    """Residuals (predicted - measured) of the rows of one kind after the fit.
+
+    Attributes
+    ----------
+    kind : its name. components : names of the m residuals. poses : (r,) labels.
+    raw : (r, m) [SI]. whitened : (r, m), divided by sigma (zero where absent).
+    context : name -> (r,), time [s] and temperatures [degC] of the rows, to plot the residuals
+        against.
+    dimensions : (m,) of the components. readings : (r, a) actuator readings of the rows [SI], of
+        the first pose where a row compares several; NaN where missing.
+    """
+
+    kind: str
+    components: tuple[str, ...]
+    poses: tuple[str, ...]
+    raw: FloatArray
+    whitened: FloatArray
+    context: Mapping[str, FloatArray] = field(default_factory=dict)
+    dimensions: tuple[Dimension, ...] = ()
+    readings: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __repr__(self) -> str:
+        """Return the kind and the size of the residuals."""
+        return f"<KindResiduals of {self.kind}: {len(self.raw)} rows of {len(self.components)}>"
+
+
+OWN = ("residual", "whitened", "components", "dimensions", "rows", "readings")
+"""First words of the names of stored arrays, beside those of the context; `rows` are labels."""
+
+_NAME = re.compile(r"residual_(\d+)_(.+)", re.DOTALL)
+
+
+def store_residuals(residuals: Sequence[KindResiduals]) -> dict[str, np.ndarray]:
+    """Return residuals by name, `<what>_<i>_<kind>`; a quantity of the context keeps its name."""
+    stored: dict[str, np.ndarray] = {}
+    for i, r in enumerate(residuals):
+        dimensions = np.array([dimension.value for dimension in r.dimensions], str)
+        components, labels = np.array(r.components, str), np.array(r.poses, str)
+        named = (r.raw, r.whitened, components, dimensions, labels, r.readings)
+        arrays = {**r.context, **dict(zip(OWN, named, strict=True))}
+        stored |= {f"{name}_{i}_{r.kind}": array for name, array in arrays.items()}
+    return stored
+
+
+def residuals_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[KindResiduals, ...]:
+    """Return the residuals in the arrays of a run folder; none where an older version wrote it."""
+    matches = [match for name in arrays if (match := _NAME.fullmatch(name))]
+    result = []
+    for match in sorted(matches, key=lambda m: int(m[1])):
+        ending = f"_{match[1]}_{match[2]}"
+        own = {name: arrays.get(name + ending) for name in OWN}
+        if any(array is None for array in own.values()):
+            return ()
+        raw, whitened, components, dimensions, labels, readings = (arrays[n + ending] for n in OWN)
+        result.append(
+            KindResiduals(
+                kind=match[2],
+                components=tuple(components.tolist()),
+                poses=tuple(labels.tolist()),
+                raw=raw,
+                whitened=whitened,
+                context={
+                    name.removesuffix(ending): array
+                    for name, array in arrays.items()
+                    if name.endswith(ending) and not name.startswith((*OWN, "fitted_"))
+                },
+                dimensions=tuple(Dimension(value) for value in dimensions.tolist()),
+                readings=readings,
+            )
+        )
+    return tuple(result)
+
+
+def label_residuals(
+    residuals: tuple[Residuals, ...], data: Measurements, problem: Problem
+) -> tuple[KindResiduals, ...]:
+    """Return the residuals (t = 1) of every kind with labels; those of uncertain readings last."""
+    observations = [o for o in data.all_observations if len(o)]
+    present, context = [o.present for o in observations], [o.context for o in observations]
+    if problem.is_uncertain:
+        present.append(np.isfinite(data.readings))
+        context.append(data.context)
+    return tuple(
+        KindResiduals(
+            kind=s.kind.name,
+            components=tuple(column.name for column in s.kind.noise_columns),
+            poses=_label_rows(s, data.labels),
+            raw=np.where(measured, r.raw[0], np.nan),
+            whitened=r.whitened[0],
+            context=columns,
+            dimensions=tuple(column.dimension for column in s.kind.noise_columns),
+            readings=_take_readings(s, data.readings),
+        )
+        for s, measured, columns, r in zip(problem.rows, present, context, residuals, strict=True)
+    )
+
+
+def _take_readings(rows: ObservationRows, readings: FloatArray) -> FloatArray:
+    """Return the readings (r, a) of the first pose of each row; NaN for targets on the base."""
+    of_first = readings[rows.poses_by_link[:, 0]]
+    return np.full_like(of_first, np.nan) if rows.kind.is_of_base else of_first
+
+
+def _label_rows(rows: ObservationRows, labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a label for each row: those of the poses that it observed, or "base"."""
+    poses = rows.poses_by_link
+    if rows.kind.is_of_base:
+        return (rows.kind.of,) * len(poses)
+    if poses.shape[1] == 1:
+        return tuple(map(labels.__getitem__, poses[:, 0].tolist()))
+    return tuple("/".join(labels[i] for i in members) for members in poses.tolist())
+
+
+# --- Findings of a fit: how the iteration ended, poses with low weight, estimates beyond
+# tolerance.
+
+FAR = 10.0
+"""Deviation from nominal, in stated tolerances (standard deviations), that contradicts the
+tolerance; noise alone does not cause it.
+"""
+
+LOW_WEIGHT = 0.5
+"""Weight of a pose below which it is named."""
+
+STATUS_CODES = {
+    DescentStatus.CONVERGED: "fit.converged",
+    DescentStatus.OUT_OF_ITERATIONS: "fit.out-of-iterations",
+    DescentStatus.NO_DESCENT: "fit.no-descent",
+    DescentStatus.BAD_START: "fit.bad-start",
+    DescentStatus.NO_PROGRESS: "fit.no-progress",
+}
+
+
+def report_status(status: DescentStatus, iterations: int) -> Finding:
+    """Return how the iteration ended."""
+    code = STATUS_CODES[status]
+    if status is DescentStatus.BAD_START:
+        return report_finding("fit.bad-start")
+    return report_finding(code, iterations=iterations)
+
+
+def report_divergence(
+    free: FreeParameters, deviation: FloatArray, method: Method, converged: bool
+) -> list[Finding]:
+    """Return findings on estimates far beyond their stated tolerances.
+
+    Nothing is reported where the tolerances are a prior: then `PriorConflict` tests them.
+
+    Parameters
+    ----------
+    free : the parameters. deviation : (p,) estimate - nominal, in tolerances.
+    method : of the fit. converged : whether the iteration did.
+    """
+    if isinstance(method, MAP):
+        return []
+    far = np.flatnonzero((np.abs(deviation) > FAR) & ~free.assumed)
+    if len(far) == 0:
+        stated = not free.assumed.all()
+        return [report_finding("fit.no-prior")] if stated and not converged else []
+    order = far[np.argsort(-np.abs(deviation[far]), kind="stable")]
+    return [
+        report_finding(
+            "fit.beyond-tolerance",
+            names=tuple(free.names[i] for i in order),
+            factor=abs(float(deviation[order[0]])),
+        )
+    ]
+
+
+def report_weights(data: Measurements, weights: FloatArray, loss: Loss | None) -> list[Finding]:
+    """Return which poses a loss gave less than half of their weight.
+
+    Parameters
+    ----------
+    weights : (n,) of the poses. loss : None reports nothing.
+    """
+    if loss is None:
+        return []
+    low = tuple(data.labels[i] for i in np.flatnonzero(weights < LOW_WEIGHT))
+    name, total = describe_loss(loss), data.n_poses
+    if not low:
+        return [report_finding("fit.full-weights", loss=name, total=total)]
+    return [report_finding("fit.low-weights", loss=name, count=len(low), total=total, poses=low)]
+
+
+def report_used_poses(
+    data: Measurements, weights: FloatArray, loss: Loss | None, excluded: tuple[str, ...]
+) -> list[Finding]:
+    """Return which poses the loss gives little weight, and which ones the options exclude."""
+    findings = report_weights(data, weights, loss)
+    return (
+        [*findings, report_finding("fit.excluded-poses", poses=excluded)] if excluded else findings
+    )
+
+
+def report_equations(equations: int, parameters: int, method: Method) -> list[Finding]:
+    """Return how many directions are known from tolerances alone."""
+    if equations >= parameters or not isinstance(method, MAP):
+        return []
+    return [
+        report_finding(
+            "fit.few-equations",
+            equations=equations,
+            parameters=parameters,
+            directions=parameters - equations,
+        )
+    ]
+
+
+def report_unknown_bias(
+    free: FreeParameters, method: Method, prior: FloatArray | None
+) -> list[Finding]:
+    """Return why a ridge has no intervals, where its bias is not known.
+
+    Parameters
+    ----------
+    prior : (1, p) variance of the true coordinates, see `Method.prior_variance`.
+    """
+    if not isinstance(method, Ridge) or prior is None or not np.isnan(prior).any():
+        return []
+    lacking = method.lacks_tolerances(free)
+    return [
+        report_finding(
+            "fit.ridge-without-intervals",
+            names=tuple(n for n, lacks in zip(free.names, lacking, strict=True) if lacks),
+            is_correlated=free.correlation is not None,
+        )
+    ]
+
 
 LAST_DIGITS = 3
 """Digits of the values at which an iteration ended that did not converge."""

@@ -9,33 +9,194 @@ each other: threads compute them in any order, with the same numbers to the last
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.descent import Descent, LinearModel, descend
+from loopcal.estimate.exact_poses import ExactPoses
 from loopcal.estimate.fit_descent import descend_once, get_method, repeat_trials
+from loopcal.estimate.frame_freedoms import find_measured_frames
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.identified_trials import IdentifiedTrials
-from loopcal.estimate.methods.penalties import Method, adapt_method
-from loopcal.estimate.minimization.chord_start import (
-    ACCEPTED_STEP,
-    SharedFactor,
-    share_factor,
-    take_chords,
-)
-from loopcal.estimate.minimization.descent import Descent, descend
-from loopcal.estimate.minimization.linear_model import LinearModel
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import problem_of_trials
-from loopcal.measure import Trials
+from loopcal.estimate.penalties import MAP, Method, adapt_method, fix_penalty
+from loopcal.estimate.pose_linearization import PoseSolution, linearize_rows
+from loopcal.estimate.posterior import Posterior, VarianceSources, compute_posterior
+from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.measure.array_checks import check_type
-from loopcal.mechanism import Mechanism
+from loopcal.measure.simulation import Trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.decomposition import Decomposition, solve_regular
 from loopcal.numerics.gauss_newton import DescentStatus
-from loopcal.typing import FloatArray, IntArray
+from loopcal.presentation import TableResult
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# --- The result of identifying many machines at once.
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedTrials(TableResult):
+    """t machines identified at once; arrays are (t, ...), SI.
+
+    Attributes
+    ----------
+    values : (t, p of the robot). status : (t,) DescentStatus. iterations : (t,).
+    cost : (t,) whitened sum of squares. free_parameters : names, nominal values and tolerances.
+    linear_models : of the last rows of consecutive trials. method : with what `adapt_method`
+        entered.
+    """
+
+    values: FloatArray
+    status: IntArray
+    iterations: IntArray
+    cost: FloatArray
+    free_parameters: FreeParameters
+    linear_models: tuple[LinearModel, ...]
+    method: Method
+
+    def __repr__(self) -> str:
+        """Return the number of trials and how many converged."""
+        return (
+            f"<IdentifiedTrials of {self.free_parameters.robot.name}: {len(self.values)} trials of "
+            f"{len(self.free_parameters)} parameters, {int(self.converged.sum())} converged>"
+        )
+
+    @cached_property
+    def decomposition(self) -> Decomposition:
+        """The decompositions of the rows: variances and leverages are read from them."""
+        decompositions = [model.decomposition for model in self.linear_models]
+        if any(part.dual is not None for part in decompositions):
+            decompositions = [part.with_dual() for part in decompositions]
+        return Decomposition.join(decompositions)
+
+    @cached_property
+    def penalty(self) -> FloatArray:
+        """(t, p free) of the directions of the decompositions."""
+        return np.concatenate([model.penalty for model in self.linear_models])
+
+    @cached_property
+    def prior_variance(self) -> FloatArray | None:
+        """(t, p free) see `Method.prior_variance`."""
+        return self.method.prior_variance(self.decomposition, self.penalty, self.free_parameters)
+
+    @property
+    def converged(self) -> BoolArray:
+        """(t,) which trials converged."""
+        return self.status == DescentStatus.CONVERGED
+
+    def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
+        """Return standard deviations (t, p free) [SI]; infinite where the data do not determine a
+        parameter. They do not contain the uncertainty of factors on the tolerances.
+        """
+        scaled = self.decomposition.standard_deviations(
+            self.penalty, noise_variance, self.prior_variance
+        )
+        return scaled * self.free_parameters.tolerance
+
+
+# --- A start for many trials: one step of each with a factor that all of them share.
+
+ACCEPTED_STEP = 1e-3
+"""A trial that began with a chord has converged where all further steps together would change the
+whitened residuals by less than this: no estimate then moves by more than this share of its standard
+deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharedFactor:
+    """The factor of the rows of one trial at the start of all.
+
+    Attributes
+    ----------
+    solution : of this trial at the start. start : there, for the linearizations nearby.
+    triangle : (p, p) R. by_residuals : (p, m) R^-1 Q' of the rows. by_deviation : (p, p) R^-1 Q' P.
+    """
+
+    solution: PoseSolution
+    start: Start
+    triangle: FloatArray
+    by_residuals: FloatArray
+    by_deviation: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ChordStart:
+    """Where chords lead.
+
+    Attributes
+    ----------
+    deviation : (t, p). length : (t,) by which the chords changed the whitened residuals, to first
+        order; infinite in trials that begin where they were. start : for the linearization there.
+    """
+
+    deviation: FloatArray
+    length: FloatArray
+    start: Start
+
+
+def share_factor(
+    problem: Problem, deviation: FloatArray, method: Method, tolerance: float
+) -> SharedFactor | None:
+    """Return the factor of the first trial at deviation (1, p).
+
+    None where chords cannot be used: poses or nuisance parameters are eliminated from the rows, the
+    penalty depends on them, or a direction might not count.
+    """
+    poses, p = problem.poses, problem.parameters
+    if isinstance(method, MAP) and callable(method.inflation):
+        method = replace(method, inflation=1.0)  # which only chooses where the exact descent begins
+    fixed = fix_penalty(method, p)
+    is_plain = problem.nuisance is None and problem.consistent is None
+    if fixed is None or not is_plain or not isinstance(poses, ExactPoses):
+        return None
+    if not poses.is_single_block:
+        return None
+    first = problem.take(np.array([0]))
+    begin = first.start(deviation)
+    solution = first.poses.solve(deviation, first.trials, begin, first.control)
+    assert solution.linearized is not None
+    if solution.linearized.is_lost(poses.blocks[0].is_needed).any():
+        return None
+    kinds = [
+        linearize_rows(rows, solution.linearized, first.trials, None)
+        for rows in poses.blocks[0].rows
+    ]
+    A = np.concatenate([kind.by_parameters.reshape(-1, p) for kind in kinds])
+    q, r = np.linalg.qr(np.concatenate([A, fixed.matrix]))
+    if len(r) < p:  # fewer rows than parameters
+        return None
+    _, is_regular = solve_regular(r[None], np.zeros((1, p)), tolerance)
+    if not is_regular[0]:
+        return None
+    inverse = np.linalg.solve(r, q.T)
+    states, is_near = poses.next_start(solution, begin)
+    start = replace(begin, deviation=deviation, poses=states, is_near=is_near)
+    by_residuals = np.ascontiguousarray(inverse[:, : len(A)])
+    return SharedFactor(
+        solution, start, np.array(r), by_residuals, inverse[:, len(A) :] @ fixed.matrix
+    )
+
+
+def take_chords(problem: Problem, shared: SharedFactor, deviation: FloatArray) -> ChordStart:
+    """Return where one chord leads from deviations (t, p), which are equal in all trials."""
+    t = len(deviation)
+    kinds = problem.residuals(deviation, shared.solution)
+    residual = np.concatenate([kind.whitened.reshape(t, -1) for kind in kinds], axis=1)
+    # one product for each trial: a product of all of them would round by their number
+    step = np.matmul(shared.by_residuals, residual[:, :, None])
+    step = -(step + np.matmul(shared.by_deviation, deviation[:, :, None]))[:, :, 0]
+    length = np.linalg.norm(np.matmul(shared.triangle, step[:, :, None])[:, :, 0], axis=1)
+    good = np.isfinite(length)
+    return ChordStart(
+        np.where(good[:, None], deviation + step, deviation),
+        np.where(good, length, np.inf),
+        shared.start.take(np.zeros(t, dtype=np.int64)),
+    )
 
 
 def identify_trials(
@@ -194,3 +355,34 @@ def _cut_problem(problem: Problem, trials: IntArray) -> Problem:
     numbers, data, own = problem.trials[trials], problem.data, np.arange(len(trials))
     rows = tuple(r.cut_trials(numbers) for r in problem.rows)
     return replace(problem, rows=rows, trials=own, data=lambda i: data(int(numbers[i])))
+
+
+# --- The posterior of one of many simulated machines that were identified at once.
+
+
+def compute_trial_posterior(fits: IdentifiedTrials, trials: Trials, trial: int) -> Posterior:
+    """Return the posterior of a trial, as its own `identify` gives it for stated noise.
+
+    Parameters
+    ----------
+    fits : of `identify_trials`. trials : their measurements. trial : number of the machine.
+    """
+    free, chosen = fits.free_parameters, np.array([trial])
+    data = trials.trial(trial)
+    problem = problem_of(free, data)
+    z = free.deviation(fits.values[chosen])
+    start = problem.start(z)
+    linearization = problem.linearize(z, start)
+    frames = find_measured_frames(
+        problem, data, z, linearization.next_start, linearization=linearization
+    )
+    prior = fits.prior_variance
+    return compute_posterior(
+        free.robot.with_values(fits.values[trial]),
+        free.places,
+        free.tolerance,
+        fits.decomposition.take(chosen),
+        fits.penalty[chosen],
+        VarianceSources(1.0, None if prior is None else prior[chosen]),
+        frames,
+    )

@@ -22,7 +22,7 @@ def report_finding(code: str, severity: Severity | None = None, **data: Any) -> 
     ------
     KeyError : the code is not in the catalog, or `data` lacks one of its fields.
     """
-    from loopcal.findings.catalog import find_entry
+    from loopcal.findings.catalog import find_entry as find_entry
 
     entry = find_entry(code)
     if missing := entry.fields - data.keys():

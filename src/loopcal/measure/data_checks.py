@@ -5,7 +5,9 @@ Each check raises a `DataError` made from a finding of the catalog, unless the c
 `allow=True`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple, cast
 
@@ -14,14 +16,58 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.findings import Quantity, report_finding
-from loopcal.measure.closure_checks import check_closure
-from loopcal.measure.kinds import Kind
+from loopcal.measure.kinds import CLOSURE
+from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations, TextArray
-from loopcal.mechanism import Mechanism
-from loopcal.numerics.sorted_values import find_distinct
+from loopcal.measure.readings import resolve_reading_sigma
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
+
+# --- Checks of readings alone, the kind `closure`: they need redundant actuators of stated noise.
+
+
+def check_closure(
+    robot: Mechanism, kinds: Sequence[Kind], reading_sigma: FloatArray | None, n_poses: int
+) -> None:
+    """Refuse the kind `closure` for a robot without redundant actuators, or for exact readings.
+
+    Parameters
+    ----------
+    reading_sigma : (n, a) [SI] of the readings; None as the robot states.
+
+    Raises
+    ------
+    DataError
+        `data.closure-without-redundancy`, `data.closure-without-sigma`, or that of
+        `resolve_reading_sigma`.
+    """
+    check_redundancy(robot, kinds)
+    is_closure = any(kind.name == CLOSURE for kind in kinds)
+    if is_closure and resolve_reading_sigma(robot, reading_sigma, n_poses) is None:
+        raise DataError(report_finding("data.closure-without-sigma", robot=robot.name))
+
+
+def check_redundancy(robot: Mechanism, kinds: Iterable[Kind]) -> None:
+    """Refuse the kind `closure` for a robot that does not have more actuators than freedoms.
+
+    Raises
+    ------
+    DataError
+        `data.closure-without-redundancy`.
+    """
+    if robot.program.sigma is None and any(kind.name == CLOSURE for kind in kinds):
+        raise DataError(
+            report_finding(
+                "data.closure-without-redundancy",
+                robot=robot.name,
+                actuators=len(robot.actuators),
+                freedoms=len(robot.freedoms),
+            )
+        )
+
 
 STATIC_SIGMAS, MOVING_SIGMAS = 10.0, 100.0
 """Values of a target within the first number of standard deviations count as static; the check

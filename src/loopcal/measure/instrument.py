@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
-from loopcal.measure.kinds import Kind
-from loopcal.measure.kinds.shared_errors import measure_progress
+from loopcal.measure.kinds.kind import Kind, measure_progress
 from loopcal.measure.observations import TextArray, check_labels, check_rows
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
 

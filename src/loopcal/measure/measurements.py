@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurements: the actuator readings at n poses, and the observations made at them."""
 
-from collections.abc import Mapping
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -11,14 +13,84 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.measure.array_checks import check_array, check_seed, check_type, describe, set_fields
-from loopcal.measure.base_rows import check_bodies
+from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
-from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
-from loopcal.numerics.elimination_tree import find_connected_groups
-from loopcal.numerics.sorted_values import find_distinct
+from loopcal.measure.readings import check_reading_sigma, weight_reading_sigma
+from loopcal.numerics.elimination import find_connected_groups
+from loopcal.numerics.statistics import find_distinct
 from loopcal.presentation import TableResult
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# --- Rows of targets that are fixed to the base: monuments, by which an instrument finds its
+# frame.
+
+
+def check_bodies(of_poses: Sequence[Observations], of_base: Sequence[Observations]) -> None:
+    """Refuse rows of the base among those of poses, the reverse, and a target on two bodies.
+
+    Raises
+    ------
+    DataError
+        Also `data.target-on-two-bodies`.
+    """
+    for rows in of_poses:
+        if rows.kind.is_of_base:
+            raise DataError(
+                f"rows of kind {rows.kind.name!r} measure targets on the base; pass them as "
+                "`base_observations`, not as `observations`"
+            )
+    for rows in of_base:
+        if not rows.kind.is_of_base:
+            raise DataError(
+                f"rows of kind {rows.kind.name!r} measure poses; pass them as `observations`, or "
+                'give their kind `of="base"`'
+            )
+    check_targets([rows.kind for rows in (*of_poses, *of_base)])
+
+
+def check_targets(kinds: Sequence[Kind]) -> None:
+    """Refuse kinds that have a target on the base and on a platform.
+
+    Raises
+    ------
+    DataError
+        `data.target-on-two-bodies`.
+    """
+    for kind in (kind for kind in kinds if kind.is_of_base):
+        if shared := list_moving_targets(kind, kinds):
+            raise DataError(report_finding("data.target-on-two-bodies", targets=shared))
+
+
+def list_moving_targets(kind: Kind, others: Iterable[Kind]) -> tuple[str, ...]:
+    """Return the targets of a kind of the base that are on a platform by another kind."""
+    moving = {
+        target
+        for other in others
+        if not other.is_of_base
+        for target in getattr(other, "targets", ())
+    }
+    return tuple(target for target in kind.target_columns if target in moving)
+
+
+def anchor_rows(rows: Observations, observations: Sequence[Observations]) -> IntArray:
+    """Return a pose (r,) for each row of the base, on which its numbers do not depend.
+
+    It is the first pose of the same session that another row needs, so that nothing is solved for
+    its sake, and no session is joined with another; the first one of all where there is none.
+    """
+    first: dict[str, int] = {}
+    needed: list[int] = []
+    for other in observations:
+        counted = (other.weight > 0.0) & other.is_measured
+        poses = other.rows.reshape(len(other), other.kind.poses_per_row)[counted, 0].tolist()
+        needed += poses[:1]
+        for pose, session in zip(poses, other.session[counted].tolist(), strict=True):
+            first.setdefault(session, pose)
+    usual = needed[0] if needed else 0
+    poses = [first.get(session, usual) for session in rows.session.tolist()]
+    return np.array(poses, dtype=np.intp)
+
 
 SAME_READING = 1e-9
 """Readings [m] or [rad] that differ by less belong to repeats of one pose."""

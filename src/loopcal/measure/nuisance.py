@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
-from loopcal.measure.kinds import Kind
+from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.observations import Observations
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray

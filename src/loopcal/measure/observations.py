@@ -1,22 +1,210 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observations: measured rows of one kind, with their poses and covariances."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import date
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
+from loopcal.findings import Finding, report_finding
 from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
-from loopcal.measure.kinds import Evaluation, Kind
-from loopcal.measure.kinds.shared_errors import measure_progress
-from loopcal.measure.traceability import InstrumentRecord
-from loopcal.measure.whitening import compute_whitener
-from loopcal.numerics.sorted_values import find_distinct
+from loopcal.measure.kinds.kind import Evaluation, Kind, measure_progress
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import SD_RANGE, is_sd
+
+# --- Whiteners: matrices that give residuals unit variance, with zero rows for absent components.
+
+_SMALLEST_PIVOT = 1e-7
+"""Smallest pivot [1] of a correlation matrix. Below it a component equals a combination of
+the others to seven digits, and the inverse has fewer digits than a measurement.
+"""
+
+
+def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatArray) -> FloatArray:
+    """Return matrices W with `W C W' = weight` on the present components.
+
+    Rows and columns of absent components are zero.
+
+    W is the inverse lower Cholesky factor. Without a component, a Gaussian loses its row and column
+    of C. Here they are replaced by those of the identity, which keeps the shape and gives the same
+    factor for the other components.
+
+    The inverse is formed once, because each step of a fit multiplies residuals and Jacobians of all
+    rows by it, and numpy has no triangular solve of stacked blocks. It is accurate: blocks are
+    correlation matrices of a few components, whose pivots are bounded from below.
+
+    Parameters
+    ----------
+    covariance : (r, m, m) [SI]
+        Entries of absent components are ignored.
+    present : (r, m) bool
+    weight : (r,)
+        Factor of the squared residuals, not negative; 0 excludes a row.
+
+    Returns
+    -------
+    W : (r, m, m)
+
+    Raises
+    ------
+    DataError
+        If a covariance is not symmetric or not positive definite; rows are counted from 1.
+    """
+    both = present[:, :, None] & present[:, None, :]
+    diagonal = np.eye(present.shape[1], dtype=bool)
+    C = np.where(both, covariance, 0.0) + (diagonal & ~both)
+    variance = np.einsum("rii->ri", C)
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    _refuse(
+        ~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(is_sd(sd), axis=1),
+        f"has a variance that is not above 0 (standard deviations {SD_RANGE})",
+    )
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        correlation = C / (sd[:, :, None] * sd[:, None, :])
+    _refuse(~np.all(np.isfinite(correlation), axis=(1, 2)), "is not positive definite")
+    asymmetric = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > 1e-9
+    _refuse(np.any(asymmetric, axis=(1, 2)), "is not symmetric")
+    W = _invert_factor(correlation) / sd[:, None, :]
+    return np.where(both, W, 0.0) * np.sqrt(weight)[:, None, None]
+
+
+def _invert_factor(correlation: FloatArray) -> FloatArray:
+    """Return the inverse lower Cholesky factors (r, m, m) of correlation matrices."""
+    diagonal = np.eye(correlation.shape[1], dtype=bool)
+    if not np.any(correlation[:, ~diagonal]):  # most files: nothing to factor
+        root = np.sqrt(np.where(diagonal, correlation, 1.0))
+        return np.where(diagonal, 1.0 / root, 0.0)
+    try:
+        L = np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(correlation)[:, 0]
+        _refuse(smallest <= max(float(np.min(smallest)), 0.0), "is not positive definite")
+        raise
+    _refuse(
+        np.min(np.einsum("rii->ri", L), axis=1) < _SMALLEST_PIVOT,
+        "is not positive definite to rounding",
+    )
+    return np.asarray(np.tril(np.linalg.inv(L)), dtype=np.float64)
+
+
+def _refuse(wrong: BoolArray, what: str) -> None:
+    if np.any(wrong):
+        row = int(np.flatnonzero(wrong)[0]) + 1
+        raise DataError(
+            f"the covariance of row {row} {what}; give each component a standard deviation above 0 "
+            "and correlations between -1 and 1 that are consistent"
+        )
+
+
+# --- Which instrument measured, and how its values are traceable: certificate, laboratory, dates.
+
+DATES = ("calibrated", "due", "measured")
+"""Fields that hold a date."""
+
+
+@dataclass(frozen=True)
+class InstrumentRecord:
+    """An instrument and its calibration; a text that is empty is not stated.
+
+    Parameters
+    ----------
+    name : what people call it. manufacturer, model, serial_number : which one it is.
+    certificate : number of its calibration certificate. laboratory : that issued it.
+    standard : reference standard or procedure of that calibration, such as "ISO 10360-10".
+    calibrated, due : dates of its calibration and of the next one, as 2026-05-31.
+    measured : date of these measurements.
+
+    Raises
+    ------
+    DataError : not a date, or the due date lies before the calibration.
+    """
+
+    name: str = ""
+    manufacturer: str = ""
+    model: str = ""
+    serial_number: str = ""
+    certificate: str = ""
+    laboratory: str = ""
+    standard: str = ""
+    calibrated: str = ""
+    due: str = ""
+    measured: str = ""
+
+    def __post_init__(self) -> None:
+        for key in DATES:
+            _parse_date(key, getattr(self, key))
+        if self.due and self.calibrated and self.due < self.calibrated:
+            raise DataError(
+                f"due is {self.due}, which is before calibrated, {self.calibrated}; correct one"
+            )
+
+    def __str__(self) -> str:
+        """Return the instrument as a sentence names it."""
+        name = self.name or " ".join(x for x in (self.manufacturer, self.model) if x)
+        number = f"serial number {self.serial_number}" if self.serial_number else ""
+        return ", ".join(part for part in (name, number) if part) or "without a name"
+
+    @property
+    def is_traceable(self) -> bool:
+        """Whether a certificate and the date of calibration are stated."""
+        return bool(self.certificate and self.calibrated)
+
+    def to_dict(self) -> dict[str, str]:
+        """Return the stated facts by name."""
+        return {name: value for name, value in asdict(self).items() if value}
+
+
+def list_instruments(observations: Sequence[Observations]) -> tuple[InstrumentRecord, ...]:
+    """Return the stated instruments of rows, each once."""
+    stated = (rows.instrument for rows in observations)
+    return tuple(dict.fromkeys(record for record in stated if record is not None))
+
+
+def check_instruments(observations: Sequence[Observations]) -> list[Finding]:
+    """Return the instruments that were not validly calibrated when they measured.
+
+    Dates are compared with each other, not with the clock: without the date of the measurements
+    nothing can be said.
+    """
+    findings = []
+    for record in list_instruments(observations):
+        dates = {name: getattr(record, name) for name in DATES}
+        if not record.measured:
+            if record.due:
+                findings.append(
+                    report_finding(
+                        "data.instrument-not-dated", instrument=str(record), due=record.due
+                    )
+                )
+        elif record.due and record.measured > record.due:
+            findings.append(
+                report_finding("data.instrument-past-due", instrument=str(record), **dates)
+            )
+        elif record.calibrated and record.measured < record.calibrated:
+            findings.append(
+                report_finding("data.instrument-calibrated-later", instrument=str(record), **dates)
+            )
+    return findings
+
+
+def _parse_date(key: str, text: str) -> None:
+    """Refuse a text that is no date of the form 2026-05-31."""
+    if not text:
+        return
+    try:
+        is_date = date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        is_date = False
+    if not is_date:
+        raise DataError(f"{key} is {text!r}; write a date as 2026-05-31")
+
 
 TextArray = NDArray[np.str_]
 """Names of sessions or groups."""

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +13,15 @@ from numpy.typing import ArrayLike
 from loopcal import mechanism
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
-from loopcal.measure.kinds import Kind
-from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.typing import FloatArray
+from loopcal.measure.kinds.kind import Kind
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import SMALLEST_SD, Dimension
 
 if TYPE_CHECKING:
-    from loopcal.measure.kinds import ActuatorReadings
+    from loopcal.measure.kinds.joints import ActuatorReadings
+    from loopcal.measure.measurements import Measurements
 
 # --- commanded poses
 
@@ -138,6 +142,143 @@ def make_readings_kind(robot: Mechanism) -> ActuatorReadings:
 
     An uncertain reading is a measurement of the true one, by this kind.
     """
-    from loopcal.measure.kinds import ActuatorReadings
+    from loopcal.measure.kinds.joints import ActuatorReadings
 
     return ActuatorReadings({actuator.name: actuator.dimension for actuator in robot.actuators})
+
+
+# --- Standard deviations (n, a) [SI] of actuator readings: 0 is exact, infinity is missing.
+
+LARGEST_SIGMA = 1e6
+"""Largest finite sigma of a reading, in sizes of the robot or radians."""
+
+NOT_A_SIGMA = (
+    "is not a standard deviation; give 0 (exact), a positive number from "
+    f"{SMALLEST_SD:g} on, or infinity (missing)"
+)
+
+
+def weight_reading_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray | None:
+    """Return standard deviations (n, a) of readings whose squares count by a weight (n,).
+
+    A weight of 0 makes them infinite; exact readings stay exact.
+    """
+    if sigma is None:
+        return None
+    root = np.sqrt(weight)[:, None]
+    weighted = np.divide(sigma, root, out=np.full(sigma.shape, np.inf), where=root > 0.0)
+    return np.where(sigma == 0.0, 0.0, weighted)
+
+
+def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
+    """Return standard deviations (n, a) of readings (n, a) from what broadcasts to them; DataError
+    where it does not fit.
+    """
+    try:
+        if np.iscomplexobj(sigma):
+            raise TypeError
+        given = np.asarray(sigma, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(
+            f"reading_sigma is {sigma!r}; give numbers, in meters and radians"
+        ) from None
+    try:
+        return np.array(np.broadcast_to(given, readings.shape))
+    except ValueError:
+        raise DataError(
+            f"reading_sigma has shape {given.shape}; give one number, or one for each of the "
+            f"{readings.shape[1]} actuators, or one for each of the {readings.shape[0]} x "
+            f"{readings.shape[1]} readings"
+        ) from None
+
+
+def check_reading_sigma(
+    sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]
+) -> FloatArray:
+    """Return checked, read-only standard deviations of readings (n, a).
+
+    Raises
+    ------
+    DataError
+        If one is negative or not a number, or a reading is missing although its sigma is finite.
+    """
+    checked = broadcast_reading_sigma(sigma, readings)
+
+    def name(pose: int, column: int) -> str:
+        value = f"{checked[pose, column]:.6g}"
+        return f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1}"
+
+    _refuse(~((checked == 0.0) | (checked >= SMALLEST_SD)), name, NOT_A_SIGMA)
+    is_missing = np.isnan(readings) & np.isfinite(checked)
+    _refuse(is_missing, name, "belongs to a missing reading; give the reading, or infinity")
+    checked.setflags(write=False)
+    return checked
+
+
+def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) -> FloatArray | None:
+    """Return the standard deviations (n, a) [SI] of readings, or None where all are exact.
+
+    Given ones win over those that the robot states.
+
+    Parameters
+    ----------
+    given : (n, a) or None, as in `Measurements.reading_sigma`.
+
+    Raises
+    ------
+    DataError
+        If a sigma is negative, not a number, or finite but too large to mean anything; or if a
+        reading of a robot with redundant actuators is exact. The poses of such a robot are free
+        and readings follow from them, so that no reading can be kept; see
+        docs/theory/uncertain-readings.md.
+    """
+    if given is None:
+        if not robot.stated_sigma.any():
+            return None
+        given = np.tile(robot.stated_sigma, (n, 1))
+    _check_size(robot, given)
+    if robot.program.sigma is not None and np.any(given == 0.0):
+        name = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
+        raise DataError(
+            f"the readings of {name} are stated to be exact, but {robot.name!r} has "
+            f"{len(robot.actuators)} actuators for {len(robot.freedoms)} degrees of freedom; "
+            "readings of redundant actuators cannot be exact: state a sigma above 0 for each, a "
+            "small one for very good encoders"
+        )
+    return given if np.any(given != 0.0) else None
+
+
+def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
+    """Return measurements that contain the standard deviations that the robot states.
+
+    It is the same object where all readings are exact.
+    """
+    sigma = resolve_reading_sigma(robot, data.reading_sigma, data.n_poses)
+    return (
+        data if sigma is None or sigma is data.reading_sigma else replace(data, reading_sigma=sigma)
+    )
+
+
+def _check_size(robot: Mechanism, sigma: FloatArray) -> None:
+    """Refuse standard deviations that are negative or too large, naming the actuator."""
+    is_length = [actuator.dimension is Dimension.LENGTH for actuator in robot.actuators]
+    size = np.where(is_length, robot.size, 1.0)
+
+    def name(pose: int, column: int) -> str:
+        actuator = robot.actuators[column]
+        shown = robot.get_unit(actuator.dimension)
+        value = f"{sigma[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
+        return f"the sigma {value} of the reading of {actuator.name} in row {pose + 1}"
+
+    _refuse(~((sigma == 0.0) | (sigma >= SMALLEST_SD)), name, NOT_A_SIGMA)
+    is_huge = np.isfinite(sigma) & (sigma / size > LARGEST_SIGMA)
+    _refuse(
+        is_huge, name, "is larger than any possible error of a reading; give inf (missing) instead"
+    )
+
+
+def _refuse(wrong: BoolArray, name: Callable[[int, int], str], what: str) -> None:
+    """Raise a DataError that names the first wrong entry (pose, column), if there is one."""
+    if np.any(wrong):
+        pose, column = (int(i) for i in np.argwhere(wrong)[0])
+        raise DataError(f"{name(pose, column)} {what}")

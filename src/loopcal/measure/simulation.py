@@ -9,28 +9,123 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
-from loopcal.measure.closure_checks import check_closure, check_redundancy
-from loopcal.measure.disturbances import NO_DISTURBANCE, Disturbance, reach_poses
+from loopcal.measure.data_checks import check_closure, check_redundancy
+from loopcal.measure.initial_values import EvaluatedRows, evaluate_measurements
 from loopcal.measure.instrument import Distribution, Instrument, Seed, Sensor, make_random_stream
+from loopcal.measure.kinds.surfaces import Line, Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
-from loopcal.measure.reading_sigma import broadcast_reading_sigma, resolve_reading_sigma
 from loopcal.measure.readings import (
+    broadcast_reading_sigma,
     list_sensed_joints,
     name_pose,
+    resolve_reading_sigma,
     select_joint_values,
     solve_commanded_poses,
 )
-from loopcal.mechanism import Mechanism, Status, forward, refuse_drawn_errors
+from loopcal.mechanism.actuation import solve_at_pose
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.over_constraint import refuse_drawn_errors
+from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
+
+# --- Errors of simulated machines that no fit knows of, and the true poses under them.
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """What happens at each measured pose although the model does not contain it.
+
+    Attributes
+    ----------
+    values : (t | 1, n, p) [SI] added to the true parameter values, such as thermal growth; None
+        where these are the same at all poses.
+    readings : (t | 1, n, a) [SI] true joint values minus readings, such as backlash; None for 0.
+    motion : (t | 1, n, 3) [m] displacement of what is measured, in base axes, such as the drift of
+        an instrument; None for 0. It is no part of the true poses.
+    """
+
+    values: FloatArray | None = None
+    readings: FloatArray | None = None
+    motion: FloatArray | None = None
+
+    def displace(self, T: FloatArray) -> FloatArray:
+        """Return the poses (t, n, 4, 4) that are measured at true poses T."""
+        if self.motion is None:
+            return T
+        moved = np.array(T)
+        moved[..., :3, 3] += self.motion
+        return moved
+
+
+NO_DISTURBANCE = Disturbance()
+
+
+def reach_poses(
+    robot: Mechanism,
+    values: FloatArray,
+    readings: FloatArray,
+    start: State,
+    disturbance: Disturbance,
+) -> tuple[FloatArray, State]:
+    """Return the true readings (t | 1, n, a) and the states (t, n) of t machines.
+
+    Parameters
+    ----------
+    robot : structure of the machines. values : (t, p) [SI] of each of them.
+    readings : (n, a) [SI] of the controller. start : (1, n) state of the commanded poses.
+    """
+    true = readings[None]
+    if disturbance.readings is not None:
+        true = true + disturbance.readings
+    shape = (len(values), len(readings))
+    if disturbance.values is not None:  # every pose is a machine of its own
+        values = (values[:, None] + disturbance.values).reshape(-1, values.shape[1])
+        true = np.broadcast_to(true, (*shape, readings.shape[1]))
+        true = true.reshape(-1, 1, readings.shape[1])
+        start = _reshape_state(start, shape, (-1, 1))
+    state = forward_trials(robot, values, true, start)
+    # Redundant actuators of a wrong geometry contradict each other: their true readings are those
+    # of the reached pose. Where they contradict each other so widely that they lead to none, the
+    # machine is moved to the commanded pose, with all but the needed actuators following it.
+    if robot.program.sigma is not None:
+        lost = (state.status != Status.CONVERGED)[..., None, None]
+        begin = replace(state, T=np.where(lost, start.T, state.T))
+        placed, closed = solve_at_pose(robot, values, begin.T, begin)
+        state = map_arrays(partial(_select_lost, lost[..., 0, 0]), placed, state)
+        true = np.where(np.isfinite(closed), closed, true)
+    if disturbance.values is not None:
+        true, state = true.reshape(*shape, -1), _reshape_state(state, (len(values), 1), shape)
+    return true, state
+
+
+def _select_lost(lost: BoolArray, placed: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Return the arrays of poses (t, n, ..), those of lost ones (t, n) as they are placed."""
+    return np.where(lost.reshape(*lost.shape, *[1] * (reached.ndim - 2)), placed, reached)
+
+
+def _reshape_state(state: State, shape: tuple[int, int], wanted: tuple[int, int]) -> State:
+    """Return a state, broadcast to `shape` of trials and poses, with another shape of these."""
+
+    def change(array: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(array, (*shape, *array.shape[2:])).reshape(*wanted, *array.shape[2:])
+
+    return map_arrays(change, state)
+
 
 NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
 
@@ -374,3 +469,147 @@ def _draw_noise(instrument: Instrument, generator: np.random.Generator) -> list[
     return [
         sensor.noise.draw(generator, len(sensor.assigned_rows)) for sensor in instrument.sensors
     ]
+
+
+# --- Simulated measurements by contact: the operator moves a machine until its points touch
+# surfaces.
+
+STEPS = 20
+"""Corrections of a commanded position: each leaves the share by which the geometry is wrong."""
+
+EXACT = 1e-6
+"""Share of the noise to which a gap is reached."""
+
+
+def simulate_contacts(
+    robot: Mechanism, sheet: Measurements, instrument: Instrument, seed: int
+) -> Measurements:
+    """Return measurements of planes and lines with the readings at which a true machine touches.
+
+    Parameters
+    ----------
+    robot : at its true values; its nominal ones are those of the controller.
+    sheet : rows of planes and lines; its readings are those of the commanded poses, its missing
+        gaps are zero.
+    instrument : a sensor for each of `sheet.observations`; its noise is that of the contacts.
+    seed : of the noise of contacts and of readings.
+
+    Raises
+    ------
+    DataError
+        Another kind of rows, a machine that cannot move in x, y and z, or points that it cannot
+        bring to their surfaces.
+    """
+    _check_sheet(robot, sheet)
+    sheet = _fill_gaps(sheet)
+    generator = make_random_stream(seed, 0)
+    noise = [
+        sensor.noise.draw(generator, len(rows))
+        for sensor, rows in zip(instrument.sensors, sheet.observations, strict=True)
+    ]
+    names = robot.controlled
+    places = [names.index(name) for name in POSITION]
+    commanded = read_coordinates(forward(robot.nominal, sheet.readings).T, names)
+    q, T = _command(robot, commanded, sheet)
+    values = _place_surfaces(sheet, T)
+    limit = EXACT * min(float(np.min(sensor.noise.sigma)) for sensor in instrument.sensors)
+    largest = np.inf
+    for _ in range(STEPS):
+        rows = evaluate_measurements(sheet, T[None], values[None])
+        shift, largest = _correct_positions(sheet, rows, noise)
+        if largest <= limit:
+            return _record(robot, sheet, q, seed)
+        commanded[:, places] += shift
+        q, T = _command(robot, commanded, sheet)
+    raise DataError(
+        f"{robot.name} does not bring all points to their surfaces: a gap of {largest:.3g} m is "
+        f"left after {STEPS} corrections; simulate smaller errors"
+    )
+
+
+def _check_sheet(robot: Mechanism, sheet: Measurements) -> None:
+    """Refuse rows other than planes and lines, and a machine that does not move in x, y and z."""
+    other = [o.kind.name for o in sheet.observations if not isinstance(o.kind, Plane | Line)]
+    if other:
+        raise DataError(
+            f"rows of the kind {other[0]!r} state no readings; only points on planes and lines are "
+            "simulated without readings"
+        )
+    missing = [name for name in POSITION if name not in robot.controlled]
+    if missing:
+        raise DataError(
+            f"{robot.name} does not control {', '.join(missing)}, so that its points cannot be "
+            "moved to planes and lines"
+        )
+
+
+def _fill_gaps(sheet: Measurements) -> Measurements:
+    """Return the sheet with a gap of zero where none is stated."""
+    filled = tuple(
+        replace(o, measured=np.nan_to_num(np.where(o.present, o.measured, 0.0)))
+        for o in sheet.observations
+    )
+    return replace(sheet, observations=filled)
+
+
+def _command(
+    robot: Mechanism, commanded: FloatArray, sheet: Measurements
+) -> tuple[FloatArray, FloatArray]:
+    """Return readings (n, a) and true poses (n, 4, 4) at commanded coordinates (n, c)."""
+    controller = inverse(robot.nominal, commanded)
+    true = forward(robot, controller.q)
+    lost = np.flatnonzero(~(controller.converged & true.converged))
+    if len(lost):
+        first = int(lost[0])
+        solution = true if controller.converged[first] else controller
+        raise DataError(
+            f"{robot.name} does not reach pose {sheet.labels[first]!r} "
+            f"({solution.explain(first)}); simulate smaller errors, or plan the points closer to "
+            "the middle of the workspace"
+        )
+    return controller.q, true.T
+
+
+def _place_surfaces(sheet: Measurements, T: FloatArray) -> FloatArray:
+    """Return the values (U,) of unknown surfaces: parallel to the stated ones, through the first
+    point of each group.
+    """
+    nuisance = sheet.nuisance_parameters
+    values = nuisance.values()
+    rows = evaluate_measurements(sheet, T[None], values[None], nuisance)
+    for o, evaluated, indices in zip(sheet.observations, rows, nuisance.indices, strict=True):
+        names = [parameter.name for parameter in o.kind.nuisance_parameters]
+        shifts = [i for i, name in enumerate(names) if name.rpartition(".")[2] in OFFSETS]
+        if not shifts:
+            continue
+        _, first = np.unique(indices[:, shifts[0]], return_index=True)
+        values[indices[first][:, shifts]] += evaluated.residual[0, first]
+    return values
+
+
+OFFSETS = ("height", "a", "b")
+"""Parameters of a surface that move it along the residuals of its points, in their order."""
+
+
+def _correct_positions(
+    sheet: Measurements, rows: tuple[EvaluatedRows, ...], noise: list[FloatArray]
+) -> tuple[FloatArray, float]:
+    """Return the smallest displacements (n, 3) [m] that close the gaps up to their noise, and the
+    largest gap.
+    """
+    gaps = [r.residual[0] - drawn for r, drawn in zip(rows, noise, strict=True)]
+    poses = np.concatenate([np.repeat(r.poses[:, 0], r.residual.shape[2]) for r in rows])
+    along = np.concatenate([r.jacobian[0, :, 0, :, 3:].reshape(-1, 3) for r in rows])
+    gap = np.concatenate([each.ravel() for each in gaps])
+    shift = np.zeros((sheet.n_poses, 3))
+    for pose in np.unique(poses):
+        is_of_pose = poses == pose
+        shift[pose] = np.linalg.lstsq(along[is_of_pose], -gap[is_of_pose], rcond=None)[0]
+    return shift, float(np.abs(gap).max(initial=0.0))
+
+
+def _record(robot: Mechanism, sheet: Measurements, q: FloatArray, seed: int) -> Measurements:
+    """Return the sheet with recorded readings."""
+    recorded, sigma = record_readings(robot, q[None], sheet.reading_sigma, 1, seed)
+    readings = q if recorded is None else recorded[0]
+    return replace(sheet, readings=readings, reading_sigma=sigma)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The generic description of a mechanism: limbs, actuators, parameters and their maps.
 
-Every family expands into an `Assembly`; `loopcal.mechanism.build` compiles it for the engine.
+Every family expands into an `Assembly`; `compilation.build` compiles it for the engine.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Address:
 
     `owner` is a limb or an actuator; `element` a link or joint of the limb, `rod`, or
     `transmission`; `axis` one of AXES, `pitch`, `length`, or a term (see
-    `loopcal.mechanism.transmission.terms`).
+    `loopcal.mechanism.transmission`).
     """
 
     owner: str

@@ -19,17 +19,24 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
-from loopcal.mechanism import actuation, closure, stages
-from loopcal.mechanism.actuation.driven_joints import DrivenJoints, drive_joints
-from loopcal.mechanism.closure.limb_rows import (
-    linearize_limbs,
-    name_passive_joints,
-    solve_passive_motion,
+from loopcal.mechanism import actuation
+from loopcal.mechanism.actuation import DrivenJoints, drive_joints
+from loopcal.mechanism.chains import (
+    differentiate_end,
+    differentiate_joints,
+    differentiate_platform_entries,
+    name_platform_entries,
 )
-from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.parameter_units import ParameterUnits
+from loopcal.mechanism.limb_rows import linearize_limbs, name_passive_joints, solve_passive_motion
+from loopcal.mechanism.model import Mechanism, ParameterUnits
+from loopcal.mechanism.open_closure import (
+    differentiate_open,
+    differentiate_unknowns,
+    fold_open_poses,
+    list_unknown_joints,
+)
 from loopcal.mechanism.states import is_closed
-from loopcal.mechanism.transmission.terms import joints_from_readings
+from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -62,7 +69,7 @@ def differentiate_pose(
     states have infinities or NaN.
     """
     if robot.stages:
-        whole = stages.differentiate_end(robot, values, q, state, differentiate_pose, columns)
+        whole = differentiate_end(robot, values, q, state, differentiate_pose, columns)
         return PoseSensitivity(*whole)
     if robot.has_open_sums:
         derivatives = actuation.differentiate_open_sums(robot, values, q, state, columns)
@@ -72,7 +79,7 @@ def differentiate_pose(
         chosen = robot.all_parameters if columns is None else columns
         inputs = chosen.linearize(values, tau, q)
         is_open = robot.program.may_stay_open
-        differentiate = closure.differentiate_open if is_open else engine.differentiate
+        differentiate = differentiate_open if is_open else engine.differentiate
         derivatives = differentiate(robot.program, e, joints, state, inputs)
         if robot.has_sums:
             by_parameters, by_joints = derivatives
@@ -103,7 +110,7 @@ def fold_pose_rows(
     """
     e, tau, joints = driven or drive_joints(robot, values, q)
     inputs = columns.linearize(values, tau, q)
-    fold_poses = closure.fold_open_poses if robot.program.may_stay_open else engine.fold_poses
+    fold_poses = fold_open_poses if robot.program.may_stay_open else engine.fold_poses
     return fold_poses(factor, robot.program, e, joints, state, inputs, observed)
 
 
@@ -131,7 +138,7 @@ def differentiate_passive_joints(
     """
     names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
     if robot.stages:
-        whole = stages.differentiate_joints(robot, values, q, state, differentiate_passive_joints)
+        whole = differentiate_joints(robot, values, q, state, differentiate_passive_joints)
         return PassiveSensitivity(names, *whole)
     parameters = np.zeros((t, n, len(names), len(robot.parameters)))
     readings = np.zeros((t, n, len(names), len(robot.actuators)))
@@ -177,10 +184,10 @@ def _differentiate_open_joints(
     e, tau = robot.slots(values)
     joints = joints_from_readings(q, tau, robot.slots.frequency)
     inputs = robot.all_parameters.linearize(values, tau, q)
-    exact = closure.differentiate_unknowns(program, e, joints, state, inputs)
+    exact = differentiate_unknowns(program, e, joints, state, inputs)
     places = [
         names.index(f"{limbs[i].name}.{limbs[i].joints[j].name}")
-        for i, j in closure.list_unknown_joints(program)
+        for i, j in list_unknown_joints(program)
     ]
     return places, exact[:, :, len(program.freedoms) :]
 
@@ -192,11 +199,11 @@ def differentiate_sensed_values(
     known: list[str] = []
     derivatives: list[tuple[FloatArray, FloatArray]] = []
     for stage in robot.stages:
-        entries = stages.name_platform_entries(stage.name)
+        entries = name_platform_entries(stage.name)
         if not set(entries).isdisjoint(names):
             known += entries
             derivatives.append(
-                stages.differentiate_platform_entries(
+                differentiate_platform_entries(
                     robot, values, q, state, differentiate_pose, stage.name
                 )
             )

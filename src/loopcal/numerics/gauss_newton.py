@@ -17,14 +17,240 @@ stated share of their norm (the relative offset of Bates and Watts, Technometric
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from loopcal.numerics.damping import PATIENCE, Damping, FixedFactors, Progress
-from loopcal.numerics.full_steps import FullSteps
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# --- Damping of Gauss-Newton steps, and the test of progress: working memory of one iteration.
+
+PATIENCE = 20
+"""Evaluations without progress after which a trial ends. One whose result is not finite, such as
+that of poses out of reach, counts `NOT_FINITE` times: it takes the longest and says the least."""
+
+NOT_FINITE = 5
+
+LESS_COST, LESS_LENGTH, LESS_DAMPING = 0.99, 0.95, 0.1
+"""Progress is a decrease of the sum of squares, of the length of the full step, or of the damping
+to this share of its value at the last progress."""
+
+
+class Damping:
+    """Levenberg-Marquardt damping of t trials by Nielsen's rule: working memory of one iteration.
+
+    Parameters
+    ----------
+    first : (t,) damping of the first step.
+    floor : from trials (a,) to their damping after the first rejected step (a,), at least; asked
+        only for trials with a rejected step.
+    """
+
+    value: FloatArray
+    growth: FloatArray
+
+    def __init__(self, first: FloatArray, floor: Callable[[IntArray], FloatArray]) -> None:
+        self.value, self._ask_floor = np.array(first), floor
+        self.growth = np.full(len(self.value), 2.0)
+        self._floor = np.full(len(self.value), np.nan)
+
+    def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
+        """Lower the damping after a good step; raise it ever faster after rejected ones.
+
+        `ratio` (a,) is the decrease over the predicted one.
+        """
+        if accepted.all() and not self.value[trials].any():
+            self.growth[trials] = 2.0
+            return
+        unknown = trials[~accepted & np.isnan(self._floor[trials])]
+        if unknown.size:
+            self._floor[unknown] = self._ask_floor(unknown)
+        less = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+        more = np.fmax(self.value[trials] * self.growth[trials], self._floor[trials])
+        self.value[trials] = np.where(accepted, self.value[trials] * less, more)
+        self.growth[trials] = np.where(accepted, 2.0, 2.0 * self.growth[trials])
+
+    def release(self, trials: IntArray) -> None:
+        """Remove the damping of some trials."""
+        self.value[trials], self.growth[trials] = 0.0, 2.0
+
+
+class FixedFactors:
+    """Damping that is divided by ten after an accepted step and multiplied by ten otherwise."""
+
+    value: FloatArray
+
+    def __init__(self, first: FloatArray) -> None:
+        self.value = np.array(first)
+
+    def adapt(self, trials: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
+        """Adapt the damping of some trials."""
+        del ratio
+        self.value[trials] *= np.where(accepted, 0.1, 10.0)
+
+    def release(self, trials: IntArray) -> None:
+        """Remove the damping of some trials."""
+        self.value[trials] = 0.0
+
+
+class Progress:
+    """The last progress of t trials: working memory of one iteration.
+
+    A trial that makes none within `PATIENCE` evaluations ends. Nothing is recorded before that many
+    evaluations, in which most trials converge.
+    """
+
+    marks: FloatArray
+    age: IntArray
+
+    def __init__(self, trials: int) -> None:
+        self.marks = np.full((trials, 3), np.inf)
+        self.age = np.zeros(trials, dtype=np.int64)
+
+    def find_stalled(
+        self, trials: IntArray, is_finite: BoolArray, *measures: FloatArray
+    ) -> BoolArray:
+        """Return which trials (a,) made no progress for too long.
+
+        `is_finite` (a,) says which were evaluated with a finite result. `measures` are the sums of
+        squares, the lengths of the full steps and the dampings (a,) before.
+        """
+        values = np.stack(measures, axis=1)
+        share = np.array([LESS_COST, LESS_LENGTH, LESS_DAMPING])
+        progress = values < share * self.marks[trials]
+        self.marks[trials] = np.where(progress, values, self.marks[trials])
+        age = np.where(progress.any(axis=1), 0, self.age[trials])
+        self.age[trials] = age + np.where(is_finite, 1, NOT_FINITE)
+        return self.age[trials] >= PATIENCE
+
+
+# --- Chains of full Gauss-Newton steps that may raise the sum of squares on their way to the
+# solution.
+
+CONTRACTION = 0.9
+"""Largest ratio of the lengths of two full steps of a chain."""
+
+LEAST_GAIN = 0.25
+"""Share of the predicted decrease that a chain must bring. With less, full steps may lead into the
+basin of another, higher minimum."""
+
+LONGEST_CHAIN = 10
+"""Steps of a chain, at most."""
+
+FIRST_WAIT = 2
+"""Damped steps before a chain is tried; twice as many after every one that led nowhere."""
+
+
+class FullSteps:
+    """Chains of full steps of t trials: working memory of one iteration.
+
+    Parameters
+    ----------
+    trials : t. is_enabled : whether chains are tried.
+    """
+
+    is_enabled: bool
+    is_ahead: BoolArray
+
+    def __init__(self, trials: int, is_enabled: bool) -> None:
+        self.is_enabled, self.is_ahead = is_enabled, np.zeros(trials, dtype=bool)
+        self._is_low = np.zeros(trials, dtype=bool)
+        self._count, self._taken = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=int)
+        self._wait = np.full(trials, FIRST_WAIT)
+        self._length, self._promised = np.zeros(trials), np.zeros(trials)
+        self._point: Any = None
+
+    def find_arrived(self, model: Any) -> tuple[IntArray, Any]:
+        """End the chains that reached a lower point or led nowhere.
+
+        Return the trials (a,) that reached a lower point, and these points.
+        """
+        ahead = np.flatnonzero(self.is_ahead)
+        points_ahead = self._point.take(ahead)
+        length = model.propose(points_ahead, np.zeros(len(ahead))).full_length
+        contracts = length <= CONTRACTION * self._length[ahead]
+        is_lower = contracts & self._is_low[ahead]
+        goes_on = contracts & ~is_lower & (self._count[ahead] < LONGEST_CHAIN)
+        self._end(ahead[~goes_on & ~is_lower])
+        arrived = ahead[is_lower]
+        self.is_ahead[arrived], self._wait[arrived], self._taken[arrived] = False, FIRST_WAIT, 0
+        return arrived, points_ahead.take(np.flatnonzero(is_lower))
+
+    def start_due(self, point: Any, active: IntArray, damping: FloatArray) -> None:
+        """Begin chains at the points of trials (a,) that took enough damped steps."""
+        if not self.is_enabled or not damping.any():
+            return
+        due = (damping > 0.0) & (self._taken[active] >= self._wait[active])
+        due &= ~self.is_ahead[active]
+        if due.any():
+            trials = active[due]
+            self._begin(trials, point, point.take(trials), 0)
+
+    def is_away(self, active: IntArray) -> BoolArray:
+        """Return which trials (a,) are at a point of a chain that is not accepted."""
+        return self.is_ahead[active] & (self._count[active] > 0)
+
+    def replace_points(self, current: Any, active: IntArray) -> Any:
+        """Return the points of trials (a,), those of chains where a chain goes on."""
+        ahead = np.flatnonzero(self.is_ahead[active])
+        return current if not ahead.size else current.put(ahead, self._point.take(active[ahead]))
+
+    def expect(self, step: Any, active: IntArray) -> Any:
+        """Return steps (a,) with the decrease that the first full step of their chain predicted."""
+        is_first = self.is_ahead[active] & (self._count[active] == 0)
+        self._promised[active[is_first]] = step.predicted[is_first]
+        self._length[active] = step.full_length
+        promised = np.where(self.is_ahead[active], self._promised[active], step.predicted)
+        return replace(step, predicted=promised)
+
+    def record(
+        self,
+        point: Any,
+        step: Any,
+        candidate: Any,
+        active: IntArray,
+        accepted: BoolArray,
+        ratio: FloatArray,
+        is_full: BoolArray,
+    ) -> None:
+        """Record what was evaluated at the ends of steps (a,).
+
+        Chains begin where a full step was refused; `is_full` (a,) are the undamped steps, `ratio`
+        (a,) the decrease over the predicted one.
+        """
+        if accepted.all() and not self.is_ahead.any():
+            self._taken[active] += 1
+            return
+        ahead, finite = self.is_ahead[active], np.isfinite(candidate.cost)
+        self._taken[active[accepted & ~ahead]] += 1
+        begun = ~ahead & ~accepted & is_full & finite
+        if begun.any():
+            trials = active[begun]
+            self._promised[trials] = step.predicted[begun]
+            self._length[trials] = step.full_length[begun]
+            self._begin(trials, point, candidate.take(np.flatnonzero(begun)), 1)
+        moved = ahead & finite
+        if moved.any():
+            trials = active[moved]
+            self._point = self._point.put(trials, candidate.take(np.flatnonzero(moved)))
+            self._is_low[trials] = accepted[moved] & (ratio[moved] >= LEAST_GAIN)
+            self._count[trials] += 1
+        self._end(active[ahead & ~finite])
+
+    def _begin(self, trials: IntArray, point: Any, first: Any, count: int) -> None:
+        """Begin chains at the points `first`; `point` are the accepted ones of all trials."""
+        self._point = (point if self._point is None else self._point).put(trials, first)
+        self.is_ahead[trials], self._is_low[trials], self._count[trials] = True, False, count
+
+    def _end(self, trials: IntArray) -> None:
+        """End chains that led nowhere."""
+        again = trials[self._taken[trials] >= self._wait[trials]]
+        self._wait[again] *= 2
+        self.is_ahead[trials], self._taken[trials] = False, 0
+
 
 ROUNDING = 1e-12
 """Relative change of a sum of squares that is rounding and says nothing about a step."""
@@ -221,7 +447,7 @@ def minimize(
     ----------
     model : rules of the problem. point : the start of all trials.
     damping : of the steps. With `Damping`, chains of full steps are tried, see
-        `loopcal.numerics.full_steps`, and trials that make no progress end, see `Progress`.
+        `loopcal.numerics.gauss_newton`, and trials that make no progress end, see `Progress`.
     iterations : evaluations after the first, at most.
     observe : called with the points after every evaluation by which one of them moved.
 
@@ -344,3 +570,124 @@ def minimize_by_halving(
         if not share.any():
             break
     return point, converged
+
+
+# --- Least squares from several starts at once, for problems whose good start is not known.
+
+STEPS = 60
+"""Steps of damped Gauss-Newton [1]; starts in the right basin need fewer than ten."""
+
+FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
+"""Damping of the first step [1], in columns of length one, and that at which a descent ends."""
+
+NEGLIGIBLE_STEP = 1e-6
+"""Step, in standard deviations or as a share of the residuals, that is as good as none."""
+
+SMALLEST = 1e-12
+"""Singular value of columns of length one that counts as zero."""
+
+Linearize = Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]]
+"""From values (c, u) of starts, whose numbers are (c,), to residuals (c, M), in units of their
+standard deviation or of order one, and their Jacobians (c, M, u)."""
+
+
+def minimize_from_starts(
+    linearize: Linearize, x: FloatArray, steps: int = STEPS
+) -> tuple[FloatArray, FloatArray]:
+    """Minimize sums of squares from several starts at once, by damped Gauss-Newton.
+
+    Parameters
+    ----------
+    linearize : see `Linearize`. x : (c, u) starts. steps : at most.
+
+    Returns
+    -------
+    x : (c, u). cost : (c,) sums of squares; infinite where a start cannot be evaluated.
+    """
+    residual, jacobian = linearize(x, np.arange(len(x)))
+    start = _Point(x, residual, jacobian, sum_squares(residual))
+    damping = FixedFactors(np.full(len(x), FIRST_DAMPING))
+    point = minimize(_Descent(linearize), start, damping, steps).point
+    return point.x, point.cost
+
+
+def sum_squares(residual: FloatArray) -> FloatArray:
+    """Return sums of squares (c,) of residuals (c, M); infinite where they are not finite."""
+    total = np.sum(residual * residual, axis=1)
+    return np.where(np.isfinite(total), total, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point(TrialBatch):
+    """Values x (c, u), residuals (c, M), Jacobians (c, M, u), sums of squares (c,)."""
+
+    x: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+    cost: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Step(TrialBatch):
+    """A damped step (c, u), its length (c,) in the residuals, and its damping (c,)."""
+
+    x: FloatArray
+    length: FloatArray
+    damping: FloatArray
+
+
+class _Descent(NamedTuple):
+    """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
+
+    linearize: Linearize
+
+    def propose(self, point: _Point, damping: FloatArray) -> _Step:
+        """Return the damped steps, from a decomposition of columns of length one."""
+        norm = np.linalg.norm(point.jacobian, axis=1)
+        scale = np.where(norm > 0.0, norm, 1.0)
+        # one triangular factor, so that the decomposition does not grow with the rows
+        columns = point.jacobian / scale[:, None, :]
+        stack = np.nan_to_num(np.concatenate([columns, point.residual[..., None]], axis=-1))
+        R = np.asarray(np.linalg.qr(stack, mode="r"), dtype=float)
+        U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
+        right = np.einsum("cmk,cm->ck", U, R[..., -1])
+        total = s * s + damping[:, None] ** 2 + SMALLEST**2
+        gain = np.where(s > SMALLEST, s / total, 0.0)
+        step = np.where(norm > 0.0, -np.einsum("cku,ck->cu", V, gain * right) / scale, 0.0)
+        return _Step(step, np.linalg.norm(step * scale, axis=1), damping)
+
+    def is_negligible(self, point: _Point, step: _Step) -> BoolArray:
+        """Return no step: all are evaluated."""
+        del point
+        return np.zeros(len(step.x), dtype=bool)
+
+    def finish(self, point: _Point, step: _Step, trials: IntArray) -> _Point:
+        """Return the points as they are."""
+        del step, trials
+        return point
+
+    def evaluate(self, point: _Point, step: _Step, trials: IntArray) -> _Point:
+        """Return the points to which steps lead."""
+        x = point.x + step.x
+        residual, jacobian = self.linearize(x, trials)
+        return _Point(x, residual, jacobian, sum_squares(residual))
+
+    def judge(self, point: _Point, step: _Step, candidate: _Point) -> tuple[BoolArray, FloatArray]:
+        """Accept every decrease."""
+        del step
+        return candidate.cost < point.cost, np.ones(len(point.cost))
+
+    def objective(self, point: _Point) -> FloatArray:
+        """Return the sum of squares."""
+        return point.cost
+
+    def ending(
+        self, point: _Point, step: _Step, candidate: _Point, accepted: BoolArray
+    ) -> IntArray:
+        """End where a step moves the residuals by a millionth of their sigma, or of themselves."""
+        del point, accepted
+        is_small = step.length <= NEGLIGIBLE_STEP * (1.0 + np.sqrt(candidate.cost))
+        stuck = np.where(
+            step.damping > LARGEST_DAMPING, DescentStatus.NO_DESCENT, DescentStatus.RUNNING
+        )
+        return np.where(is_small, DescentStatus.CONVERGED, stuck)

@@ -14,8 +14,8 @@ from loopcal.errors import DataError
 from loopcal.io.core.outputs import restore_on_failure
 from loopcal.io.core.text_file import write_text
 from loopcal.papers import Paper
-from loopcal.studies import Study, load_study
-from loopcal.studies.files.template import quote_robot
+from loopcal.studies.files.study_file import load_study, quote_robot
+from loopcal.studies.specification.study import Study
 
 FILE = "study.yaml"
 """Name of the study file in the folder of a paper with one robot."""

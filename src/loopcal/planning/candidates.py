@@ -17,14 +17,13 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import (
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import POSITION
+from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.mechanism.workspace import (
     MIN_DRAWS,
     MIN_REACHABLE_SHARE,
-    POSITION,
-    Mechanism,
-    Solution,
     draw_coordinates,
-    inverse,
     workspace_ranges,
 )
 from loopcal.planning.constraints import (

@@ -12,28 +12,31 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.apply.validation_findings import FEW_ROWS
+from loopcal.apply.validation import FEW_ROWS
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Instrument
-from loopcal.mechanism import Mechanism
-from loopcal.planning.design import (
+from loopcal.measure.instrument import Instrument
+from loopcal.mechanism.model import Mechanism
+from loopcal.planning.constraints import N_POSES, PlanOptions
+from loopcal.planning.design_space import (
     A,
     Criterion,
     E,
     I,
-    choose_design,
     evaluate_criterion,
     factor_design,
     is_allowed,
 )
-from loopcal.planning.design.exchange import EXCHANGES
-from loopcal.planning.options import N_POSES, PlanOptions
+from loopcal.planning.exchange import EXCHANGES, choose_design
 from loopcal.planning.path import order_poses
 from loopcal.planning.prediction import ExpectedErrors
-from loopcal.planning.problem import PlanningProblem, prepare_problem
+from loopcal.planning.problem import (
+    PlanningProblem,
+    compute_error_curve,
+    find_sample_size,
+    prepare_problem,
+)
 from loopcal.planning.result import DesignQuality, ErrorForecast, Plan, PlannedPoses
-from loopcal.planning.sample_size import compute_error_curve, find_sample_size
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension, find_unit
 

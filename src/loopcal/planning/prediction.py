@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.apply.accuracy import transport
-from loopcal.diagnose import ErrorFrame
 from loopcal.diagnose.error_frames import (
     BASE,
     FITTED,
     RELATIVE,
+    ErrorFrame,
     ReferencePoses,
     check_frame,
     follow_pose,
@@ -30,8 +30,9 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import observe_poses
 from loopcal.findings import Quantity, report_finding
-from loopcal.mechanism import Mechanism, Solution
-from loopcal.planning.options import Target
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution
+from loopcal.planning.constraints import Target
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 

@@ -11,13 +11,14 @@ import numpy as np
 
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.measure import Instrument, Kind
-from loopcal.mechanism import Mechanism, inverse
-from loopcal.planning.options import PlanOptions
+from loopcal.measure.instrument import Instrument
+from loopcal.measure.kinds.kind import Kind
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import inverse
+from loopcal.planning.constraints import PlanOptions
 from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import ExpectedErrors
-from loopcal.planning.problem import name_groups
-from loopcal.planning.sample_size import ErrorCurve
+from loopcal.planning.problem import ErrorCurve, name_groups
 from loopcal.presentation import TableResult, draw
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -178,7 +179,7 @@ class Plan(TableResult):
 
     def plot(self) -> Figure:
         """Draw the poses, numbered in their order, with the path between them."""
-        return draw("draw_plan", self)
+        return draw("plan_figures.draw_plan", self)
 
     def __repr__(self) -> str:
         return (

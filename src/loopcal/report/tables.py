@@ -5,12 +5,18 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
+from loopcal.findings.wording import count_decimals
 from loopcal.plain_text import escape
+from loopcal.units import Dimension, Unit, find_unit
+
+if TYPE_CHECKING:
+    from loopcal.mechanism.model import Mechanism
 
 GAP = 2
 """Blanks between two columns of text."""
@@ -182,3 +188,125 @@ def build_table(
 def _total(widths: Sequence[int]) -> int:
     """Return the characters of a line of columns."""
     return sum(widths) + GAP * (len(widths) - 1)
+
+
+# --- Numbers for people: digits that the uncertainty leaves, and the units of a robot's file.
+
+ROUNDING = 1e-12
+"""A number smaller than this, in whatever unit is shown, is rounding and printed as 0."""
+
+INSIGNIFICANT = 0.01
+"""Share of its uncertainty below which a value is printed as 0."""
+
+ABSENT = "-"
+"""Stands for a number that does not exist."""
+
+
+def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
+    """Return the units in which the numbers of a robot are shown: those of its file."""
+    return {dimension: find_unit(symbol) for dimension, symbol in robot.units.items()}
+
+
+def format_number(value: float, digits: int = 6) -> str:
+    """Return a number with `digits` significant digits; a dash where it is not finite."""
+    if not math.isfinite(value):
+        return ABSENT
+    return f"{0.0 if abs(value) < ROUNDING else value:.{digits}g}"
+
+
+def format_in(unit: Unit, value: float, digits: int = 6) -> str:
+    """Return a number in SI as one in a unit, without its symbol."""
+    return format_number(float(value) / unit.factor_to_si, digits)
+
+
+def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -> str:
+    """Return a value to the third significant digit of its uncertainty.
+
+    A value below a hundredth of its uncertainty is 0. Without a finite uncertainty above 0 the
+    value has `digits` significant digits.
+    """
+    if not math.isfinite(value) or not math.isfinite(uncertainty) or uncertainty <= 0.0:
+        return format_number(value, digits)
+    if abs(value) < INSIGNIFICANT * uncertainty:
+        value = 0.0
+    return f"{value:.{count_decimals(uncertainty)}f}"
+
+
+def format_exact_beside(value: float, uncertainty: float) -> str:
+    """Return a value that is exact, such as a nominal one, with the decimals of the uncertainty
+    beside it; with its own digits where these would show it as 0.
+    """
+    if ROUNDING <= abs(value) < INSIGNIFICANT * uncertainty < math.inf:
+        return format_number(value)
+    return format_with_uncertainty(value, uncertainty)
+
+
+def format_uncertainty(uncertainty: float) -> str:
+    """Return an uncertainty with three significant digits, or a word where it has no number."""
+    if math.isnan(uncertainty):
+        return "not given"
+    if math.isinf(uncertainty):
+        return "unknown"
+    return f"{uncertainty:.{count_decimals(uncertainty)}f}" if uncertainty > 0.0 else "0"
+
+
+# --- A page of paragraphs and tables, rendered as text of a given width.
+
+COMMAND = "Next: loopcal "
+"""Start of a line that contains a command."""
+
+Block = str | Table
+"""A paragraph or a table. A paragraph may have several lines; each is wrapped on its own."""
+
+
+def render_text(blocks: Iterable[Block], width: int) -> str:
+    """Return blocks as plain text, with an empty line around tables.
+
+    Parameters
+    ----------
+    blocks : paragraphs and tables. An empty paragraph is an empty line.
+    width : characters of a line. Paragraphs are wrapped; numbers in tables are never cut.
+    """
+    lines: list[str] = []
+    after_table = False
+    for block in blocks:
+        is_table = isinstance(block, Table)
+        if (is_table or (after_table and block)) and lines and lines[-1]:
+            lines.append("")
+        lines += (block.to_text(width) if is_table else wrap_text(block, width)).split("\n")
+        after_table = is_table
+    return escape("\n".join(lines), "\n")
+
+
+def wrap_text(text: str, width: int) -> str:
+    """Return text with each line wrapped; continuation lines keep the indentation of theirs."""
+    return "\n".join(_wrap_line(line, width) for line in text.split("\n"))
+
+
+def format_list(labels_and_texts: Sequence[tuple[str, str]]) -> list[str]:
+    """Return lines `  label  text`, with the texts in one column."""
+    widest = max((len(label) for label, _ in labels_and_texts), default=0)
+    return [f"  {label:<{widest}}  {text}" for label, text in labels_and_texts]
+
+
+def _wrap_line(line: str, width: int) -> str:
+    """Return one line wrapped; the indentation ends where a second column begins.
+
+    A command to copy is not wrapped.
+    """
+    if len(line) <= width or line.startswith(COMMAND):
+        return line
+    stripped = line.lstrip()
+    indent = len(line) - len(stripped)
+    column = stripped.find("  ")
+    if indent and 0 < column < 20:
+        indent += column + len(stripped[column:]) - len(stripped[column:].lstrip())
+    return textwrap.fill(
+        line,
+        width,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        drop_whitespace=True,
+        replace_whitespace=False,
+    )

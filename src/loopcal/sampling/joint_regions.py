@@ -25,14 +25,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from loopcal.errors import EstimationError, suggest_names
-from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.inference.residual_test import LEVEL
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.residual_test import LEVEL
 from loopcal.estimate.result import Identification
 from loopcal.findings import report_finding
 from loopcal.findings.wording import round_to_digits
-from loopcal.numerics.chi_square import compute_f_quantile
 from loopcal.numerics.decomposition import NULL_COMPONENT
-from loopcal.numerics.multiple_tests import compute_single_level
+from loopcal.numerics.statistics import compute_f_quantile, compute_single_level
 from loopcal.presentation import TableResult
 from loopcal.sampling.intervals import half_widths
 from loopcal.typing import FloatArray, IntArray

@@ -3,23 +3,131 @@
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
+from typing import Any
 
 from loopcal.findings import Finding, report_finding
-from loopcal.studies.execution import Executor
-from loopcal.studies.execution.interface import MOST_LOSSES
+from loopcal.findings.wording import name_count
+from loopcal.report.tables import Block
+from loopcal.studies.execution.executors import MOST_LOSSES, Executor
 from loopcal.studies.files.store import StudyStore
-from loopcal.studies.schedule import Blocks, MissingBlock, Schedule
-from loopcal.studies.simulation.poses import CellPoses
-from loopcal.studies.simulation.tasks import BlockResult, PosesTask, compute_task
-from loopcal.studies.specification.cells import Cell
-from loopcal.studies.specification.keys import compute_key, describe_block
-from loopcal.studies.specification.study import Study
+from loopcal.studies.results.questions import explain_failures
+from loopcal.studies.simulation.block import (
+    BlockResult,
+    BlockTask,
+    PosesTask,
+    compute_block,
+    compute_task,
+    make_block_task,
+    make_poses_task,
+)
+from loopcal.studies.simulation.fits import OUTCOMES
+from loopcal.studies.simulation.machines import CellPoses, compute_poses, is_planned
+from loopcal.studies.specification.study import (
+    Cell,
+    Study,
+    compute_key,
+    describe_block,
+    list_factors,
+)
 from loopcal.typing import Progress, report_no_progress
+
+# --- The order of the work of a study: the poses of a cell, then its blocks.
+
+KEPT_POSES = 256
+"""Poses that are kept, because later cells have the same ones, such as those of other methods."""
+
+MOST_WAITING = 64
+"""Cells that may wait for poses which they have in common."""
+
+
+@dataclass(frozen=True)
+class MissingBlock:
+    """A block to compute. `cell` : number of its cell. `content` : what determines its numbers."""
+
+    key: str
+    cell: int
+    content: dict[str, Any]
+
+
+Blocks = Iterator[MissingBlock]
+"""The missing blocks of one cell."""
+
+
+class Schedule(Iterator["BlockTask | PosesTask | None"]):
+    """Tasks, one by one; None while all that is left needs poses that a worker computes.
+
+    Parameters
+    ----------
+    cells : missing blocks of each cell. Few of them are taken ahead, so that memory does not grow
+        with the number of cells or blocks.
+    """
+
+    def __init__(self, cells: Iterable[Blocks]) -> None:
+        self._cells = iter(cells)
+        self._current: tuple[Blocks, CellPoses] | None = None
+        self._next: deque[tuple[Blocks, CellPoses]] = deque()  # not begun, poses are known
+        self._waiting: dict[str, list[tuple[int, Blocks]]] = {}  # by the task of their poses
+        self._poses: dict[str, CellPoses] = {}  # the latest ones, by their task
+
+    def __next__(self) -> BlockTask | PosesTask | None:
+        """Return the next task."""
+        if not self._next and not self._waiting and (task := self._look_ahead()) is not None:
+            return task
+        while True:
+            if self._current is not None:
+                blocks, poses = self._current
+                block = next(blocks, None)
+                if block is not None:
+                    return make_block_task(block.key, block.cell, block.content, poses)
+            self._current = None
+            if not self._next and (task := self._look_ahead()) is not None:
+                return task
+            if self._next:
+                self._current = self._next.popleft()
+            elif self._waiting:
+                return None
+            else:
+                raise StopIteration
+
+    def add_poses(self, task: PosesTask, poses: CellPoses) -> None:
+        """Accept the poses of a task; the blocks that wait for them come next."""
+        self._next.extend((blocks, poses) for _, blocks in self._waiting.pop(task.key))
+        self._poses[task.key] = poses
+        if len(self._poses) > KEPT_POSES:
+            del self._poses[next(iter(self._poses))]
+
+    def give_up(self, task: PosesTask) -> list[int]:
+        """Leave out the cells that wait for poses, and return their numbers."""
+        return [cell for cell, _ in self._waiting.pop(task.key)]
+
+    def _look_ahead(self) -> PosesTask | None:
+        """Take cells until one can begin, or needs poses that no worker has; return their task."""
+        while sum(map(len, self._waiting.values())) < MOST_WAITING:
+            blocks = next(self._cells, None)
+            if blocks is None:
+                return None
+            first = next(blocks, None)
+            if first is None:
+                continue
+            blocks, task = chain((first,), blocks), make_poses_task(first.content)
+            if (poses := self._poses.get(task.key)) is not None:
+                self._next.append((blocks, poses))
+                return None
+            waiting = self._waiting.setdefault(task.key, [])
+            waiting.append((first.cell, blocks))
+            if len(waiting) == 1:
+                return task
+        return None
+
 
 MOST_NAMED = 5
 """Blocks that were given up and are named in a finding."""
@@ -176,3 +284,125 @@ def _list_blocks(study: Study, store: StudyStore, cell: Cell, blocks: range) -> 
             key = compute_key(content)
             if key not in stored:
                 yield MissingBlock(key, cell.number, content)
+
+
+# --- Estimate how long a study takes, by computing one block of some of its cells.
+
+MOST_BLOCKS = 4
+"""Cells of which a block is computed at most; further cells are estimated from them."""
+
+LONGEST = 30.0
+"""Seconds after which no further block is begun."""
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """How long a study takes.
+
+    Attributes
+    ----------
+    cells, trials, blocks : of the study. measured : cells of which a block was computed.
+    seconds_per_block : mean of these blocks. plans : sets of poses to draw or to plan, which cells
+    have in common. seconds_per_plan : mean of those of the measured cells.
+    worker_seconds : of the study, by one worker.
+    workers : processors of this computer. seconds : of the study by as many processes.
+    bytes : of its store. failed : share of the trials of these blocks that failed.
+    computed : trials of these blocks. failures : code -> trials of these blocks.
+    """
+
+    cells: int
+    trials: int
+    blocks: int
+    measured: int
+    seconds_per_block: float
+    plans: int
+    seconds_per_plan: float
+    worker_seconds: float
+    workers: int
+    seconds: float
+    bytes: int
+    failed: float
+    computed: int
+    failures: Mapping[str, int]
+
+
+def estimate_time(
+    study: Study, workers: int, progress: Progress = report_no_progress
+) -> TimeEstimate:
+    """Compute a block of some cells, evenly spread over the study, and estimate the whole.
+
+    Raises
+    ------
+    LoopcalError : one of these cells cannot be computed; the text names it.
+    """
+    chosen = _spread(study.cells, MOST_BLOCKS)
+    seconds, trials = [], 0
+    failures: dict[str, int] = {}
+    poses: dict[str, CellPoses] = {}
+    planning = 0.0
+    for i, cell in enumerate(chosen):
+        progress(i, len(chosen), "computing a block")
+        content = describe_block(study, cell, 0)
+        plan = make_poses_task(content)
+        if plan.key not in poses:
+            begin = time.perf_counter()
+            poses[plan.key] = compute_poses(json.loads(plan.content))
+            planning += time.perf_counter() - begin
+        task = make_block_task(compute_key(content), cell.number, content, poses[plan.key])
+        begin = time.perf_counter()
+        result = compute_block(task)
+        seconds.append(time.perf_counter() - begin)
+        trials += len(result.values)
+        for code in (OUTCOMES[int(number)] for number in result.values[:, 0] if number):
+            failures[code] = failures.get(code, 0) + 1
+        if sum(seconds) + planning > LONGEST:
+            break
+    blocks = study.blocks * len(study.cells)
+    plans = len({make_poses_task(describe_block(study, cell, 0)).key for cell in study.cells})
+    each, each_plan = sum(seconds) / len(seconds), planning / len(poses)
+    return TimeEstimate(
+        cells=len(study.cells),
+        trials=study.replicates * len(study.cells),
+        blocks=blocks,
+        measured=len(seconds),
+        seconds_per_block=each,
+        plans=plans,
+        seconds_per_plan=each_plan,
+        worker_seconds=each * blocks + each_plan * plans,
+        workers=workers,
+        seconds=each * math.ceil(blocks / workers) + each_plan * math.ceil(plans / workers),
+        bytes=blocks * study.block * len(study.columns) * 8,
+        failed=sum(failures.values()) / trials,
+        computed=trials,
+        failures=failures,
+    )
+
+
+def view_estimate(
+    study: Study, estimate: TimeEstimate, format_duration: Callable[[float], str]
+) -> list[Block]:
+    """Return the page of an estimate."""
+    cells = name_count(estimate.cells, "cell")
+    lines: list[Block] = [f"{study.title}: {cells}, {estimate.trials} trials"]
+    for name in list_factors(study):
+        levels = dict.fromkeys(cell.levels[name] for cell in study.cells)
+        separator = "; " if any("," in level for level in levels) else ", "
+        lines.append(f"  {name:<12}{separator.join(levels)}")
+    total = format_duration(estimate.seconds)
+    plural = "es" if estimate.workers > 1 else ""
+    lines.append(
+        f"A block of {study.block} trials takes {estimate.seconds_per_block:.2g} s; the study "
+        f"takes about {total} with {estimate.workers} process{plural}, and "
+        f"{max(estimate.bytes / 1e6, 0.1):.1f} MB"
+    )
+    if any(is_planned(level) for level in study.poses.values()):
+        times = "once" if estimate.plans == 1 else f"{estimate.plans} times"
+        lines.append(f"This includes planning poses, {estimate.seconds_per_plan:.2g} s {times}")
+    return [*lines, *explain_failures(estimate.failures, estimate.computed)]
+
+
+def _spread(cells: tuple[Cell, ...], count: int) -> list[Cell]:
+    """Return some cells, evenly spread, with the first and the last."""
+    if len(cells) <= count:
+        return list(cells)
+    return [cells[round(i * (len(cells) - 1) / (count - 1))] for i in range(count)]

@@ -3,17 +3,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from loopcal.estimate.trial_identification import check_threads
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.core.text_file import as_path
+from loopcal.io.data.measurement_writer import format_measurements
+from loopcal.io.robot.robot_file import format_robot
+from loopcal.io.runs.run_folder import build_document, refuse_run_folder, save_run
 from loopcal.studies.driver import WHOLE, RunReport, Share, run_blocks
-from loopcal.studies.execution import Executor, Processes, Serial
+from loopcal.studies.execution.executors import Executor, Processes, Serial
 from loopcal.studies.files.study_file import load_study
-from loopcal.studies.files.study_folder import StudySource, open_study
+from loopcal.studies.files.study_folder import StudySource, open_study, read_study
 from loopcal.studies.results.study_result import StudyResult
+from loopcal.studies.simulation.block import replay_trial
+from loopcal.studies.simulation.fits import refuse_per_leg
+from loopcal.studies.specification.levels import FACTORS
 from loopcal.studies.specification.study import Study
 from loopcal.typing import Progress, report_no_progress
+from loopcal.workflow.calibration import calibrate
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.calibration_report import CalibrationReport
 
 
 def study(
@@ -78,3 +92,87 @@ def run_study(
     """Compute what is missing in the folder of a study; see `open_study` and `run_blocks`."""
     with open_study(folder, source, resume) as store:
         return run_blocks(source.study, store, executor, share, progress, threads)
+
+
+# --- Calibrate one trial of a study as `loopcal calibrate` does, with its files and run folder.
+
+ROBOT, TRUTH, DATA = "robot.yaml", "truth.yaml", "measurements.csv"
+"""Files of the folder of inputs: the nominal robot, the true machine, and what was measured."""
+
+INPUTS = FolderKind(
+    "trial", "trial.json", ("study", "cell", "trial"), (ROBOT, TRUTH, DATA), filled_in=()
+)
+"""The folder of inputs; its document says which trial it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A calibrated trial.
+
+    Attributes
+    ----------
+    report, document : of the calibration, and of its run folder. inputs : folder of its inputs.
+    findings : that the files state other tolerances than the cell, or that the calibration has
+        another method than the cell.
+    """
+
+    report: CalibrationReport
+    document: dict[str, Any]
+    inputs: Path
+    findings: tuple[Finding, ...]
+
+
+def calibrate_trial(
+    folder: Path,
+    cell: int,
+    trial: int,
+    output: Path,
+    command: Sequence[str] = (),
+    force: bool = False,
+    progress: Progress = report_no_progress,
+) -> Replay:
+    """Calibrate the machine of one trial with all checks, and write its run folder.
+
+    A second folder beside it, `NAME-input`, gets the robot file, the measurements and the true
+    machine, for `loopcal calibrate`.
+
+    Parameters
+    ----------
+    folder : of the study. cell, trial : both count from 0. output : run folder to make.
+    command : the command line, for the run folder. force : replace an older run.
+
+    Raises
+    ------
+    DataError : the study has no such cell or trial. FileError : a folder cannot be used.
+    LoopcalError : the calibration is refused; the text says why.
+    """
+    study = read_study(folder)
+    simulated = replay_trial(study, cell, trial)
+    if simulated.method.method == "per-leg":
+        refuse_per_leg(simulated.method, simulated.robot, simulated.data)
+    levels, limits = study.cells[cell].levels, study.scores
+    options = CalibrationOptions(
+        fit=simulated.options, limit_position=limits.limit_position, limit_angle=limits.limit_angle
+    )
+    place = output.with_name(f"{output.name}-input")
+    refuse_run_folder(output, force)
+    refuse_folder(place, INPUTS, force)
+    robot, data = simulated.robot, simulated.data
+    contents = {
+        ROBOT: format_robot(robot),
+        TRUTH: format_robot(simulated.truth),
+        DATA: format_measurements(data, robot, states_use=bool(data.is_held_out.any())),
+    }
+    document = {"study": study.title, "cell": dict(levels), "trial": trial}
+    files = {name: text.encode() for name, text in contents.items()}
+    write_result_folder(place, INPUTS, document, files, force=force)
+    paths = {"robot": place / ROBOT, "data": place / DATA}
+    report = calibrate(robot, data, options, progress)
+    save_run(output, report, paths, command, force)
+    errors = study.errors[levels[FACTORS["errors"]]]
+    is_changed = errors.tolerance_factor != 1.0 or bool(errors.tolerances)
+    findings = [report_finding("store.replay-tolerances", file=ROBOT)] if is_changed else []
+    if simulated.method.is_published:
+        level = levels[FACTORS["methods"]]
+        findings.append(report_finding("store.replay-method", method=level))
+    return Replay(report, build_document(report, paths, command), place, tuple(findings))

@@ -6,30 +6,29 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from loopcal.apply import Validation, compute_error_budget, map_height_errors, validate
-from loopcal.diagnose import (
-    ConventionCheck,
-    adjust_uncertainty,
-    check_conventions,
-    check_start_values,
-    compute_reading_errors,
-    examine_fit,
-    interpret_fit,
-    report_base_targets,
-)
+from loopcal.apply.error_budget import compute_error_budget
+from loopcal.apply.height_errors import map_height_errors
+from loopcal.apply.validation import Validation, validate
+from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+from loopcal.diagnose.conventions.convention_check import ConventionCheck, check_conventions
 from loopcal.diagnose.error_frames import BASE, FITTED, RELATIVE, check_frame
-from loopcal.diagnose.frame_drift import compare_shapes, report_moved_targets
+from loopcal.diagnose.fit_examination import compute_reading_errors, examine_fit
+from loopcal.diagnose.frame_drift import compare_shapes, report_base_targets, report_moved_targets
+from loopcal.diagnose.frame_motions import interpret_fit
+from loopcal.diagnose.start_values import check_start_values
 from loopcal.errors import DataError
-from loopcal.estimate import Identification, identify
 from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.frame_freedoms import list_instrument_frames
-from loopcal.estimate.inference.prior import refuse_reused_rows
+from loopcal.estimate.identification import identify
 from loopcal.estimate.information import count_equations
+from loopcal.estimate.prior import refuse_reused_rows
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.importance import sort_by_importance
-from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type
-from loopcal.mechanism import Mechanism
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
 from loopcal.workflow.calibration_findings import (
     check_split_instruments,
@@ -41,13 +40,14 @@ from loopcal.workflow.calibration_findings import (
     report_unexplained,
     report_validation,
 )
-from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.calibration_options import CalibrationOptions, DataSplit, split_data
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
-from loopcal.workflow.data_split import DataSplit, split_data
 
 if TYPE_CHECKING:
-    from loopcal.diagnose import MeasurementSuggestion, ModelChoice, ValueComparison
-    from loopcal.estimate import Change
+    from loopcal.diagnose.cross_validation import ModelChoice
+    from loopcal.diagnose.suggestions import MeasurementSuggestion
+    from loopcal.diagnose.value_comparison import ValueComparison
+    from loopcal.estimate.recalibration import Change
 
 OUT_OF_REACH = ("residuals.poses-out-of-reach", "residuals.calibrated-out-of-reach")
 """Codes of data that a geometry cannot reach."""
@@ -181,7 +181,7 @@ def _fit(
     fit_options = replace(options.fit, excluded_poses=excluded)
     count.begin("choosing the parameters" if options.choose_model else "preparing")
     if options.prior is not None:
-        from loopcal.estimate import recalibrate
+        from loopcal.estimate.recalibration import recalibrate
 
         count.begin("fitting")
         fit, change = recalibrate(
@@ -195,7 +195,7 @@ def _fit(
         return _FitResult(fit, change=change)
     choice = None
     if options.choose_model:
-        from loopcal.diagnose import choose_model
+        from loopcal.diagnose.cross_validation import choose_model
 
         choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
@@ -204,7 +204,7 @@ def _fit(
     chosen = robot if choice is None else choice.robot
     free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
     if fit_options.method is None and available < free:
-        from loopcal.diagnose import describe_missing_equations
+        from loopcal.diagnose.suggestions import describe_missing_equations
 
         raise DataError(
             report_finding(
@@ -304,7 +304,7 @@ def _compare_with_stored(
     """Return the comparison with stored values; None where none are given."""
     if options.compare_with is None:
         return None
-    from loopcal.diagnose import compare_with_values
+    from loopcal.diagnose.value_comparison import compare_with_values
 
     return compare_with_values(fit, options.compare_with)
 
@@ -313,6 +313,7 @@ def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSugges
     """Return further measurements that determine open combinations; None where none is open."""
     if not fit.converged or not fit.unidentifiable:
         return None
-    from loopcal.diagnose import identifiability, suggest_measurements
+    from loopcal.diagnose.identifiable_parameters import identifiability
+    from loopcal.diagnose.suggestions import suggest_measurements
 
     return suggest_measurements(identifiability(fit.robot, data, fit.options.rank_tolerance))

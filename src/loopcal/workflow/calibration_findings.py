@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from loopcal.apply import Validation
 from loopcal.apply.height_errors import measures_only_heights
-from loopcal.apply.validation_findings import FEW_ROWS
-from loopcal.diagnose import ConventionCheck
-from loopcal.estimate import Identification
+from loopcal.apply.validation import FEW_ROWS, Validation
+from loopcal.diagnose.conventions.convention_check import ConventionCheck
+from loopcal.diagnose.frame_motions import FrameMotions, find_frame_motions
+from loopcal.estimate.null_space import Combination
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity, report_finding
-from loopcal.measure import Measurements, check_instruments
+from loopcal.measure.kinds.joints import Closure
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import check_instruments
 from loopcal.units import Dimension
-from loopcal.workflow.data_split import DataSplit
+from loopcal.workflow.calibration_options import DataSplit
 from loopcal.workflow.verdict import BASE_MOVED
 
 NO_GAIN = "model.no-expected-gain"
@@ -117,8 +121,6 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
     """Return whether open combinations only move frames, or change poses."""
     if not fit.converged or not fit.unidentifiable:
         return []
-    from loopcal.workflow.open_freedoms import sort_open_freedoms
-    from loopcal.workflow.readings_gauge import is_readings_alone, report_readings_gauge
 
     freedoms = sort_open_freedoms(fit.posterior, fit.unidentifiable, len(fit.names) - fit.rank)
     motions, count = freedoms.motions, freedoms.changing_count
@@ -134,3 +136,60 @@ def report_freedoms(fit: Identification, data: Measurements) -> list[Finding]:
             report_finding("workflow.undetermined-combinations", count=count, names=freedoms.names)
         )
     return findings
+
+
+# --- What combinations of parameters that data leave open do: move frames only, or change poses.
+
+
+@dataclass(frozen=True)
+class OpenFreedoms:
+    """The combinations that data do not determine.
+
+    Attributes
+    ----------
+    motions : of frames by these combinations. count : of all. changing : combinations that may
+        change poses. names : of the parameters in these.
+    """
+
+    motions: FrameMotions
+    count: int
+    changing: tuple[Combination, ...]
+    names: tuple[str, ...]
+
+    @property
+    def changing_count(self) -> int:
+        """Number of combinations that change poses."""
+        return self.count - self.motions.count
+
+
+def sort_open_freedoms(
+    posterior: Posterior, unidentifiable: tuple[Combination, ...], count: int
+) -> OpenFreedoms:
+    """Separate the combinations that only move frames from those that change poses.
+
+    A combination with a meaning, such as the place of a frame, changes no pose. Where all have one,
+    but they are more than the motions of frames, the parameters of all are named.
+    """
+    changing = tuple(c for c in unidentifiable if not c.meaning)
+    names = dict.fromkeys(name for c in changing or unidentifiable for name in c.names)
+    return OpenFreedoms(find_frame_motions(posterior), count, changing, tuple(names))
+
+
+# --- What redundant readings alone leave open, in one sentence.
+
+
+def is_readings_alone(data: Measurements) -> bool:
+    """Return whether measurements have no measured column."""
+    return all(isinstance(rows.kind, Closure) for rows in data.observations)
+
+
+def report_readings_gauge(motions: FrameMotions, count: int) -> Finding:
+    """Return what `count` open combinations are: the place of frames, the size, and others."""
+    others = count - motions.count - motions.has_scale
+    combinations = (
+        {"what": "frames", "frames": motions.frames, "count": motions.count},
+        {"what": "scale", "frames": (), "count": int(motions.has_scale)},
+        {"what": "others", "frames": (), "count": others},
+    )
+    kept = tuple(part for part in combinations if part["count"])
+    return report_finding("identifiability.readings-gauge", parts=kept)

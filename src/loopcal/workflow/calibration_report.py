@@ -11,31 +11,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.apply.height_errors import store_heights
-from loopcal.apply.stored_validation import store_differences
+from loopcal.apply.validation import store_differences
 from loopcal.engine import collect_versions
-from loopcal.estimate import Identification
+from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
-from loopcal.measure import InstrumentRecord, Measurements, list_instruments
-from loopcal.mechanism import Mechanism
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import InstrumentRecord, list_instruments
+from loopcal.mechanism.model import Mechanism
 from loopcal.presentation import TableResult
 from loopcal.serialization import to_json
-from loopcal.workflow.calibration_options import CalibrationOptions
-from loopcal.workflow.data_split import DataSplit
-from loopcal.workflow.recommendation import recommend_values
-from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
+from loopcal.workflow.calibration_options import CalibrationOptions, DataSplit
+from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict, recommend_values
 
 if TYPE_CHECKING:
-    from loopcal.apply import ErrorBudget, HeightErrors, Validation
-    from loopcal.diagnose import (
-        ConventionCheck,
-        FitExamination,
-        MeasurementSuggestion,
-        ModelChoice,
-        ReadingError,
-        StartCheck,
-        ValueComparison,
-    )
-    from loopcal.estimate import Change
+    from loopcal.apply.error_budget import ErrorBudget
+    from loopcal.apply.height_errors import HeightErrors
+    from loopcal.apply.validation import Validation
+    from loopcal.diagnose.conventions.convention_check import ConventionCheck
+    from loopcal.diagnose.cross_validation import ModelChoice
+    from loopcal.diagnose.fit_examination import FitExamination, ReadingError
+    from loopcal.diagnose.start_values import StartCheck
+    from loopcal.diagnose.suggestions import MeasurementSuggestion
+    from loopcal.diagnose.value_comparison import ValueComparison
+    from loopcal.estimate.recalibration import Change
 
 TOP = 3
 """Findings that a summary shows."""

@@ -3,25 +3,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.errors import DataError
-from loopcal.measure import (
-    Instrument,
-    Measurements,
-    check_strokes,
-    find_outside_strokes,
+from loopcal.errors import DataError, suggest_names
+from loopcal.measure.data_checks import check_strokes, find_outside_strokes
+from loopcal.measure.instrument import Gaussian, Instrument, Noise, Sensor, Uniform
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.points import TargetKind
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import (
     replace_measured_values,
     sample_truth,
     simulate,
     simulate_contacts,
 )
-from loopcal.mechanism import Mechanism, forward, inverse, resolve_poses
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import resolve_poses
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension, find_unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,3 +157,141 @@ def predict_noise_free(
     return simulate(
         robot, targets, instrument, 0, robot, reading_sigma=reading_sigma, pose_names=names
     )
+
+
+# --- Build an instrument from a short description: kinds, noise, and which frames are unknown.
+
+FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
+"""A frame that may be unknown -> the names that kinds have for it."""
+
+DISTRIBUTIONS: Mapping[str, Callable[[FloatArray], Noise]] = {
+    "normal": Gaussian,
+    "uniform": lambda sigma: Uniform(np.sqrt(3.0) * sigma),
+}
+"""Name of a distribution -> noise with given standard deviations (m,) [SI]."""
+
+
+@dataclass(frozen=True)
+class InstrumentDescription:
+    """What is known of an instrument before anything is measured.
+
+    Parameters
+    ----------
+    kinds : names of kinds of measurement. components : coordinates that the kind `component`
+        measures. orientation : form of measured angles; None for the default of the kind.
+    sigma_position, sigma_angle : standard deviations of each length [m] and angle [rad].
+    unknown_frames : of "base" (the frame of the instrument in the base) and "tool".
+    targets : names of targets on the platform whose places are unknown; none leaves the tool.
+    distribution : of simulated noise, one of DISTRIBUTIONS; both have the stated standard
+        deviations. Uniform noise lies within sqrt(3) of them.
+    """
+
+    kinds: Sequence[str] = ("pose",)
+    components: Sequence[str] = ()
+    orientation: str | None = None
+    sigma_position: float = 1e-5
+    sigma_angle: float = 5e-5
+    unknown_frames: Sequence[str] = ()
+    targets: Sequence[str] = ()
+    distribution: str = "normal"
+
+
+def build_instrument(description: InstrumentDescription) -> Instrument:
+    """Return the instrument of a description.
+
+    Raises
+    ------
+    DataError : an unknown kind, frame or component, or a setting that belongs to none of the kinds.
+    """
+    possible = {"components": tuple(description.components), "orientation": description.orientation}
+    settings = {name: value for name, value in possible.items() if value}
+    sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}
+    sensors = []
+    for i, name in enumerate(description.kinds):
+        _check_kind(name, description.kinds[:i])
+        fields = _setting_names(name)
+        kind: Any = KINDS[name](**{k: v for k, v in settings.items() if k in fields})
+        if description.unknown_frames:
+            kind = replace(kind, unknown=_name_unknown_frames(description.unknown_frames, kind))
+        if description.targets:
+            kind = _add_targets(kind, description.targets)
+        noise = np.array([sigma[column.dimension] for column in kind.noise_columns])
+        sensors.append(Sensor(kind, DISTRIBUTIONS[description.distribution](noise)))
+    for setting in settings:
+        if not any(setting in _setting_names(name) for name in description.kinds):
+            kinds = ",".join(description.kinds)
+            raise DataError(
+                f"the setting {setting!r} does not belong to the kind {kinds!r}; remove it, or "
+                "choose another kind"
+            )
+    return Instrument(tuple(sensors))
+
+
+def _check_kind(name: str, earlier: Sequence[str]) -> None:
+    """Raise DataError for an unknown kind, or one that is named twice."""
+    if name not in KINDS:
+        raise DataError(
+            f"{name!r} is not a kind of measurement{suggest_names(name, KINDS)}; known kinds are "
+            f"{', '.join(KINDS)}"
+        )
+    if name in earlier:
+        raise DataError(
+            f"the kind {name!r} is named twice; name it once, and add the second one to the "
+            "measurement file by hand"
+        )
+
+
+def _setting_names(kind: str) -> set[str]:
+    """Return the settings of a kind: the fields of its dataclass."""
+    return {f.name for f in dataclasses.fields(cast(Any, KINDS[kind])) if f.init}
+
+
+def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]:
+    """Return the names that a kind has for unknown frames."""
+    possible: tuple[str, ...] = getattr(kind, "allowed_unknown", ())
+    names = []
+    for frame in frames:
+        if frame not in FRAMES:
+            raise DataError(
+                f"{frame!r} is not a frame that can be unknown; allowed are base, tool, or both"
+            )
+        names_of_frame = [name for name in FRAMES[frame] if name in possible]
+        if not names_of_frame:
+            raise DataError(
+                f"this kind of measurement has no {frame} frame that could be unknown; remove it"
+            )
+        names.append(names_of_frame[0])
+    return tuple(names)
+
+
+def _add_targets(kind: Any, targets: Sequence[str]) -> Any:
+    """Return a kind with these targets, whose places are unknown."""
+    if not isinstance(kind, TargetKind):
+        able = ", ".join(name for name, known in KINDS.items() if issubclass(known, TargetKind))
+        raise DataError(
+            f"the kind {kind.name!r} measures no targets; leave out the targets, or choose one of "
+            f"{able}"
+        )
+    unknown = tuple(dict.fromkeys((*kind.unknown, "targets")))
+    return replace(kind, targets=tuple(targets), unknown=unknown)
+
+
+def place_targets(instrument: Instrument, robot: Mechanism) -> Instrument:
+    """Return the instrument with assumed places of unknown targets that state none.
+
+    Several targets are evenly on a circle around the tool, in the xy plane of the platform; its
+    radius is half of the robot's size, to two digits in the robot's unit of length. One target is
+    at the tool.
+    """
+    unit = find_unit(robot.units[Dimension.LENGTH]).factor_to_si
+    radius = float(f"{robot.size / 2.0 / unit:.2g}")
+    sensors = []
+    for sensor in instrument.sensors:
+        kind = sensor.kind
+        if isinstance(kind, TargetKind) and "targets" in kind.unknown and len(kind.targets) > 1:
+            angles = 2.0 * np.pi * np.arange(len(kind.targets)) / len(kind.targets)
+            circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+            places = np.round(radius * circle, 1 if radius < 100.0 else 0) * unit
+            kind = kind if kind.has_tool else replace(kind, places=places + robot.tool[:3, 3])
+        sensors.append(replace(sensor, kind=kind))
+    return Instrument(tuple(sensors))

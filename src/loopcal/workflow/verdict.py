@@ -7,6 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from enum import Enum
 
+from loopcal.apply.validation import FEW_ROWS, Validation
+from loopcal.diagnose.start_values import StartCheck, StartVerdict
+from loopcal.estimate.residual_test import SIGNIFICANCE, ResidualTest, coverage_factor
 from loopcal.findings import Finding, Severity, report_finding
 
 TOO_FEW_HELD_OUT = (
@@ -177,3 +180,49 @@ def _choose_validation(findings: Sequence[Finding], recommendation: str) -> str:
     if any(finding.code in TOO_FEW_HELD_OUT for finding in findings):
         return "workflow.next-hold-out-more"
     return "workflow.next-hold-out"
+
+
+# --- Whether a machine is given the identified values or keeps its current ones.
+
+
+def recommend_values(
+    verdict: Verdict,
+    start: StartCheck,
+    residual_test: ResidualTest,
+    errors: Validation | None,
+    findings: Iterable[Finding] = (),
+) -> Finding:
+    """Return the recommendation to apply the identified values or to keep the current ones.
+
+    Parameters
+    ----------
+    start : the current values against the fit. residual_test : of the fit, for the scale of the
+        noise. errors : at held-out poses; None without any. findings : of the calibration.
+    """
+    if verdict is Verdict.NOT_CALIBRATED:
+        return report_finding("values.keep-not-calibrated")
+    if start.verdict in (StartVerdict.BEST, StartVerdict.WITHIN_NOISE):
+        return report_finding("values.keep-within-noise")
+    is_open = start.verdict is StartVerdict.OPEN
+    checked = None if errors is None else errors.without_blunders or errors
+    if checked is None or min(checked.judged, checked.values_left) < FEW_ROWS:
+        if is_open:
+            return report_finding("values.keep-undecided")
+        return report_finding(_judge_fitted(residual_test, findings))
+    if is_open:
+        p_value = checked.kinds[-1].compute_gain_p_value(checked.values_left)
+        code = "values.apply-held-out" if p_value < SIGNIFICANCE else "values.keep-undecided"
+        return report_finding(code, p_value=p_value, poses=checked.judged)
+    gain = checked.kinds[-1].gain / residual_test.sigma_scale
+    needed = coverage_factor(residual_test.noise_degrees)
+    code = "values.apply" if gain >= needed else "values.keep-not-confirmed"
+    return report_finding(code, gain=gain, needed=float(needed), poses=checked.judged)
+
+
+def _judge_fitted(test: ResidualTest, findings: Iterable[Finding]) -> str:
+    """Return the code of the recommendation by fitted poses alone, whose gain is beyond noise."""
+    if test.is_doubtful:
+        return "values.keep-doubtful-residuals"
+    if any(finding.code == "model.no-expected-gain" for finding in findings):
+        return "values.keep-no-gain"
+    return "values.apply-fitted"

@@ -10,9 +10,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.engine import select_engine
-from loopcal.io import load_robot
-from loopcal.mechanism import read_coordinates
-from loopcal.mechanism.platform_coordinates import state_target
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.platform_coordinates import read_coordinates, state_target
 from tests.engine.cases import displacement_units, draw_map, make_pose_rows, pose_demand
 from tests.engine.native.instruction_sets import ROBOTS, list_arrays, make_engines, make_robot_case
 from tests.engine.test_compare_poses import draw_poses

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from loopcal.engine import TwistRows
-from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import load_robot
 from tests.engine.cases import draw_map, make_case
 from tests.engine.native.instruction_sets import make_engines
 

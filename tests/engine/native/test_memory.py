@@ -13,7 +13,7 @@ from loopcal.engine import select_engine
 from tests.engine.cases import draw_map, make_case, make_pose_rows
 from tests import zoo
 from loopcal.engine import Target
-from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import load_robot
 
 engine, case = select_engine("native"), make_case(zoo.five_bar(), n=3)
 arguments = case.program, case.e, case.q

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
-from loopcal.io.exports import convert_export, read_profile, save_conversion
+from loopcal.io.exports.conversion import convert_export, save_conversion
+from loopcal.io.exports.profile import read_profile
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import export_robot, save_imported
 from loopcal.io.formats.program_format import ExportSource, ImportOptions

@@ -7,7 +7,7 @@ import loopcal as lc
 from loopcal.errors import FileError
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from tools.fuzz.sources import SOURCES
 
 OWN = {

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io import load_robot, save_robot
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
-from loopcal.mechanism import Mechanism
+from loopcal.io.robot.robot_file import load_robot, save_robot
+from loopcal.mechanism.model import Mechanism
 from tools.fuzz.sources import MARLIN, REPRAP
 
 

@@ -6,11 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError, MechanismError
-from loopcal.io import load_robot
 from loopcal.io.formats.gcode_program import GcodeSettings, format_gcode, read_stops
-from loopcal.planning import check_route
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.planning.path import check_route
 
 SHEET = """\
 ## Poses of hexapod-42

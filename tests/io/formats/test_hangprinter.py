@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from loopcal import forward, inverse
-from loopcal.diagnose import identifiability
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import FileError
-from loopcal.io import load_measurements
+from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot

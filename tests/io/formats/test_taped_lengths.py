@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import FileError
-from loopcal.io import load_robot
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ImportOptions
+from loopcal.io.robot.robot_file import load_robot
 from tests.cable_robot import (
     LINE,
     NAMES,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import ExportSource
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 
 VALUES = {"radius": 105.56123456, "tower1.angle": 210.26712345, "tower1.stop": 299.72774321}
 VALUES |= {"tower2.stop": 299.64701234, "tower3.stop": 300.29862345}

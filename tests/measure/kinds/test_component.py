@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure import Component, Observations, Pose
-from loopcal.measure.kinds.poses.component import SMALL_TILT
+from loopcal.measure.kinds.poses import SMALL_TILT, Component, Pose
+from loopcal.measure.observations import Observations
 from tests.jacobians import check_jacobian
 
 FIVE = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", T_platform_tool=np.eye(4))

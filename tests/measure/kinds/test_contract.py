@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure import KINDS, Observations
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.observations import Observations
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 

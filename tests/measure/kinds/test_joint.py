@@ -6,18 +6,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    JointSensor,
-    Locked,
-    Sensor,
-    evaluate_measurements,
-    select_joint_values,
-    simulate,
-    whiten_rows,
-)
-from loopcal.mechanism import forward_trials, inverse
+from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.joints import JointSensor, Locked
+from loopcal.measure.readings import select_joint_values
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.solutions import inverse
 from tests import zoo
 
 COMMANDED = np.random.default_rng(2).uniform([0.65, -np.pi, 0.05], [0.75, np.pi, 0.2], (8, 3))

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure import Observations, Pose
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.observations import Observations
 
 
 def test_residual_is_a_rotation_vector_and_a_difference_of_positions():

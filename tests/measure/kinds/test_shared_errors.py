@@ -8,17 +8,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError
-from loopcal.measure import (
-    KINDS,
-    Component,
-    Distance,
-    Gaussian,
-    Observations,
-    Pose,
-    Sensor,
-    collect_nuisance_parameters,
-)
-from loopcal.measure.kinds.shared_errors import measure_progress
+from loopcal.measure.instrument import Gaussian, Sensor
+from loopcal.measure.kinds import KINDS
+from loopcal.measure.kinds.distance import Distance
+from loopcal.measure.kinds.kind import measure_progress
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.observations import Observations
 from tests.measure.kinds.test_contract import (
     attach_frame_and_tool,
     draw_joint_values,

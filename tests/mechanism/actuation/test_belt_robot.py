@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import loopcal as lc
-from loopcal.mechanism import differentiate_at_pose, differentiate_pose
+from loopcal.mechanism.actuation import differentiate_at_pose
+from loopcal.mechanism.sensitivity import differentiate_pose
 
 SIZE = 4.3  # [m] of the machine
 

@@ -8,17 +8,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
-from loopcal.io import load_robot
-from loopcal.mechanism import (
-    Actuator,
-    Link,
-    Status,
-    build,
-    differentiate_pose,
-    forward,
-    forward_trials,
-    inverse,
-)
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.assembly import Actuator, Link
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian

@@ -8,19 +8,19 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from loopcal.estimate import LeastSquares, identify_trials
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    differentiate_pose,
-    forward,
-    forward_trials,
-    inverse,
-    read_coordinates,
-    sample_workspace,
-)
-from loopcal.mechanism.stages.chain_state import ChainState
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate_trials
+from loopcal.mechanism.chains import ChainState
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from tests.jacobians import check_jacobian
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot

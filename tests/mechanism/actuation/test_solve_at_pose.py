@@ -7,18 +7,12 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
-from loopcal.mechanism import (
-    Joint,
-    Limb,
-    Link,
-    Status,
-    build,
-    differentiate_at_pose,
-    differentiate_passive_joints,
-    forward,
-    inverse,
-    solve_at_pose,
-)
+from loopcal.mechanism.actuation import differentiate_at_pose, solve_at_pose
+from loopcal.mechanism.assembly import Joint, Limb, Link
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.sensitivity import differentiate_passive_joints
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
 from tests import zoo
 from tests.jacobians import check_jacobian
 

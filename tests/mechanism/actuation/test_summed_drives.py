@@ -10,34 +10,23 @@ from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
-from loopcal.estimate import LeastSquares, identify_trials
+from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import (
-    Gaussian,
-    Instrument,
-    Pose,
-    Sensor,
-    sample_truth,
-    select_joint_values,
-    simulate,
-    simulate_trials,
-)
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    analyze_singularity,
-    compute_closure_sign,
-    differentiate_passive_joints,
-    differentiate_pose,
-    find_assembly_modes,
-    forward,
-    forward_trials,
-    inverse,
-    jacobian,
-    sample_workspace,
-    solve_at_pose,
-)
-from loopcal.workflow import calibrate
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.readings import select_joint_values
+from loopcal.measure.simulation import sample_truth, simulate, simulate_trials
+from loopcal.mechanism.actuation import solve_at_pose
+from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.modes import find_assembly_modes
+from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
+from loopcal.mechanism.singularities import analyze_singularity
+from loopcal.mechanism.solutions import forward, inverse, jacobian
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.workflow.calibration import calibrate
 from tests.jacobians import central_difference, check_jacobian, compile_quickly
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot

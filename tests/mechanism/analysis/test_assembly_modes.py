@@ -10,18 +10,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError, MechanismError
-from loopcal.io import load_robot
-from loopcal.mechanism import (
-    PoseRecord,
-    build,
-    driven_values,
-    find_assembly_modes,
-    find_working_modes,
-    forward,
-    inverse,
-    read_coordinates,
-)
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.families.records import PoseRecord
+from loopcal.mechanism.modes import find_assembly_modes, find_working_modes
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import driven_values
 from tests import zoo
 
 # P. Dietmaier, "The Stewart-Gough platform of general geometry can have 40 real postures" (1998,

@@ -6,13 +6,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError
-from loopcal.io import load_robot
-from loopcal.mechanism import (
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.singularities import (
     analyze_singularity,
     compute_median_margins,
-    inverse,
     trace_singularity,
 )
+from loopcal.mechanism.solutions import inverse
 from tests import zoo
 
 

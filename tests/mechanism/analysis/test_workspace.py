@@ -10,8 +10,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import MechanismError
-from loopcal.io import load_robot
-from loopcal.mechanism import build, forward, inverse, sample_workspace
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 from tests import zoo
 
 

@@ -10,7 +10,10 @@ from numpy.testing import assert_allclose
 
 from loopcal.errors import MechanismError
 from loopcal.geometry import invert_pose
-from loopcal.mechanism import Joint, Limb, Link, build, find_assembly_modes, forward, inverse
+from loopcal.mechanism.assembly import Joint, Limb, Link
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.modes import find_assembly_modes
+from loopcal.mechanism.solutions import forward, inverse
 from tests import zoo
 
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
 
 Array = NDArray[np.float64]
 BASE = [

@@ -8,7 +8,8 @@ import pytest
 
 from loopcal import load_robot
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Actuator, Address, Joint, Limb, LinearMap, Link, build
+from loopcal.mechanism.assembly import Actuator, Address, Joint, Limb, LinearMap, Link
+from loopcal.mechanism.compilation import build
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo

@@ -9,31 +9,28 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal import engine, geometry
-from loopcal.diagnose import identifiability
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.engine.numpy_engine import newton
 from loopcal.errors import MechanismError
-from loopcal.io import load_robot
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    build,
-    compare_coordinates,
-    differentiate_passive_joints,
-    differentiate_pose,
-    forward,
-    forward_trials,
-    inverse,
-    propose_added_joints,
-)
-from loopcal.mechanism.compilation.over_constraint import (
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families.joint_release import propose_added_joints
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.over_constraint import (
     find_breaking_parameters,
     find_nearby_states,
     find_over_constraint,
     fix_breaking_parameters,
     is_over_constrained,
 )
-from loopcal.mechanism.states import driven_values
+from loopcal.mechanism.platform_coordinates import compare_coordinates
+from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status, driven_values
 from tests.over_constrained import (
     EXECHON,
     FOUR_BAR,

@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism import (
-    Mechanism,
-    Point,
-    PoseRecord,
-    build,
-    compute_readings,
-    joints_from_readings,
-    select_poses,
-)
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limb_records import JointRecord, LimbRecord, Prismatic, Revolute
 from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.families.records import Point, PoseRecord
+from loopcal.mechanism.kinematics import compute_readings
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.states import select_poses
+from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]

@@ -8,15 +8,10 @@ import pytest
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism import (
-    compare_coordinates,
-    compute_readings,
-    differentiate_pose,
-    forward,
-    forward_trials,
-    inverse,
-    read_coordinates,
-)
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
+from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 from tests.mechanism.families.ranks import random_coordinates

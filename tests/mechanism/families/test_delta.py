@@ -8,15 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.mechanism import (
-    Mechanism,
-    PoseRecord,
-    Workspace,
-    build,
-    differentiate_pose,
-    forward,
-    inverse,
-)
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limb_records import (
     Copies,
     LengthDrive,
@@ -28,6 +20,10 @@ from loopcal.mechanism.families.limb_records import (
 )
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
+from loopcal.mechanism.families.records import PoseRecord, Workspace
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
 from tests.mechanism.families.ranks import random_coordinates
 from tests.zoo import load_cached_robot
 

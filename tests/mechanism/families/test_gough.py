@@ -14,19 +14,13 @@ from numpy.typing import NDArray
 
 from loopcal import geometry as rigid
 from loopcal.errors import MechanismError
-from loopcal.mechanism import (
-    LengthTolerance,
-    Mechanism,
-    PoseRecord,
-    Workspace,
-    build,
-    check_limits,
-    differentiate_pose,
-    forward,
-    inverse,
-)
-from loopcal.mechanism.families.gough import Gough, GoughCones
-from loopcal.mechanism.families.hexapod_legs import Screw
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families.gough import Gough, GoughCones, Screw
+from loopcal.mechanism.families.records import LengthTolerance, PoseRecord, Workspace
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import check_limits
 from tests import zoo
 from tests.mechanism.families.ranks import (
     perturb,

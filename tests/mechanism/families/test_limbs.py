@@ -12,16 +12,7 @@ import pytest
 
 from loopcal.errors import LoopcalError, MechanismError
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import (
-    LengthTolerance,
-    Mechanism,
-    PoseRecord,
-    build,
-    check_limits,
-    differentiate_pose,
-    forward,
-    inverse,
-)
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Copies,
@@ -39,7 +30,12 @@ from loopcal.mechanism.families.limb_records import (
     Universal,
 )
 from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.families.three_prs import ThreePrs
+from loopcal.mechanism.families.prs import ThreePrs
+from loopcal.mechanism.families.records import LengthTolerance, PoseRecord
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import check_limits
 from tests.mechanism.families.random_limbs import (
     build_mechanism,
     expected_rank,

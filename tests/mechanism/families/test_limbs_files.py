@@ -8,7 +8,8 @@ import pytest
 
 from loopcal.errors import LoopcalError
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
-from loopcal.mechanism import Mechanism, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import inverse
 
 LIMBS = tuple(
     name for name in list_shipped_robots() if "\nfamily: limbs" in find_robot_file(name).read_text()

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from loopcal.engine.numpy_engine.closure import place_links
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Mechanism, PoseRecord, Workspace, build, differentiate_pose
-from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs
-from loopcal.mechanism.families.three_prs import ThreePrs
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.families.prs import LEFT_OUT, RuPusPrs, ThreePrs
+from loopcal.mechanism.families.records import PoseRecord, Workspace
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
 from tests.mechanism.families.ranks import (
     null_vector,
     perturb,

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.mechanism.families.ru_pus_prs import RuPusPrs
-from loopcal.mechanism.families.three_prs import ThreePrs
+from loopcal.mechanism.families.prs import RuPusPrs, ThreePrs
 from tests.mechanism.families.ranks import (
     perturb,
     rank,

@@ -5,7 +5,9 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Status, forward, inverse, sample_workspace
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from tests import zoo
 
 # Table 4 of "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism":

@@ -14,17 +14,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal import engine, geometry
 from loopcal.errors import DataError
 from loopcal.findings.catalog import load_catalog
-from loopcal.mechanism import (
-    Address,
-    LinearMap,
-    Status,
-    build,
-    compute_readings,
-    forward,
-    forward_trials,
-    inverse,
-    jacobian,
-)
+from loopcal.mechanism.assembly import Address, LinearMap
+from loopcal.mechanism.compilation import build
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
+from loopcal.mechanism.solutions import forward, inverse, jacobian
+from loopcal.mechanism.states import Status
 from loopcal.parameters import Parameter
 from tests import zoo
 from tests.engine.cases import actuated_joint_values, stack_dense_rows

@@ -6,10 +6,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism import POSITION, Status, inverse, read_coordinates
-from loopcal.mechanism.kinematics.nearest_pose import controls_all
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
+from loopcal.mechanism.platform_coordinates import POSITION, read_coordinates
+from loopcal.mechanism.solutions import controls_all, inverse
+from loopcal.mechanism.states import Status
 from tests import zoo
 from tests.mechanism.kinematics.test_kinematics import sample_inverse
 

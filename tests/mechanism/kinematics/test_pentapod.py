@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.apply.compensation import Reach, compensate
-from loopcal.mechanism import Mechanism, forward, inverse, jacobian, sample_workspace
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse, jacobian
 from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]

@@ -13,16 +13,11 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism import (
-    Mechanism,
-    Solution,
-    Status,
-    compute_readings,
-    forward,
-    inverse,
-    inverse_trials,
-    read_coordinates,
-)
+from loopcal.mechanism.kinematics import compute_readings, inverse_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.solutions import Solution, forward, inverse
+from loopcal.mechanism.states import Status
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]

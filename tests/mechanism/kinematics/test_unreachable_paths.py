@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from loopcal import engine
-from loopcal.io import load_robot
-from loopcal.mechanism import forward
-from loopcal.mechanism.kinematics import reading_paths
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism import kinematics as reading_paths
+from loopcal.mechanism.solutions import forward
 
 
 @pytest.fixture

@@ -8,16 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from loopcal import engine, geometry
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    differentiate_by_coordinates,
-    forward,
-    inverse,
-    sample_workspace,
-)
-from loopcal.mechanism.stages import chain_inverse
-from loopcal.mechanism.stages.chain_reach import bound_platform
+from loopcal.mechanism import chains as chain_inverse
+from loopcal.mechanism.chains import bound_platform
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import differentiate_by_coordinates, forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]

@@ -14,32 +14,34 @@ from loopcal.apply.compensation import Reach, compensate
 from loopcal.engine import NEAR_GOAL
 from loopcal.errors import DataError
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import solve_commanded_poses
-from loopcal.mechanism import (
-    Mechanism,
-    Solution,
-    Status,
-    check_limits,
-    compare_coordinates,
-    differentiate_pose,
-    draw_coordinates,
-    forward,
-    inverse,
-    read_coordinates,
-    sample_workspace,
-    workspace_ranges,
-)
-from loopcal.mechanism.analysis.modes import find_working_modes
-from loopcal.mechanism.analysis.singularities import trace_singularity
-from loopcal.mechanism.kinematics.batch_kinematics import (
+from loopcal.measure.readings import solve_commanded_poses
+from loopcal.mechanism.kinematics import (
     clear_sign,
     compute_readings,
     forward_trials,
     inverse_trials,
 )
-from loopcal.mechanism.kinematics.pose_solutions import make_solution
-from loopcal.mechanism.kinematics.solution_modes import SAME_POSE, has_bends, judge_modes
-from loopcal.mechanism.states import select_poses
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.modes import find_working_modes
+from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.singularities import trace_singularity
+from loopcal.mechanism.solutions import (
+    SAME_POSE,
+    Solution,
+    forward,
+    has_bends,
+    inverse,
+    judge_modes,
+    make_solution,
+)
+from loopcal.mechanism.states import Status, select_poses
+from loopcal.mechanism.workspace import (
+    check_limits,
+    draw_coordinates,
+    sample_workspace,
+    workspace_ranges,
+)
 from tests.zoo import load_cached_robot
 
 Array = NDArray[np.float64]

@@ -10,10 +10,14 @@ from scipy.optimize import least_squares, root_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from loopcal.estimate import identify
-from loopcal.io import load_robot
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
-from loopcal.mechanism import Mechanism, forward, inverse, sample_workspace
+from loopcal.estimate.identification import identify
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import sample_truth, simulate
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.workspace import sample_workspace
 
 Array = NDArray[np.float64]
 

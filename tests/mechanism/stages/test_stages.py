@@ -11,21 +11,15 @@ from scipy.optimize import least_squares
 from loopcal import geometry
 from loopcal.errors import FileError, MechanismError
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    analyze_singularity,
-    compute_limb_frames,
-    differentiate_passive_joints,
-    differentiate_pose,
-    find_assembly_modes,
-    find_working_modes,
-    forward,
-    forward_trials,
-    inverse,
-    sample_workspace,
-)
-from loopcal.report.scene.robot_parts import list_parts
+from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.modes import find_assembly_modes, find_working_modes
+from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
+from loopcal.mechanism.singularities import analyze_singularity
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.report.scene.scene import list_parts
 from tests.denavit_hartenberg import multiply_denavit_hartenberg
 from tests.jacobians import check_jacobian
 from tests.zoo import load_cached_robot

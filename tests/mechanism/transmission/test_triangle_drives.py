@@ -10,26 +10,24 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from loopcal.diagnose import identifiability
+from loopcal.diagnose.identifiable_parameters import identifiability
 from loopcal.errors import FileError, MechanismError
-from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, simulate
-from loopcal.mechanism import (
-    Mechanism,
-    Status,
-    differentiate_passive_joints,
-    differentiate_pose,
-    forward,
-    forward_trials,
-    inverse,
-    locate_anchors,
-    sample_workspace,
-)
-from loopcal.mechanism.transmission.triangle import (
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.kinematics import forward_trials, locate_anchors
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_passive_joints, differentiate_pose
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.transmission import (
     compute_angle,
     compute_length,
     compute_range,
     differentiate_length,
 )
+from loopcal.mechanism.workspace import sample_workspace
 from tests.jacobians import check_jacobian
 from tests.robot_texts import load_text
 from tests.zoo import load_cached_robot

@@ -13,26 +13,30 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
-from loopcal.cli.options.fit_options import fit_options, make_fit_options
-from loopcal.cli.options.shared_options import (
+from loopcal.cli.options import (
     FILE,
     Count,
     PoseShare,
     data_argument,
     data_options,
     file_option,
+    fit_options,
     flag_option,
     force_option,
     frame_option,
     json_option,
+    leave_out_held_out,
     limit_options,
+    make_fit_options,
     print_convention_note,
     read_checked_measurements,
     read_measurements,
     robot_argument,
     seed_option,
+    take_flags,
     verbose_option,
 )
+from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
@@ -131,8 +135,13 @@ def calibrate(
       loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
     """  # noqa: D301
     from loopcal import io, workflow
-    from loopcal.io.runs.run_folder import build_document, load_run, refuse_run_folder, save_run
-    from loopcal.io.runs.run_verdict import name_robot_file
+    from loopcal.io.runs.run_folder import (
+        build_document,
+        load_run,
+        name_robot_file,
+        refuse_run_folder,
+        save_run,
+    )
     from loopcal.report.calibration_view import view_calibration
 
     inputs = _list_inputs(robot, data, prior, compare)
@@ -195,7 +204,7 @@ def budget(run: Path, as_json: bool) -> int:
       loopcal budget run --json
     """  # noqa: D301
     from loopcal.io.runs.run_folder import load_run
-    from loopcal.report.budget_view import view_budget
+    from loopcal.report.calibration_view import view_budget
 
     calibrated = load_run(run)
     content = calibrated.load_budget()
@@ -248,10 +257,10 @@ def validate(
       loopcal validate run more.csv --limit-position 0.02mm --limit-angle 0.01deg
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
-    from loopcal.apply import report_reused_rows
-    from loopcal.apply import validate as validate_robot
+    from loopcal.apply.validation import report_reused_rows
+    from loopcal.apply.validation import validate as validate_robot
     from loopcal.io.runs.run_folder import load_run_or_robot
-    from loopcal.measure import check_instruments
+    from loopcal.measure.observations import check_instruments
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
@@ -331,18 +340,13 @@ def compensate(
       loopcal compensate run targets.csv -o readings.csv
       loopcal compensate run targets.csv --mode commands -o commands.csv
     """  # noqa: D301
-    from loopcal.apply import compensate as compensate_targets
-    from loopcal.io import load_robot
+    from loopcal.apply.compensation import compensate as compensate_targets
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.runs.compensation_file import (
-        format_compensation,
-        load_targets,
-        save_compensation,
-    )
+    from loopcal.io.robot.robot_file import load_robot
+    from loopcal.io.runs.result_files import format_compensation, load_targets, save_compensation
     from loopcal.io.runs.run_folder import find_failure, load_posterior_or_robot
-    from loopcal.mechanism import Mechanism
-    from loopcal.report.calibration_view import with_hint
-    from loopcal.report.compensation_view import view_compensation
+    from loopcal.mechanism.model import Mechanism
+    from loopcal.report.calibration_view import view_compensation, with_hint
 
     inputs = (run, targets, None if controller is None else Path(controller))
     refuse_outputs((output,), inputs, force)
@@ -371,3 +375,282 @@ def compensate(
         if not is_usable
     ]
     return terminal.print_failures([*([] if failure is None else [failure]), *missed])
+
+
+# --- `loopcal certificate`: a digital calibration certificate of a run.
+
+
+@click.command()
+@click.argument("run", metavar="[RUN]", type=FILE, required=False)
+@click.argument("facts", metavar="[FACTS]", type=FILE, required=False)
+@flag_option("--new", help="Print a file FACTS to fill in.")
+@json_option
+def certificate(run: Path | None, facts: Path | None, new: bool, as_json: bool) -> int:
+    """Print a digital calibration certificate of RUN: XML by PTB's schema DCC 3.3.0.
+
+    FACTS is a YAML file with what a run does not know: laboratory, customer, dates, serial number.
+    Instruments are those that the measurement files state.
+
+    \b
+    Examples:
+      loopcal certificate --new > facts.yaml
+      loopcal certificate run facts.yaml > certificate.xml
+    """  # noqa: D301
+    from loopcal.io.runs.certificate import TEMPLATE, format_certificate, load_administration
+    from loopcal.io.runs.run_folder import load_run_or_robot
+
+    if new:
+        if run is not None:
+            raise DataError("--new prints a file to fill in; leave out RUN and FACTS")
+        return _print("facts", TEMPLATE, as_json)
+    if run is None or facts is None:
+        raise DataError("RUN and FACTS are needed; loopcal certificate --new prints a file FACTS")
+    text = format_certificate(load_run_or_robot(run), load_administration(facts))
+    return _print("certificate", text, as_json)
+
+
+def _print(name: str, text: str, as_json: bool) -> int:
+    """Print a text, or a JSON object that holds it, and return the exit code."""
+    if as_json:
+        terminal.print_json({name: text})
+    else:
+        click.echo(text, nl=False)
+    return 0
+
+
+# --- `loopcal compare`: calibrations side by side.
+
+
+@click.command()
+@click.argument("runs", metavar="RUN...", type=FILE, nargs=-1, required=True)
+@click.option(
+    "--data",
+    "data",
+    type=FILE,
+    multiple=True,
+    metavar="DATA",
+    help="Measurements at which the errors of all runs are compared. May be given several times.",
+)
+@file_option(
+    "-o",
+    "--output",
+    help="File to write: .html (a page with figures), .json, or .csv (one row for each run and "
+    "parameter).",
+)
+@data_options
+@force_option("the output file")
+@json_option
+def compare(
+    runs: tuple[Path, ...],
+    data: tuple[Path, ...],
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    **flags: Any,
+) -> int:
+    """Compare calibrations side by side: two or more run folders, of sessions, machines or methods.
+
+    The first RUN is the reference of the others. Where the data are independent, whether the
+    machine has changed is tested in what both data sets determine, and the parameter or limb that
+    explains the change is named. If nothing has changed, a change is reported in 5 % of cases, for
+    all runs together. Runs that share measurements are compared without a test.
+
+    Runs whose parameters do not mean the same are refused: other mechanisms, free parameters, or
+    fixed values.
+
+    \b
+    Examples:
+      loopcal compare may june
+      loopcal compare map ridge --data more.csv
+      loopcal compare may june july -o sessions.html
+      loopcal compare may june july -o sessions.csv
+    """  # noqa: D301
+    from loopcal.apply.run_comparison import compare_runs
+    from loopcal.documents import ENDINGS, check_ending, write_comparison
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.runs.run_folder import load_run
+    from loopcal.report.validation_view import find_error_units, view_comparison
+
+    if output is not None:
+        check_ending(output, "comparison", ENDINGS)
+        refuse_outputs((output,), (*runs, *data), force)
+    loaded = [load_run(run) for run in runs]
+    measurements = read_checked_measurements(data, loaded[0].robot, **flags) if data else None
+    comparison = compare_runs(loaded, measurements)
+    if output is not None:
+        write_comparison(output, comparison)
+    if as_json:
+        terminal.print_json(comparison.to_dict())
+        return 0
+    units = find_error_units(comparison)
+    page = view_comparison(comparison, units.__getitem__)
+    terminal.print_page(page if output is None else [*page, "", f"Written to {output}"])
+    return 0
+
+
+# --- `loopcal repeatability`: pose accuracy and repeatability by ISO 9283.
+
+
+@click.command()
+@click.argument("robot", metavar="ROBOT", type=FILE)
+@data_argument("DATA...")
+@data_options
+@json_option
+def repeatability(robot: Path, data: tuple[Path, ...], as_json: bool, **flags: bool) -> int:
+    """Compute pose accuracy (AP) and repeatability (RP) by ISO 9283 from DATA, in which each pose
+    of ROBOT, a run folder or a robot file, was visited several times.
+
+    Each visit is a row with a name of its own; visits of one pose have the same readings, or the
+    same commanded coordinates. The geometry of ROBOT is that of the controller. Visits from several
+    directions have the direction in the column group.
+
+    \b
+    Examples:
+      loopcal repeatability robot.yaml visits.csv
+      loopcal repeatability run visits.csv --json
+    """  # noqa: D301
+    from loopcal.apply.repeatability import assess_repeatability
+    from loopcal.io.runs.run_folder import load_run_or_robot
+    from loopcal.report.validation_view import view_repeatability
+
+    calibrated = load_run_or_robot(robot)
+    measurements = read_checked_measurements(data, calibrated.robot, **flags)
+    result = assess_repeatability(calibrated.robot, measurements, calibrated.nuisance_values)
+    if as_json:
+        terminal.print_json(result.to_dict())
+    else:
+        terminal.print_page(view_repeatability(result, calibrated.robot))
+    return 0
+
+
+# --- `loopcal report`: a calibration as a document to read, sign and archive.
+
+
+@click.command()
+@click.argument("run", metavar="RUN", type=FILE)
+@file_option(
+    "-o",
+    "--output",
+    help="HTML file to write; its name ends in .html. The same content is written as JSON beside "
+    "it. Default: report.html.",
+    default=Path("report.html"),
+)
+@flag_option(
+    "--pdf", help="Also print the report to a PDF file beside it, by an installed Chromium."
+)
+@force_option("the output files")
+@json_option
+def report(run: Path, output: Path, pdf: bool, force: bool, as_json: bool) -> int:
+    """Write the report of RUN, a run folder, as one HTML file that needs no network.
+
+    It contains the verdict with its scope, what the data do not determine, errors at held-out
+    poses, residuals, accuracy over the workspace, parameters, the uncertainty budget, values for
+    the controller, and provenance.
+
+    The exit code is 2 where the calibration failed; the report is written and says so.
+
+    \b
+    Examples:
+      loopcal report run
+      loopcal report run -o hexapod.html --pdf
+    """  # noqa: D301
+    from loopcal.documents import check_browser, name_files, print_pdf, write_report
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.runs.run_folder import load_run
+
+    files = [*name_files(output), *([output.with_suffix(".pdf")] if pdf else [])]
+    calibrated = load_run(run)
+    refuse_outputs(files, [run / name for name in calibrated.result.get("files", {})], force)
+    if pdf:
+        check_browser(files[-1])
+    with terminal.ProgressBar() as progress:
+        progress(0, 1, "writing the report")
+        write_report(output, calibrated)
+        if pdf:
+            progress(0, 1, "printing the report")
+            print_pdf(output, files[-1])
+    failure = calibrated.failure
+    if as_json:
+        terminal.print_json({"output": files, "reasons": [] if failure is None else [failure]})
+    else:
+        terminal.print_page([f"Written to {', '.join(str(file) for file in files)}"])
+    return terminal.print_failures([] if failure is None else [failure])
+
+
+# --- `loopcal regularize`: the held-out error against the strength of regularization.
+
+
+@click.command()
+@robot_argument
+@data_argument("DATA...")
+@file_option("-o", "--output", help="Folder to make, with the curves and their figure.")
+@click.option(
+    "--folds",
+    type=Count("FOLDS", 2),
+    default=5,
+    metavar="N",
+    help="Number of folds of poses where frames, targets or surfaces are unknown.",
+)
+@click.option(
+    "--drop", multiple=True, metavar="POSE", help="Exclude this pose. May be given several times."
+)
+@seed_option("the folds")
+@force_option("the folder")
+@data_options
+@json_option
+def regularize(
+    robot: str,
+    data: tuple[Path, ...],
+    output: Path | None,
+    folds: int,
+    drop: tuple[str, ...],
+    seed: int,
+    force: bool,
+    as_json: bool,
+    **flags: Any,
+) -> None:
+    """Show how the error at held-out poses depends on the ridge parameter lam and on the number k
+    of directions of truncated SVD, for your own DATA, and which values the rules choose.
+
+    Use a chosen value with loopcal calibrate --method ridge --lam, or --method tsvd --keep.
+
+    \b
+    Examples:
+      loopcal regularize hexapod-42 measurements.csv
+      loopcal regularize robot.yaml measurements.csv -o curves
+    """  # noqa: D301
+    from loopcal.diagnose.regularization_curves import compute_regularization_curves
+    from loopcal.estimate.options import FitOptions
+    from loopcal.io.data.measurement_file import list_measurement_files
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot
+    from loopcal.io.runs.result_files import refuse_curves, write_curves
+    from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.report.figures.fit_figures import draw_regularization
+    from loopcal.report.pictures import render_figure
+    from loopcal.report.validation_view import tabulate_points, view_regularization
+
+    machine = load_robot(robot)
+    inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
+    if output is not None:
+        refuse_curves(output, force, list(inputs.values()))
+    measurements = leave_out_held_out(read_checked_measurements(data, machine, **take_flags(flags)))
+    with terminal.ProgressBar() as progress:
+        curves = compute_regularization_curves(
+            machine,
+            measurements,
+            options=FitOptions(excluded_poses=drop),
+            folds=folds,
+            seed=seed,
+            progress=progress,
+        )
+    if output is not None:
+        picture = render_figure(draw_regularization(curves), ".png")
+        made_by = collect_provenance(["loopcal", *sys.argv[1:]], inputs, {"folds": seed})
+        document = {**curves.to_dict(), "made_by": made_by}
+        write_curves(output, document, tabulate_points(curves).to_csv(), picture, force)
+    if as_json:
+        terminal.print_json(curves.to_dict())
+        return
+    written = f"Written to {output}: curves.json, curves.csv, curves.png"
+    page = view_regularization(curves)
+    terminal.print_page(page if output is None else [*page, "", written])

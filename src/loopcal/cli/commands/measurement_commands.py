@@ -12,42 +12,40 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
-from loopcal.cli.options.fit_options import rank_tolerance_option
-from loopcal.cli.options.instrument_options import (
+from loopcal.cli.options import (
     DESCRIPTION,
-    distribution_option,
-    draw_option,
-    instrument_options,
-    make_instrument,
-    parse_reading_sigma,
-    sigma_reading_option,
-    unknown_options,
-)
-from loopcal.cli.options.shared_options import (
     POSITIVE_ANGLE,
     POSITIVE_LENGTH,
     data_argument,
     data_options,
+    distribution_option,
+    draw_option,
     file_option,
     flag_option,
     force_option,
+    instrument_options,
     is_given,
     json_option,
     leave_out_held_out,
+    make_instrument,
     name_option,
+    parse_reading_sigma,
+    rank_tolerance_option,
     read_checked_measurements,
     refuse_given,
     robot_argument,
     seed_option,
+    sigma_reading_option,
     take_flags,
+    unknown_options,
     verbose_option,
 )
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.diagnose import IdentifiableSubset
-    from loopcal.mechanism import Mechanism
-    from loopcal.workflow.identifiability_report import IdentifiabilityReport
+    from loopcal.diagnose.parameter_subset import IdentifiableSubset
+    from loopcal.mechanism.model import Mechanism
+    from loopcal.workflow.inspection import IdentifiabilityReport
     from loopcal.workflow.simulated_measurements import SimulatedMeasurements
 
 
@@ -122,12 +120,11 @@ def identifiability(
       loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
       loopcal identifiability hexapod-42 measurements.csv --useful 1um
     """  # noqa: D301
-    from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot
     from loopcal.numerics.decomposition import RANK_TOLERANCE
-    from loopcal.report.identifiability_view import view_identifiability
-    from loopcal.workflow.identifiability_report import analyze_identifiability
+    from loopcal.report.calibration_view import view_identifiability
+    from loopcal.workflow.inspection import analyze_identifiability
     from loopcal.workflow.simulated_measurements import predict_noise_free
 
     if data:
@@ -215,7 +212,7 @@ def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
 
 def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
     """Write the robot file with the parameters fixed that are left out."""
-    from loopcal.io.robot.derived_robots import save_reduced_robot
+    from loopcal.io.robot.robot_file import save_reduced_robot
 
     words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
     save_reduced_robot(subset.robot, words, output)
@@ -279,9 +276,9 @@ def simulate(
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
     """  # noqa: D301
     from loopcal.findings import report_finding
-    from loopcal.io import load_robot, save_measurements, save_robot
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
-    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.io.data.measurement_writer import save_measurements
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
     from loopcal.workflow.simulated_measurements import simulate_measurements
 
     refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
@@ -345,14 +342,14 @@ def _fill_in(
     robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
 ) -> tuple[SimulatedMeasurements, str]:
     """Return the filled-in data of a plan, and what they are."""
-    from loopcal.io import load_measurements
     from loopcal.io.data.measurement_file import (
         has_empty_readings,
         load_contact_sheet,
         load_instrument,
+        load_measurements,
     )
     from loopcal.io.runs.plan_folder import find_plan_sheet
-    from loopcal.measure import Closure
+    from loopcal.measure.kinds.joints import Closure
     from loopcal.workflow.simulated_measurements import fill_in_contacts, fill_in_measurements
 
     refuse_given(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.options.shared_options import (
+from loopcal.cli.options import (
     Count,
     data_argument,
     data_options,
@@ -27,11 +27,10 @@ from loopcal.cli.options.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from loopcal.estimate.published_methods.per_leg import PerLegEstimate
+    from loopcal.estimate.published_steps import PerLegEstimate
     from loopcal.papers.printed import Table as PrintedTable
     from loopcal.papers.reproduction import Reproduction
-    from loopcal.report.tables import Table
-    from loopcal.report.text_page import Block
+    from loopcal.report.tables import Block, Table
 
 HEADING = 18
 """Characters of a line of a heading."""
@@ -130,10 +129,9 @@ def per_leg(
       loopcal per-leg hexapod-42 measurements.csv
       loopcal per-leg hexapod-42 measurements.csv --steps 2 -o per-leg.yaml
     """  # noqa: D301
-    from loopcal.estimate.published_methods.per_leg import identify_per_leg
-    from loopcal.io import load_robot, save_robot
+    from loopcal.estimate.published_steps import identify_per_leg
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot, save_robot
 
     refuse_outputs((output,), (find_robot_file(robot), *data), force)
     machine = load_robot(robot)

@@ -13,33 +13,36 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
-from loopcal.cli.options.constraint_options import Goal, constraint_options, make_constraints
-from loopcal.cli.options.instrument_options import (
+from loopcal.cli.options import (
     DESCRIPTION,
-    instrument_options,
-    make_instrument,
-    unknown_options,
-)
-from loopcal.cli.options.shared_options import (
     Count,
+    Goal,
+    constraint_options,
     data_option,
     file_option,
     flag_option,
     force_option,
     frame_option,
+    instrument_options,
     is_given,
     json_option,
+    make_constraints,
+    make_instrument,
     name_option,
     read_checked_measurements,
     robot_argument,
     seed_option,
+    unknown_options,
 )
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.measure import Instrument, Measurements
-    from loopcal.mechanism import Mechanism
-    from loopcal.planning import Constraints, Plan, PlanOptions, SurfacePlan
+    from loopcal.measure.instrument import Instrument
+    from loopcal.measure.measurements import Measurements
+    from loopcal.mechanism.model import Mechanism
+    from loopcal.planning.constraints import Constraints, PlanOptions
+    from loopcal.planning.plane_line_planning import SurfacePlan
+    from loopcal.planning.result import Plan
 
 PLANE_LINE = "plane-line"
 """Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
@@ -153,7 +156,7 @@ def plan(
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
     """  # noqa: D301
-    from loopcal.io import load_robot
+    from loopcal.io.robot.robot_file import load_robot
     from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
 
     inputs = _list_inputs(robot, like, allowed, measured)
@@ -170,7 +173,7 @@ def plan(
             raise DataError("--groups and --points belong to --measure plane-line; leave them out")
         instrument = _find_instrument(machine, like, options)
         plan_options = _make_plan_options(machine, allowed, measured, seed, options)
-        from loopcal.planning import plan as plan_poses
+        from loopcal.planning.pose_planning import plan as plan_poses
 
         with terminal.ProgressBar() as progress:
             result = plan_poses(machine, instrument, options=plan_options, progress=progress)
@@ -214,7 +217,7 @@ def _make_plan_options(
 ) -> PlanOptions:
     """Return the options of the library."""
     from loopcal.io.data.measurement_file import load_poses
-    from loopcal.planning import PlanOptions
+    from loopcal.planning.constraints import PlanOptions
 
     accuracy = options["accuracy"]
     if accuracy is not None and options["poses"] is not None:
@@ -283,9 +286,8 @@ def _write_plan(
         write_plan_folder,
     )
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.planning import Plan
-    from loopcal.planning.result import list_stops
-    from loopcal.report.figures import draw_curve, draw_plan
+    from loopcal.planning.result import Plan, list_stops
+    from loopcal.report.figures.plan_figures import draw_curve, draw_plan
     from loopcal.report.pictures import render_figure
 
     figures = {}
@@ -323,7 +325,7 @@ def _plan_surfaces(
     seed: int,
 ) -> SurfacePlan:
     """Plan groups of points on planes and lines."""
-    from loopcal.planning import SurfaceOptions, plan_surfaces
+    from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces
 
     options = SurfaceOptions(
         GROUPS if groups is None else groups,

@@ -10,17 +10,16 @@ from typing import Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.options.instrument_options import (
-    instrument_options,
-    make_instrument,
-    unknown_options,
-)
-from loopcal.cli.options.shared_options import (
+from loopcal.cli.options import (
+    complete_robot,
     file_option,
     flag_option,
     force_option,
+    instrument_options,
     json_option,
+    make_instrument,
     robot_argument,
+    unknown_options,
 )
 
 
@@ -50,13 +49,12 @@ def new(
           --kind position --targets SMR1,SMR2,SMR3 --frames base --sigma-position 15um
     """  # noqa: D301
     from loopcal.io.core.csv_table import refuse_settings_beside
-    from loopcal.io.core.names import make_name
+    from loopcal.io.core.limits import make_name
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.core.text_file import write_text
     from loopcal.io.core.yaml_file import parse_yaml
     from loopcal.io.data.measurement_writer import format_template
-    from loopcal.io.robot.derived_robots import format_new_robot
-    from loopcal.io.robot.robot_file import build_robot
+    from loopcal.io.robot.robot_file import build_robot, format_new_robot
 
     make_instrument(options)  # refuses wrong options before anything is written
     refuse_outputs((output, measurements), (), force)
@@ -106,16 +104,15 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
       loopcal check linear-delta --expand
       loopcal check 3-prs --plot 3-prs.png
     """  # noqa: D301
-    from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_bytes
-    from loopcal.io.robot.robot_file import find_robot_file
-    from loopcal.workflow.robot_inspection import inspect_robot
+    from loopcal.io.robot.robot_file import find_robot_file, load_robot
+    from loopcal.workflow.inspection import inspect_robot
 
     refuse_outputs((plot,), (find_robot_file(robot),), force)
     inspection = inspect_robot(load_robot(robot))
     if plot is not None:
-        from loopcal.report.figures import draw_robot
+        from loopcal.report.figures.robot_figure import draw_robot
         from loopcal.report.pictures import save_figure
 
         save_figure(plot, draw_robot(inspection.robot), write=write_bytes)
@@ -123,8 +120,7 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
         assembly = {"assembly": inspection.robot.assembly} if expand else {}
         terminal.print_json(inspection.to_dict() | assembly)
         return
-    from loopcal.report.assembly_view import view_assembly
-    from loopcal.report.robot_view import view_robot
+    from loopcal.report.robot_view import view_assembly, view_robot
 
     page = view_robot(inspection)
     if expand:
@@ -132,3 +128,124 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     if plot is not None:
         page += ["", f"Picture: {plot}"]
     terminal.print_page(page)
+
+
+# --- `loopcal view`: a robot, or a calibration, as an interactive 3-D view in the browser.
+
+OUTPUT = Path("view.html")
+
+
+@click.command()
+@click.argument("source", metavar="RUN|ROBOT", shell_complete=complete_robot)
+@file_option(
+    "-o", "--output", help=f"HTML file to write; its name ends in .html. Default: {OUTPUT}."
+)
+@flag_option("--no-browser", help="Do not open the view in the browser.")
+@force_option("the output file")
+@json_option
+def view(source: str, output: Path | None, no_browser: bool, force: bool, as_json: bool) -> int:
+    """Show RUN, a run folder, or a robot file as an interactive 3-D view in the browser.
+
+    The view is one HTML file that needs no network. It shows the robot at home; of a run also at
+    the measured poses, with the position errors before calibration and the uncertainty over the
+    workspace.
+
+    The exit code is 2 where the calibration of RUN failed; the view is written and says so.
+
+    \b
+    Examples:
+      loopcal view hexapod-42
+      loopcal view run -o hexapod.html --no-browser
+    """  # noqa: D301
+    from loopcal.documents import check_ending, open_page, write_view
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.runs.run_folder import load_run_or_robot
+
+    output = output or OUTPUT
+    check_ending(output, "view")
+    run = load_run_or_robot(source)
+    files = [Path(source) / name for name in run.result.get("files", {})]
+    refuse_outputs((output,), files or (Path(source),), force)
+    with terminal.ProgressBar() as progress:
+        progress(0, 1, "writing the view")
+        write_view(output, run if run.result else run.robot)
+    is_open = not no_browser and open_page(output.resolve().as_uri())
+    failure = run.failure
+    failures = [] if failure is None else [failure]
+    if as_json:
+        terminal.print_json({"output": output, "opened": is_open, "reasons": failures})
+    else:
+        unopened = "" if is_open or no_browser else "; no browser could be started here"
+        terminal.print_page([f"Written to {output}{unopened}"])
+    return terminal.print_failures(failures)
+
+
+# --- `loopcal example` and `loopcal completion`: files to begin with, and a shell that completes.
+
+SHELLS = ("bash", "zsh", "fish")
+"""Shells whose completion click can write."""
+
+
+@click.command()
+@click.argument("name", metavar="[NAME]", required=False)
+@file_option("-o", "--output", help="Folder to make; by default one with the name of the example.")
+@json_option
+def example(name: str | None, output: Path | None, as_json: bool) -> int:
+    """Write the files of an example into a new folder; without NAME, list the examples.
+
+    \b
+    Examples:
+      loopcal example
+      loopcal example hexapod-42
+      loopcal example delta-printer -o printer
+    """  # noqa: D301
+    from loopcal.io.example_folders import describe_example, list_examples, write_example
+    from loopcal.report.tables import Table, word_column
+
+    if name is None:
+        titles = {name: describe_example(folder) for name, folder in list_examples().items()}
+        if as_json:
+            terminal.print_json({"examples": titles})
+            return 0
+        columns = (word_column("example"), word_column("content", wraps=True))
+        table = Table("Examples; loopcal example NAME writes one", columns, tuple(titles.items()))
+        terminal.print_page([table])
+        return 0
+    folder = Path(name) if output is None else output
+    files = write_example(name, folder)
+    if as_json:
+        terminal.print_json({"example": name, "folder": str(folder), "files": files})
+    else:
+        terminal.print_page([f"Written to {folder}: {', '.join(files)}"])
+    return 0
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(SHELLS))
+@json_option
+def completion(shell: str, as_json: bool) -> int:
+    """Print the script with which SHELL completes commands, options, names of robots and files.
+
+    \b
+    Add to the start-up file of your shell:
+      bash  ~/.bashrc                        eval "$(loopcal completion bash)"
+      zsh   ~/.zshrc                         eval "$(loopcal completion zsh)"
+      fish  ~/.config/fish/config.fish       loopcal completion fish | source
+
+    \b
+    Examples:
+      loopcal completion bash
+    """  # noqa: D301
+    from click.shell_completion import get_completion_class
+
+    from loopcal.cli.entry_point import command_line
+
+    writer = get_completion_class(shell)
+    assert writer is not None  # SHELLS are those of click
+    script = writer(command_line, {}, "loopcal", "_LOOPCAL_COMPLETE")
+    text = script.source_template % script.source_vars()
+    if as_json:
+        terminal.print_json({"shell": shell, "script": text})
+    else:
+        terminal.print_text(text)
+    return 0

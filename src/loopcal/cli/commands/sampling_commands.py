@@ -3,33 +3,132 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+import numpy as np
 
 from loopcal.cli import terminal
-from loopcal.cli.options.fit_options import fit_options
-from loopcal.cli.options.fit_source import load_fit
-from loopcal.cli.options.shared_options import (
+from loopcal.cli.options import (
     Count,
     add_options,
     data_argument,
     data_options,
     file_option,
+    fit_options,
     flag_option,
     force_option,
     json_option,
+    leave_out_held_out,
+    make_fit_options,
+    read_checked_measurements,
     refuse_given,
     seed_option,
+    take_flags,
 )
+from loopcal.errors import EstimationError, LoopcalError
+from loopcal.findings import report_finding
 
 if TYPE_CHECKING:
-    from loopcal.report.text_page import Block
-    from loopcal.sampling.block_bootstrap import Bootstrap
+    from loopcal.estimate.result import Identification
+    from loopcal.io.runs.run_folder import Run
+    from loopcal.measure.measurements import Measurements
+    from loopcal.report.tables import Block
+    from loopcal.sampling.bootstrap import Bootstrap
     from loopcal.sampling.intervals import Intervals
     from loopcal.sampling.posterior_sample import PosteriorSample
     from loopcal.typing import FloatArray
+
+
+# --- The fit that a command examines further: that of a run folder, repeated, or a new one.
+
+EQUAL = 1e-2
+"""Largest difference of a repeated estimate from that of the run, in standard deviations."""
+
+
+def load_fit(
+    source: str, data: Sequence[Path], options: Mapping[str, Any]
+) -> tuple[Identification, Measurements]:
+    """Return a fit with its measurements, and with the uncertainty that `calibrate` states.
+
+    Parameters
+    ----------
+    source : a run folder, or with `data` a robot file. options : those of `fit_options` and
+        `data_options`.
+
+    Raises
+    ------
+    LoopcalError : see `loopcal.identify` and `Run.load_measurements`; or the run cannot be
+        repeated.
+    """
+    from loopcal.diagnose.adjusted_uncertainty import adjust_uncertainty
+    from loopcal.estimate.identification import identify
+    from loopcal.io.robot.robot_file import load_robot
+    from loopcal.io.runs.run_folder import load_run
+
+    if data:
+        robot = load_robot(source)
+        flags = take_flags(options)
+        measurements = leave_out_held_out(read_checked_measurements(data, robot, **flags))
+        with terminal.ProgressBar() as progress:
+            fit = identify(
+                robot, measurements, options=make_fit_options(options), progress=progress
+            )
+    else:
+        if Path(source).is_file():
+            raise LoopcalError(
+                f"{source}: this is a file; give a run folder, or the files of measurements after "
+                "that of the robot"
+            )
+        refuse_given(options, "with a run folder")
+        fit, measurements = _repeat_run(load_run(source))
+    return adjust_uncertainty(fit, measurements), measurements
+
+
+def _repeat_run(run: Run) -> tuple[Identification, Measurements]:
+    """Return the fit of a run, made again from its files and the options of its command line."""
+    from dataclasses import replace
+
+    from loopcal.estimate.identification import identify
+    from loopcal.estimate.options import FitOptions
+    from loopcal.estimate.recalibration import recalibrate
+    from loopcal.io.runs.run_folder import load_run
+
+    stated = _read_options(run)
+    accepted = ("allow_outside_stroke", "allow_duplicates")
+    data, _ = run.load_measurements(**{name: bool(stated.get(name)) for name in accepted})
+    options = make_fit_options(stated) if stated else FitOptions()
+    options = replace(options, excluded_poses=())  # they are no longer among the measurements
+    with terminal.ProgressBar() as progress:
+        if stated.get("prior") is not None:
+            earlier, limb = load_run(stated["prior"]).load_posterior(), stated.get("free_limb")
+            fit, _ = recalibrate(
+                run.initial_robot, data, earlier, limb, options=options, progress=progress
+            )
+        else:
+            fit = identify(run.initial_robot, data, options=options, progress=progress)
+    estimate, sd = run.arrays["estimate"], fit.standard_deviations
+    if len(estimate) != len(sd):
+        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
+    off = np.abs(fit.estimate - estimate) > EQUAL * np.where(np.isfinite(sd), sd, np.inf)
+    if off.any():
+        raise EstimationError(report_finding("sampling.run-not-repeated", run=str(run.path)))
+    return fit, data
+
+
+def _read_options(run: Run) -> dict[str, Any]:
+    """Return the options of the command `calibrate` that made a run; none for a run of Python."""
+    from loopcal.cli.commands.calibration_commands import calibrate
+
+    words: list[str] = list((run.result.get("made_by") or {}).get("command") or ())
+    if "calibrate" not in words:
+        return {}
+    given = words[words.index("calibrate") + 1 :]
+    context: click.Context = calibrate.make_context("calibrate", given, resilient_parsing=True)
+    return context.params
+
 
 MOST_DIGITS = 10
 """Digits of a number of poses; a longer text is no unit of resampling."""
@@ -109,8 +208,8 @@ def bootstrap(
       loopcal bootstrap run --unit session --count 2000 -o draws.csv
       loopcal bootstrap hexapod-42 measurements.csv --method ls
     """  # noqa: D301
-    from loopcal.report.sampling_view import view_bootstrap
-    from loopcal.sampling import bootstrap as resample
+    from loopcal.report.validation_view import view_bootstrap
+    from loopcal.sampling.bootstrap import bootstrap as resample
 
     _refuse_output(output, source, data, force)
     fit, measurements = load_fit(source, data, options)
@@ -181,8 +280,8 @@ def sample(
       loopcal sample linear-delta measurements.csv --method map
       loopcal sample run --region -p radius -p 'tower*.angle'
     """  # noqa: D301
-    from loopcal.report.sampling_view import view_posterior
-    from loopcal.sampling import sample_posterior
+    from loopcal.report.validation_view import view_posterior
+    from loopcal.sampling.posterior_sample import sample_posterior
 
     if region:
         refuse_given(("count", "seed", "output", "force"), "with --region")
@@ -209,8 +308,8 @@ def _show_region(
 ) -> None:
     """Print simultaneous intervals, and the joint region of parameters that were named."""
     from loopcal.io.runs.run_folder import load_run
-    from loopcal.report.sampling_view import view_region
-    from loopcal.sampling import compute_joint_region, compute_simultaneous_intervals
+    from loopcal.report.validation_view import view_region
+    from loopcal.sampling.joint_regions import compute_joint_region, compute_simultaneous_intervals
 
     if data:
         posterior = load_fit(source, data, options)[0].posterior
@@ -243,7 +342,7 @@ def _finish(
     weight: FloatArray | None = None,
 ) -> None:
     """Write the draws, where a file is named, and print the page or JSON."""
-    from loopcal.io.runs.draws_file import save_draws
+    from loopcal.io.runs.result_files import save_draws
 
     if output is not None:
         factors, units = result.fit.free_parameters.display()

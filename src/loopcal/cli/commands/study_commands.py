@@ -3,30 +3,183 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import terminal
 from loopcal.cli.command_group import CommandGroup
-from loopcal.cli.options.shared_options import (
+from loopcal.cli.options import (
     FILE,
     Count,
+    add_options,
     file_option,
     flag_option,
     force_option,
     json_option,
+    refuse_given,
 )
-from loopcal.cli.options.study_options import (
-    choose_work,
-    count_processors,
-    round_duration,
-    run_and_report,
-    worker_options,
+
+if TYPE_CHECKING:
+    from loopcal.studies.driver import RunReport, Share
+    from loopcal.studies.execution.executors import Executor
+    from loopcal.studies.files.store import StudyStore
+    from loopcal.studies.specification.study import Study
+
+
+# --- Options for the workers of a study, and what commands that compute one say.
+
+STOPPED, INCOMPLETE = 1, 2
+"""Exit codes of a study that was stopped, and of one with blocks that could not be computed."""
+
+
+class ShareType(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
+    """A share such as 3/10: the third of ten parts."""
+
+    name = "share"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the share, or fail with what is allowed."""
+        from loopcal.studies.driver import Share
+
+        match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", str(value))
+        if match is None or int(match[1]) > int(match[2]):
+            sentence = f"{value!r} is not a share; write 3/10 for the third of ten parts"
+            self.fail(sentence, param, ctx)
+        return Share(int(match[1]), int(match[2]))
+
+
+worker_options = add_options(
+    click.option(
+        "--workers",
+        type=Count("WORKERS", 1),
+        metavar="N",
+        help="Processes that compute.  [default: the number of processors]",
+    ),
+    click.option(
+        "--dask", metavar="ADDRESS", help="Use a dask cluster, by the address of its scheduler."
+    ),
+    flag_option(
+        "--ray",
+        help="Use the ray cluster of the variable RAY_ADDRESS, or one that is started here.",
+    ),
+    click.option(
+        "--cells",
+        "share",
+        type=ShareType(),
+        metavar="PART/PARTS",
+        help="Compute a share only, such as 3/10 for the third of ten jobs; join their folders "
+        "with merge.",
+    ),
 )
+
+
+@dataclass(frozen=True)
+class Work:
+    """Who computes a study, and which share of it."""
+
+    executor: Executor
+    share: Share
+
+
+def choose_work(share: Share | None, workers: int | None, dask: str | None, ray: bool) -> Work:
+    """Return what the values of `worker_options` mean."""
+    from loopcal.studies.driver import WHOLE
+
+    return Work(_make_executor(workers, dask, ray), share or WHOLE)
+
+
+def run_and_report(
+    chosen: Study, store: StudyStore, folder: Path, work: Work, as_json: bool
+) -> int:
+    """Compute what is missing in an open store, print the report, and return the exit code."""
+    from loopcal.studies.driver import run_blocks
+
+    with _keep_when_stopped(chosen, store, work.share, folder) as stop:
+        with terminal.ProgressBar() as progress:
+            report = run_blocks(chosen, store, work.executor, work.share, progress)
+        _print_report(report, folder, as_json)
+        return 0 if report.is_complete else INCOMPLETE
+    return stop[0]
+
+
+def _make_executor(workers: int | None, dask: str | None, ray: bool) -> Executor:
+    """Return the workers that the options name."""
+    from loopcal.studies.execution.executors import Dask, Ray
+    from loopcal.studies.running import make_local
+
+    if dask is not None:
+        refuse_given(("workers", "ray"), "with --dask")
+        return Dask(dask)
+    if ray:
+        refuse_given(("workers",), "with --ray")
+        return Ray()
+    return make_local(count_processors() if workers is None else workers)
+
+
+def round_duration(seconds: float) -> str:
+    """Return a duration to two digits, in the largest unit in which it is at least one."""
+    unit, factor = next((u for u in (("h", 3600.0), ("min", 60.0)) if seconds >= u[1]), ("s", 1.0))
+    return f"{float(f'{seconds / factor:.2g}'):.6g} {unit}"
+
+
+def count_processors() -> int:
+    """Return the number of processors that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
+@contextmanager
+def _keep_when_stopped(
+    chosen: Study, store: StudyStore, share: Share, folder: Path
+) -> Iterator[list[int]]:
+    """Say what is kept where the body is stopped by Ctrl-C.
+
+    Yields a list that receives the exit code.
+    """
+    from loopcal.findings import report_finding
+    from loopcal.studies.driver import count_blocks, count_stored
+
+    codes: list[int] = []
+    try:
+        yield codes
+    except KeyboardInterrupt:
+        done, total = count_stored(chosen, store, share), count_blocks(chosen, share)
+        finding = report_finding("store.stopped", done=done, total=total, folder=str(folder))
+        terminal.print_message(f"loopcal: {finding}")
+        terminal.print_message("Hint: use --resume to continue")
+        codes.append(STOPPED)
+
+
+def _print_report(report: RunReport, folder: Path, as_json: bool) -> None:
+    """Print what a driver did."""
+    for finding in report.findings:
+        terminal.print_message(f"loopcal: {finding}")
+    if as_json:
+        terminal.print_json({**_list_numbers(report), "folder": str(folder)})
+        return
+    stored = report.before + report.computed
+    blocks = f"{stored} of {report.total} blocks are stored in {folder}"
+    trials = f"{report.computed} new, {report.trials} trials in {round_duration(report.seconds)}"
+    page = [f"{blocks}: {trials}"]
+    if report.is_complete:
+        page.append(f"Next: loopcal study summary {folder}")
+    terminal.print_page(page)
+
+
+def _list_numbers(report: RunReport) -> dict[str, Any]:
+    """Return a report for JSON."""
+    from loopcal.serialization import to_json
+
+    return {**to_json(report), "is_complete": report.is_complete}
+
 
 study_argument = click.argument("study_file", metavar="STUDY", type=FILE)
 folder_argument = click.argument("folder", metavar="FOLDER", type=FILE)
@@ -70,7 +223,7 @@ def new(study_file: Path, robot: str | None, paper: str | None, force: bool, as_
       loopcal study new study.yaml --paper cmm-constraint-2011 --robot hexapod-42
     """  # noqa: D301
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.studies.files.template import write_template
+    from loopcal.studies.files.study_file import write_template
 
     if paper is not None:
         _write_paper_study(study_file, paper, robot, force, as_json)
@@ -120,8 +273,8 @@ def check(study_file: Path, quick: bool, as_json: bool) -> None:
       loopcal study check study.yaml
       loopcal study check study.yaml --quick
     """  # noqa: D301
+    from loopcal.studies.driver import estimate_time, view_estimate
     from loopcal.studies.running import read_source
-    from loopcal.studies.time_estimate import estimate_time, view_estimate
 
     chosen = read_source(study_file, quick).study
     with terminal.ProgressBar() as progress:
@@ -201,7 +354,7 @@ def status(folder: Path, as_json: bool) -> None:
     Examples:
       loopcal study status results
     """  # noqa: D301
-    from loopcal.studies.results.status import read_status, view_status
+    from loopcal.studies.results.study_result import read_status, view_status
 
     state = read_status(folder)
     if as_json:
@@ -232,15 +385,15 @@ def summary(folder: Path, scores: tuple[str, ...], against: str | None, as_json:
       loopcal study summary results --score position_max --score condition
       loopcal study summary results --score position --against instrument
     """  # noqa: D301
-    from loopcal.studies.results.question_view import view_answers
-    from loopcal.studies.results.study_result import StudyResult
-    from loopcal.studies.results.summary_drawing import render_figures
-    from loopcal.studies.results.summary_view import (
+    from loopcal.studies.results.questions import (
         build_document,
         list_shown,
+        view_answers,
         view_summary,
         write_summary,
     )
+    from loopcal.studies.results.study_result import StudyResult
+    from loopcal.studies.results.summary_drawing import render_figures
 
     result = StudyResult(folder)
     with terminal.ProgressBar() as progress:
@@ -294,7 +447,7 @@ def ask(
       loopcal study ask results --smallest poses --limit 10um
       loopcal study ask results --largest noise --score position_max --limit 0.05mm --share 0.9
     """  # noqa: D301
-    from loopcal.studies.results.question_view import view_answers
+    from loopcal.studies.results.questions import view_answers
     from loopcal.studies.results.study_result import StudyResult
 
     if (smallest is None) == (largest is None):
@@ -349,8 +502,8 @@ def merge(part_folders: tuple[Path, ...], output: Path, as_json: bool) -> None:
     Examples:
       loopcal study merge part-1 part-2 part-3 -o results
     """  # noqa: D301
-    from loopcal.studies.files.merging import merge_studies
-    from loopcal.studies.results.status import read_status, view_status
+    from loopcal.studies.files.study_folder import merge_studies
+    from loopcal.studies.results.study_result import read_status, view_status
 
     with terminal.ProgressBar() as progress:
         count = merge_studies(part_folders, output, progress)
@@ -378,7 +531,7 @@ def replay(folder: Path, trial: str, output: Path, force: bool, as_json: bool) -
     Examples:
       loopcal study replay results 3/17 -o trial
     """  # noqa: D301
-    from loopcal.studies.replay_run import calibrate_trial
+    from loopcal.studies.running import calibrate_trial
 
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", trial)
     if match is None:

@@ -15,23 +15,115 @@ are refused only where one of them fits far better: see docs/theory/convention-c
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.conventions.convention_result import ConventionCheck
-from loopcal.diagnose.conventions.interpretations.equal_interpretations import report_equals
 from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
+    BETTER,
+    Comparison,
+    compare_with_robot,
     compute_fitted_misfit,
     compute_quick_misfit,
+    exclude_far_rows,
     is_redundant,
+    judge_data,
+    list_rms_residuals,
+    refine_misfit,
+    select_reached,
+)
+from loopcal.diagnose.conventions.selection import (
+    GROSS,
+    Search,
+    Selection,
+    SetupInterpretation,
+    report_equals,
+    search_interpretations,
+    shares_poses,
 )
 from loopcal.errors import DataError
 from loopcal.estimate.fit_input import check_types
-from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
-from loopcal.mechanism import Mechanism, fix_breaking_parameters, forward
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings.wording import round_to_digits
+from loopcal.measure.data_checks import (
+    check_actuators,
+    check_targets_move,
+    describe_outside_strokes,
+    has_static_targets,
+)
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.over_constraint import fix_breaking_parameters
+from loopcal.mechanism.solutions import forward
+from loopcal.numerics.statistics import find_distinct
+from loopcal.parameters import Parameter
+from loopcal.presentation import HtmlResult
+
+if TYPE_CHECKING:
+    from loopcal.diagnose.conventions.interpretations import Interpretation
+
+
+# --- The result of a convention check.
+
+IMPLAUSIBLE = 10.0
+"""Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
+three times too small, give about 3 each.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class ConventionCheck(HtmlResult):
+    """The stated conventions of measurements against the robot, and the best other interpretation.
+
+    Attributes
+    ----------
+    misfit : root mean square of the residuals over what tolerances and noise allow [1]; NaN with
+        too few rows.
+    interpretation : another one that fits far better; None without one.
+    other_misfit : its misfit, or that without stated setup parameters which the data contradict;
+        NaN without either.
+    alternatives : other interpretations that fit as well.
+    finding : the result; None where the data agree with the stated conventions.
+    """
+
+    misfit: float
+    interpretation: Interpretation | None = None
+    other_misfit: float = float("nan")
+    alternatives: tuple[Interpretation, ...] = ()
+    finding: Finding | None = None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether tolerances and noise do not explain the data as they are stated."""
+        return self.misfit > IMPLAUSIBLE
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether there is clear evidence that the stated conventions are wrong."""
+        return self.finding is not None and self.finding.severity is Severity.REFUSAL
+
+    def __repr__(self) -> str:
+        code = "agrees" if self.finding is None else self.finding.code
+        return f"<ConventionCheck: {code}, misfit {round_to_digits(self.misfit)}>"
+
+    def __str__(self) -> str:
+        return repr(self) if self.finding is None else str(self.finding)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return misfits and findings for JSON."""
+        other = self.interpretation
+        return {
+            "misfit": self.misfit,
+            "interpretation": None if other is None else other.finding,
+            "other_misfit": self.other_misfit,
+            "alternatives": [interpretation.finding for interpretation in self.alternatives],
+            "refused": self.is_refused,
+            "finding": self.finding,
+        }
 
 
 def check_conventions(
@@ -98,7 +190,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     robot : as given, before any fit: its values, and its tolerances (stated or default).
     data : as read. The `source` of its observations, such as a file, appears in the messages.
         Targets on the base are left out: they say nothing about the robot, and
-        `loopcal.diagnose.report_base_targets` compares them with each other.
+        `loopcal.diagnose.frame_drift.report_base_targets` compares them with each other.
 
     Raises
     ------
@@ -116,7 +208,6 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     misfit = compute_quick_misfit(free, known)
     if not misfit > ALLOWED:
         return ConventionCheck(misfit, finding=report_equals(free, known, misfit))
-    from loopcal.diagnose.conventions.implausible_data import compare_interpretations, thin_out
 
     thinned = thin_out(known)
     fitted = compute_fitted_misfit(robot, thinned) if np.isinf(misfit) else np.inf
@@ -144,3 +235,334 @@ def _has_uncertain_readings(data: Measurements) -> bool:
     """Return whether readings have errors, which may explain a misfit of exact ones."""
     sigma = data.reading_sigma
     return sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
+
+
+# --- Check setup parameters (frames, targets, surfaces): stated values, and values kept from a
+# fit.
+
+MOST_SINGLE = 12
+"""Number of stated parameters up to which each is estimated alone, to find the wrong one."""
+
+SMALLER = 3.0
+"""Factor by which errors must decrease when a moved setup item is fitted again."""
+
+ABOVE = 3.0
+"""Standard deviations of the noise (rms) that the errors with kept values must exceed; below, noise
+may be the reason.
+"""
+
+FEWEST = 8
+"""Smallest number of equations beyond the fitted parameters that supports a result."""
+
+
+class Contradiction(NamedTuple):
+    """Stated setup parameters that the data contradict.
+
+    Attributes
+    ----------
+    comparison : of the measurements with these parameters estimated. misfit : the remaining misfit.
+    names : of the parameters. values : for each its name, estimate, stated value and certainty.
+    """
+
+    comparison: Comparison
+    misfit: float
+    names: tuple[str, ...]
+    values: tuple[dict[str, Any], ...]
+
+
+class MovedSetups(NamedTuple):
+    """Frames, targets and surfaces that are no longer where a fit located them.
+
+    Attributes
+    ----------
+    names : of those that moved, or of all that may have moved. times : factor by which the errors
+        decrease when they are fitted again.
+    """
+
+    names: tuple[str, ...]
+    times: float
+
+
+def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:
+    """Find stated setup parameters without which measurements fit far better.
+
+    Parameters
+    ----------
+    stated : the measurements as written. misfit : of these. better : factor by which it must
+        decrease.
+
+    Returns
+    -------
+    Contradiction or None
+        Of the parameter that alone explains the misfit, or else of all stated ones.
+    """
+    present = set(stated.data.nuisance_parameters.table.names)
+    names = tuple(value.name for value in stated.data.stated_values if value.name in present)
+    if not names:
+        return None
+    together = _estimate_stated(stated, names)
+    if not together.misfit * better < misfit:
+        return None
+    options = [together]
+    if 1 < len(names) <= MOST_SINGLE:
+        single = [_estimate_stated(stated, (name,)) for name in names]
+        options += [option for option in single if option.misfit * better < misfit]
+    return min(options, key=lambda option: (len(option.names), option.misfit))
+
+
+def find_moved_setups(
+    names: Sequence[str], sizes: Callable[[tuple[str, ...]], tuple[float, int]]
+) -> MovedSetups | None:
+    """Find frames, targets and surfaces that were moved since a fit.
+
+    Parameters
+    ----------
+    names : of those whose values are kept.
+    sizes : from the names that are fitted again to the root mean square [1] of whitened errors,
+        with the lost degrees of freedom taken into account, and the number of equations left; NaN
+        and 0 where the rows do not determine them.
+    """
+    names = tuple(names)
+    if not names:
+        return None
+    kept, _ = sizes(())
+    fitted, left = sizes(names)
+    if left < FEWEST or not kept > ABOVE or not kept > SMALLER * fitted:
+        return None
+    moved = names
+    if len(names) > 1:
+        moved = tuple(
+            name
+            for name in names
+            if sizes(tuple(other for other in names if other != name))[0] > SMALLER * fitted
+        )
+    return MovedSetups(moved or names, kept / fitted)
+
+
+def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:
+    """Compare the measurements with some stated parameters estimated."""
+    from loopcal.diagnose.conventions.misfit import refine_misfit
+
+    free, data = stated.problem.free, stated.data
+    remaining = tuple(value for value in data.stated_values if value.name not in names)
+    freed = replace(data, stated_values=remaining)
+    comparison = exclude_far_rows(compare_with_robot(free, freed))
+    misfit, estimates = refine_misfit(comparison)
+    before, after = data.nuisance_parameters.table, freed.nuisance_parameters.table
+    values = tuple(
+        _describe_value(
+            free.robot, before.entries[before.index(name)], float(estimates[after.index(name)])
+        )
+        for name in names
+    )
+    return Contradiction(comparison, misfit, names, values)
+
+
+def _describe_value(robot: Mechanism, entry: Parameter, estimate: float) -> dict[str, Any]:
+    """Return estimate, stated value and certainty of a parameter, in the unit of the robot's
+    file.
+    """
+    unit = robot.get_unit(entry.dimension)
+    symbol, factor = unit.symbol, unit.factor_to_si
+    certainty = "fixed"
+    if entry.free and entry.tolerance is not None:
+        certainty = f"sd {entry.tolerance / factor:.3g} {symbol}"
+    return {
+        "name": entry.name,
+        "estimated": f"{estimate / factor:.4g} {symbol}",
+        "stated": f"{entry.nominal / factor:.4g} {symbol}",
+        "certainty": certainty,
+    }
+
+
+# --- Judge measurements that the robot does not explain in one step of a fit: a few rows far off,
+# a wrong statement about frames or targets, another interpretation, or none that is tested.
+
+FEWEST_TO_REFUSE = 8
+"""Smallest number of equations beyond those of unknown frames by which data are refused. With
+fewer, frames and parameters alone explain nearly anything.
+"""
+
+MOST_POSES, RUNS = 120, 4
+"""Number of poses of large data sets by which interpretations are judged, and number of runs of
+neighbors (rows may be shifted by one) that contain them.
+"""
+
+
+def compare_interpretations(
+    free: FreeParameters, thinned: Measurements, has_errors: bool
+) -> ConventionCheck:
+    """Return the check of data that the robot does not explain in one step.
+
+    `has_errors` : readings that count as exact here have errors, which may explain a misfit.
+    """
+    reach = select_reached(free, thinned, follow=True)
+    stated, against, misfit = None, None, np.inf
+    if reach.is_enough:
+        whole = compare_with_robot(free, reach.data)
+        if not whole.misfit > ALLOWED:
+            return ConventionCheck(
+                whole.misfit, finding=report_equals(free, reach.data, whole.misfit)
+            )
+        stated = exclude_far_rows(whole)
+        misfit = min(whole.misfit, refine_misfit(stated)[0])
+        if not misfit > ALLOWED:
+            has_far_rows = whole.misfit > IMPLAUSIBLE and bool(stated.excluded)
+            if has_far_rows:
+                return ConventionCheck(misfit, finding=_report_far_rows(stated))
+            return ConventionCheck(misfit, finding=report_equals(free, reach.data, misfit))
+        if misfit > IMPLAUSIBLE:
+            against = find_contradiction(stated, misfit, BETTER)
+    description = {
+        "robot": free.robot.name,
+        "misfit": misfit,
+        "residuals": () if stated is None else list_rms_residuals(stated),
+        "reached": reach.n_reached if stated is None else None,
+        "poses": reach.n_tested,
+    }
+    if against is not None and against.misfit <= ALLOWED:
+        return _contradict(misfit, against)
+    search = search_interpretations(free, thinned, stated, misfit, misfit > IMPLAUSIBLE)
+    equations = _count_equations(stated, search)
+    if search.selection is not None and equations >= FEWEST_TO_REFUSE:
+        return _refuse(description, misfit, search.selection)
+    if against is not None:
+        return _contradict(misfit, against)
+    if not misfit > IMPLAUSIBLE or has_errors:
+        return ConventionCheck(misfit)
+    return _report_unexplained(description, misfit, search, equations)
+
+
+def _report_unexplained(
+    description: dict[str, Any], misfit: float, search: Search, equations: int
+) -> ConventionCheck:
+    """Report data that no tested interpretation explains, or too few rows to decide which."""
+    if equations < FEWEST_TO_REFUSE:
+        chosen = search.selection
+        listed = () if chosen is None else (chosen.interpretation, *chosen.alternatives)
+        finding = report_finding(
+            "conventions.undecided",
+            **description,
+            equations=equations,
+            needed=FEWEST_TO_REFUSE,
+            alternatives=tuple(other.describe() for other in listed),
+        )
+        return ConventionCheck(misfit, finding=finding)
+    finding = report_finding(
+        "conventions.unexplained", **description, tried=search.tried, pairs=search.pairs
+    )
+    return ConventionCheck(misfit, finding=finding)
+
+
+def _count_equations(stated: Comparison | None, search: Search) -> int:
+    """Return the number of equations beyond those of unknown frames: of the data as written or of
+    the interpretation, whichever has fewer.
+    """
+    chosen = None if search.selection is None else search.selection.comparison
+    compared = [c.linearization for c in (stated, chosen) if c is not None]
+    counts = [int(linear.equations[0]) for linear in compared if linear is not None]
+    return min(counts, default=FEWEST_TO_REFUSE)
+
+
+def thin_out(data: Measurements) -> Measurements:
+    """Return at most `MOST_POSES` poses, in runs of neighbors spread over the data; all where rows
+    share more than their pose.
+    """
+    n = data.n_poses
+    if n <= MOST_POSES or shares_poses(data):
+        return data
+    first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
+    return data.take(find_distinct(first[:, None] + np.arange(MOST_POSES // RUNS)))
+
+
+def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> ConventionCheck:
+    """Refuse data that fit far better in another interpretation; warn where a robot far beyond its
+    tolerances looks the same as a setup item that is not declared unknown.
+    """
+    interpretation, alternatives = chosen.interpretation, chosen.alternatives
+    is_setup = isinstance(interpretation, SetupInterpretation)
+    finding = report_finding(
+        "conventions.other-interpretation",
+        Severity.WARNING if is_setup and not misfit > GROSS else Severity.REFUSAL,
+        **description,
+        interpretation=interpretation.describe(),
+        alternatives=tuple(other.describe() for other in alternatives),
+        other_misfit=chosen.misfit,
+        other_residuals=list_rms_residuals(chosen.comparison),
+        is_consistent=chosen.misfit <= ALLOWED,
+    )
+    return ConventionCheck(misfit, interpretation, chosen.misfit, alternatives, finding)
+
+
+def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
+    """Report stated setup parameters without which the data fit: refused where they contradict the
+    data grossly, else a warning.
+    """
+    finding = report_finding(
+        "conventions.stated-values-contradicted",
+        Severity.REFUSAL if misfit > GROSS else Severity.WARNING,
+        values=against.values,
+        names=against.names,
+        misfit=misfit,
+        other_misfit=against.misfit,
+        residuals=list_rms_residuals(against.comparison),
+        is_consistent=against.misfit <= ALLOWED,
+    )
+    return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
+
+
+def _report_far_rows(stated: Comparison) -> Finding:
+    """Report the rows that do not fit the others, which fit; they stay in the data."""
+    return report_finding(
+        "conventions.rows-far-off",
+        count=len(stated.excluded),
+        rows=sum(len(o) for o in stated.data.observations),
+        poses=tuple(dict.fromkeys(stated.excluded)),
+    )
+
+
+# --- Explain readings outside their strokes by another unit, order, sign or zero.
+
+
+def explain_outside_strokes(
+    robot: Mechanism, data: Measurements, described: Mapping[str, Any] | None = None
+) -> Finding | None:
+    """Find the interpretation that puts all readings inside their strokes and fits the data.
+
+    Parameters
+    ----------
+    robot : as given. data : with readings outside their strokes. described : these readings, as of
+        `loopcal.measure.data_checks.describe_outside_strokes`; default: described without places.
+
+    Returns
+    -------
+    Finding or None
+        `conventions.strokes-explained`, or `conventions.strokes-contradicted` if the data fit as
+        they are written; None if nothing explains them.
+    """
+    described = describe_outside_strokes(data, robot) if described is None else described
+    if described is None:
+        return None
+    check = compare_conventions(robot, data)
+    if check.misfit <= ALLOWED:
+        return report_finding("conventions.strokes-contradicted", **described)
+    candidates = () if check.interpretation is None else (check.interpretation, *check.alternatives)
+    inside = [
+        candidate
+        for candidate in candidates
+        if describe_outside_strokes(candidate.apply(data), robot) is None
+    ]
+    if not inside or not check.other_misfit <= ALLOWED:
+        return None
+    comparison = judge_data(
+        select_free_parameters(fix_breaking_parameters(robot)), inside[0].apply(data)
+    )
+    if comparison is None:
+        return None
+    return report_finding(
+        "conventions.strokes-explained",
+        **described,
+        interpretation=inside[0].describe(),
+        alternatives=tuple(interpretation.describe() for interpretation in inside[1:]),
+        other_residuals=list_rms_residuals(comparison),
+    )

@@ -8,29 +8,31 @@ its own excluded rows. All functions are pure; see docs/theory/convention-check.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from loopcal import engine, measure
+from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.elimination import plan_elimination
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
-from loopcal.estimate.problem import Problem
-from loopcal.estimate.problem_construction import make_problem, problem_of
-from loopcal.measure import Measurements, NuisanceParameters
-from loopcal.mechanism import Mechanism, find_directly_reachable, forward, forward_trials
-from loopcal.numerics.gauss_newton import Halving
-from loopcal.typing import FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation
+from loopcal.estimate.problem import Problem, make_problem, problem_of
+from loopcal.findings import Quantity
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward
+from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
 
 FEWEST = 3
 """Smallest number of equations beyond those of unknown frames that gives a misfit."""
@@ -371,3 +373,200 @@ def _row_rms(whitened: FloatArray, sd: FloatArray) -> FloatArray:
     count = (whitened != 0.0).sum(axis=-1)
     total = ((whitened / sd) ** 2).sum(axis=-1)
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+# --- Judge single interpretations: their frames, their misfit, and whether their fit is evidence.
+
+BETTER = 5.0
+"""Factor by which another interpretation must fit better before data are refused: true data of a
+robot far beyond its tolerances fit twice as well in none of them.
+"""
+
+
+def judge_data(
+    free: FreeParameters, data: Measurements, start: FloatArray | None = None
+) -> Comparison | None:
+    """Compare measurements with the robot without far rows, quickly from a given start; None where
+    it reaches too few poses.
+    """
+    reach = select_reached(free, data)
+    if not reach.is_enough:
+        return None
+    effort = THOROUGH if start is None else QUICK
+    return exclude_far_rows(compare_with_robot(free, reach.data, (), effort, start))
+
+
+def compute_rms_residuals(comparison: Comparison) -> dict[Dimension, float]:
+    """Return root mean squares [m or rad] of the first interpretation's residuals by dimension,
+    without far rows.
+    """
+    square: dict[Dimension, list[FloatArray]] = {}
+    for s, r in zip(comparison.problem.rows, comparison.residuals(), strict=True):
+        present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
+        for j, column in enumerate(s.kind.noise_columns):
+            square.setdefault(column.dimension, []).append(r.raw[0, present[:, j], j] ** 2)
+    joined = {dimension: np.concatenate(squares) for dimension, squares in square.items()}
+    return {d: float(np.sqrt(values.mean())) for d, values in joined.items() if len(values)}
+
+
+def list_rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Return these root mean squares in units of the robot's file."""
+    robot = comparison.problem.free.robot
+    sizes = compute_rms_residuals(comparison)
+    return tuple(robot.to_quantity(size, dimension) for dimension, size in sizes.items())
+
+
+def guess_frames(
+    free: FreeParameters, data: Measurements, readings: FloatArray, reached: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Guess nuisance parameters (h, U) for h sets of readings (h, n, a), and return the median (h,)
+    of the sizes of whitened residuals with them, the robot as it is.
+
+    Poses that the robot does not reach, by `reached` (h, n), are taken at home.
+    """
+    robot, nuisance, h = free.robot, data.nuisance_parameters, len(readings)
+    T = np.broadcast_to(robot.home_state.T.reshape(-1, 4, 4)[0], (*reached.shape, 4, 4)).copy()
+    T[reached] = forward_trials(robot, robot.values[None], readings[reached][None]).T[0]
+    measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
+    most, steps = QUICK.candidates, QUICK.guess_steps
+    start = measure.guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
+    sizes = [np.zeros((h, 0))]
+    for o, places in zip(data.observations, nuisance.indices, strict=True):
+        if len(o) and not o.kind.sensed_joints:
+            residual = o.evaluate(T, start[:, places]).residual
+            whitened = np.matmul(o.whitener, residual[..., None])[..., 0]
+            sizes.append(np.linalg.norm(whitened, axis=-1))
+    size = np.concatenate(sizes, axis=1)
+    return start, np.median(size, axis=1) if size.shape[1] else np.zeros(h)
+
+
+def is_informative(
+    free: FreeParameters, data: Measurements, interpretation: Interpretation, misfit: float
+) -> bool:
+    """Return whether values that shrink fit far better than controls without information."""
+    if not any(part.shrinks for part in interpretation.parts):
+        return True
+    for control in _list_controls(data, interpretation):
+        comparison = judge_data(free, control)
+        if comparison is not None and comparison.misfit < BETTER * misfit:
+            return False
+    return True
+
+
+def _list_controls(data: Measurements, interpretation: Interpretation) -> Iterator[Measurements]:
+    """Yield data with the values of other rows, and with constants in place of changed values:
+    random numbers of any size fit as well at any pose, and zeros in every unit.
+    """
+    changed, rng = interpretation.apply(data), np.random.default_rng(0)
+    shuffled = (
+        replace(o, measured=o.measured[rng.permutation(len(o))]) for o in changed.observations
+    )
+    yield replace(changed, observations=tuple(shuffled))
+    pairs = zip(data.observations, changed.observations, strict=True)
+    constant = (
+        replace(new, measured=_make_constant(old.measured, new.measured)) for old, new in pairs
+    )
+    readings = _make_constant(data.readings, changed.readings)
+    yield replace(changed, readings=readings, observations=tuple(constant))
+
+
+def _make_constant(old: FloatArray, new: FloatArray) -> FloatArray:
+    """Return a table with the median of its column in place of the values that changed."""
+    is_changed = ~np.isclose(old, new, rtol=1e-12, atol=0.0, equal_nan=True)
+    if not is_changed.any():
+        return new
+    return np.where(is_changed, np.nanmedian(new, axis=0), new)
+
+
+# --- Refine the misfit of one interpretation by Gauss-Newton steps within the tolerances, or far
+# beyond them.
+
+REFINEMENT = Halving(steps=3, attempts=1)
+"""Gauss-Newton steps by which the stated convention and the best other one are compared finally; a
+step that does not lower the cost ends them.
+"""
+
+LARGEST_STEP = 30.0
+"""Tolerances that a parameter may leave its value in these steps."""
+
+FAR_AWAY, FIT = 30.0, Halving(steps=12, attempts=5)
+"""Factor by which the deviations of a robot far from nominal may exceed its tolerances, and the
+steps of its fit.
+"""
+
+
+def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
+    """Return the misfit of the first interpretation after Gauss-Newton steps within the tolerances,
+    and its nuisance parameters (U,) there.
+
+    The misfit to first order is returned where it is smaller.
+    """
+    if comparison.linearization is None or not np.isfinite(comparison.misfit):
+        return comparison.misfit, comparison.data.nuisance_parameters.values()
+    end = _minimize(comparison, 1.0, REFINEMENT)
+    values = (
+        np.zeros(0) if end.linearization.nuisance is None else end.linearization.nuisance.values[0]
+    )
+    refined = float(compute_misfit(end.cost, end.linearization.equations)[0])
+    return min(comparison.misfit, refined), values
+
+
+def explains_after_fit(comparison: Comparison, allowed: float) -> bool:
+    """Return whether a robot far from nominal explains the first interpretation: whether its misfit
+    after a fit with tolerances `FAR_AWAY` times as large is at most `allowed`.
+    """
+    if comparison.linearization is None or not np.isfinite(comparison.misfit):
+        return False
+    end = _minimize(comparison, FAR_AWAY, FIT)
+    return float(compute_misfit(end.cost, end.linearization.equations)[0]) <= allowed
+
+
+def _minimize(comparison: Comparison, scale: float, control: Halving) -> _Point:
+    """Minimize the cost of the first interpretation with tolerances `scale` times as large."""
+    assert comparison.linearization is not None
+    first = np.arange(1)
+    problem, linearization = comparison.problem.take(first), comparison.linearization.take(first)
+    z = linearization.deviation
+
+    def propose(point: _Point) -> _Step:
+        p = problem.parameters
+        prior = np.concatenate([np.eye(p), point.step.T], axis=1) / scale
+        whole = engine.fold(point.linearization.factor, prior[None])[0]
+        direction = -np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
+        largest = np.abs(point.step + direction).max(initial=0.0)
+        share = np.full((1, 1), float(largest <= LARGEST_STEP * scale))
+        return _Step(direction, np.sum(whole[:p, p] ** 2, keepdims=True), share)
+
+    def move(point: _Point, step: _Step, share: FloatArray) -> _Point:
+        if not share.any():
+            return point
+        total = point.step + share * step.direction
+        return _Point(total, problem.linearize(z + total, point.linearization.next_start), scale)
+
+    end, _ = minimize_by_halving(
+        _Point(np.zeros_like(z), linearization, scale), propose, move, control
+    )
+    return end
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A step (1, p) from the robot's values in tolerances, the linearization there, and the factor
+    by which tolerances are larger.
+    """
+
+    step: FloatArray
+    linearization: Linearization
+    scale: float
+
+    @property
+    def cost(self) -> FloatArray:
+        return self.linearization.cost + ((self.step / self.scale) ** 2).sum(axis=1)
+
+
+class _Step(NamedTuple):
+    """A full Gauss-Newton step (1, p); see `FullStep`."""
+
+    direction: FloatArray
+    change: FloatArray
+    share: FloatArray

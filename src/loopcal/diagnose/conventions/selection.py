@@ -10,30 +10,22 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretations.interpretation import Interpretation, combine
-from loopcal.diagnose.conventions.interpretations.reading_interpretations import (
+from loopcal.diagnose.conventions.interpretations import (
+    Interpretation,
+    combine,
+    list_interpretations,
     list_reading_interpretations,
-)
-from loopcal.diagnose.conventions.interpretations.setup_interpretations import (
-    list_setup_interpretations,
-)
-from loopcal.diagnose.conventions.interpretations.value_interpretations import list_interpretations
-from loopcal.diagnose.conventions.interpretations.zero_interpretations import (
-    find_zero_interpretations,
-)
-from loopcal.diagnose.conventions.judgement import (
-    BETTER,
-    compute_rms_residuals,
-    guess_frames,
-    is_informative,
-    judge_data,
 )
 from loopcal.diagnose.conventions.misfit import (
     ALLOWED,
+    BETTER,
     EQUALLY,
     MOST_EXCLUDED,
     QUICK,
@@ -41,15 +33,214 @@ from loopcal.diagnose.conventions.misfit import (
     Comparison,
     compare_with_robot,
     compute_misfits,
+    compute_quick_misfit,
+    compute_rms_residuals,
     exclude_far_rows,
+    explains_after_fit,
+    guess_frames,
+    is_informative,
+    is_redundant,
+    judge_data,
+    refine_misfit,
     select_reached,
 )
-from loopcal.diagnose.conventions.refinement import explains_after_fit, refine_misfit
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.measure import Measurements
-from loopcal.mechanism import compute_readings, find_directly_reachable
-from loopcal.numerics.sorted_values import find_distinct
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.kinds.kind import Column, Kind
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.kinematics import compute_readings, find_directly_reachable
+from loopcal.numerics.statistics import find_distinct
 from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
+
+# --- Interpretations of actuator readings that are counted from another zero, in either direction.
+
+SCANNED, NARROWER, SCANS = 25, 8.0, 4
+"""Number of constants in a scan, factor by which the next scan is narrower, and number of scans."""
+
+BEST = 3
+"""Number of hypotheses that are scanned again."""
+
+BESIDE = 0.02
+"""Share of the stroke by which readings may be outside: the stroke is nominal, too."""
+
+
+class _Zero(NamedTuple):
+    """Readings `sign q + base + c` of some actuators, with c between two limits.
+
+    Attributes
+    ----------
+    columns : of the actuators. sign : 1 or -1. base : (k,) of each of them [m or rad].
+    low, high : of c [m or rad].
+    """
+
+    columns: tuple[int, ...]
+    sign: float
+    base: FloatArray
+    low: float
+    high: float
+
+    def apply(self, readings: FloatArray, constant: float) -> FloatArray:
+        """Return the readings (n, a) with a value of c."""
+        chosen = list(self.columns)
+        changed = np.array(readings)
+        changed[:, chosen] = self.sign * readings[:, chosen] + self.base + constant
+        return changed
+
+
+def find_zero_interpretations(
+    free: FreeParameters, data: Measurements, poses: IntArray, reversed_only: bool
+) -> list[Interpretation]:
+    """Find the zeros with which the given robot fits best, the best first.
+
+    Parameters
+    ----------
+    data : as written. poses : by which they are compared. reversed_only : only readings that are
+        counted in the opposite direction.
+    """
+    robot = free.robot
+    zeros = [zero for zero in _list_zeros(free, data) if zero.sign < 0.0 or not reversed_only]
+    few, constants = data.take(poses), np.zeros(0)
+    for scan in range(SCANS):
+        if not zeros:
+            return []
+        grids = [np.linspace(zero.low, zero.high, SCANNED) for zero in zeros]
+        sizes = _compute_sizes(free, few, zeros, grids)
+        best = np.argsort(sizes.min(axis=1), kind="stable")[:BEST]
+        best = best[np.isfinite(sizes.min(axis=1)[best])]
+        zeros = [zeros[i] for i in best]
+        constants = np.array([grids[i][np.argmin(sizes[i])] for i in best])
+        if scan < SCANS - 1:
+            zeros = [_narrow(*pair) for pair in zip(zeros, constants.tolist(), strict=True)]
+    result = []
+    for zero, constant in zip(zeros, constants.tolist(), strict=True):
+        total = zero.base + constant
+        dimension = robot.actuators[zero.columns[0]].dimension
+        shown = [robot.to_quantity(float(value), dimension) for value in total]
+        same = np.ptp(total) < 1e-9 * max(float(np.abs(total).max()), 1e-9)
+        details = {
+            "actuators": tuple(robot.actuators[j].name for j in zero.columns),
+            "reversed": zero.sign < 0.0,
+            "zeros": tuple(shown[:1] if same else shown),
+        }
+        change = partial(zero.apply, constant=constant)
+        result.append(Interpretation("reading-zero", details, "", None, change))
+    return result
+
+
+def _list_zeros(free: FreeParameters, data: Measurements) -> Iterator[_Zero]:
+    """Yield the hypotheses about zeros, those of all actuators of a dimension first."""
+    robot = free.robot
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+    smallest, largest = np.nanmin(data.readings, axis=0), np.nanmax(data.readings, axis=0)
+    spread = largest - smallest
+    strokes = [
+        actuator.stroke or (home[j] - spread[j], home[j] + spread[j])
+        for j, actuator in enumerate(robot.actuators)
+    ]
+    low, high = np.array(strokes).T
+    low, high = low - BESIDE * (high - low), high + BESIDE * (high - low)
+    dimensions = [actuator.dimension for actuator in robot.actuators]
+    together = [
+        tuple(j for j, other in enumerate(dimensions) if other is dimension)
+        for dimension in dict.fromkeys(dimensions)
+    ]
+    singles = [(j,) for j in range(len(dimensions))]
+    for columns in dict.fromkeys([*together, *singles]):
+        chosen = list(columns)
+        zero, start, ends = np.zeros(len(chosen)), home[chosen], (low + high)[chosen]
+        bases = [(1.0, zero), (1.0, start), (-1.0, zero), (-1.0, start), (-1.0, ends)]
+        if len(chosen) == 1:  # the scan contains the others
+            bases = [(1.0, zero), (-1.0, zero)]
+        for sign, base in bases:
+            ends_of = np.sort(sign * np.array([smallest, largest])[:, chosen], axis=0) + base
+            least = float((low[chosen] - ends_of[0]).max())
+            most = float((high[chosen] - ends_of[1]).min())
+            if least < most:
+                yield _Zero(columns, sign, base, least, most)
+
+
+def _narrow(zero: _Zero, constant: float) -> _Zero:
+    """Return the hypothesis with narrower limits around a constant."""
+    half = 0.5 * (zero.high - zero.low) / NARROWER
+    return zero._replace(low=constant - half, high=constant + half)
+
+
+def _compute_sizes(
+    free: FreeParameters, data: Measurements, zeros: Sequence[_Zero], grids: Sequence[FloatArray]
+) -> FloatArray:
+    """Return the median residual sizes (h, SCANNED) of the given robot; infinite where it reaches
+    too few poses.
+    """
+    robot = free.robot
+    readings = np.stack(
+        [
+            zero.apply(data.readings, constant)
+            for zero, grid in zip(zeros, grids, strict=True)
+            for constant in grid.tolist()
+        ]
+    )
+    reached = find_directly_reachable(
+        robot, robot.values[None], readings.reshape(1, -1, readings.shape[-1])
+    ).reshape(readings.shape[:2])
+    near = np.flatnonzero(reached.mean(axis=1) >= 1.0 - MOST_EXCLUDED)
+    sizes = np.full(len(readings), np.inf)
+    if len(near):
+        sizes[near] = guess_frames(free, data, readings[near], reached[near])[1]
+    return np.nan_to_num(sizes, nan=np.inf).reshape(len(zeros), SCANNED)
+
+
+# --- Interpretations of measurements with a frame, target or anchor that no file declares unknown.
+
+DECLARED = ("frame", "targets", "tool", "anchor")
+"""Setup items that a user may forget to declare unknown. Surfaces with their frames and offsets are
+none of them: the errors of the machine explain those, too.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class SetupInterpretation(Interpretation):
+    """Measurements some setup items of which are estimated; their values stay as written.
+
+    Attributes
+    ----------
+    items : of `DECLARED`, unknown in all kinds that allow them.
+    """
+
+    items: tuple[str, ...] = ()
+
+    def apply(self, data: Measurements) -> Measurements:
+        """Return the measurements with these items unknown."""
+        changed = []
+        for rows in data.observations:
+            more = tuple(item for item in self.items if item in _list_known(rows.kind))
+            unknown = (*rows.kind.unknown, *more)
+            changed.append(replace(rows, kind=replace(rows.kind, unknown=unknown)))
+        return replace(data, observations=tuple(changed))
+
+
+def list_setup_interpretations(data: Measurements, count: int) -> Iterator[SetupInterpretation]:
+    """Yield measurements with `count` setup items unknown that are known as written; two of them
+    are the frame and another one.
+    """
+    known = [_list_known(rows.kind) if len(rows) else () for rows in data.observations]
+    items = [item for item in DECLARED if any(item in names for names in known)]
+    for chosen in combinations(items, count):
+        if count > 1 and chosen[0] != "frame":
+            continue
+        first = next(i for i, names in enumerate(known) if chosen[0] in names)
+        unknown = (*data.observations[first].kind.unknown, *chosen)
+        details = {"items": chosen, "unknown": tuple(dict.fromkeys(unknown))}
+        yield SetupInterpretation("undeclared-setup", details, "", first, np.array, chosen)
+
+
+def _list_known(kind: Kind) -> tuple[str, ...]:
+    """Return the items that a kind allows to be unknown, and that it states."""
+    allowed = set(kind.allowed_unknown)
+    if "surface" in allowed:
+        allowed.discard("frame")
+    return tuple(i for i in DECLARED if i in allowed and i not in kind.unknown)
+
 
 FAR_BETTER = 10.0
 """Factor by which it must fit better if tolerances and noise do not explain the rest, as of a robot
@@ -383,3 +574,88 @@ def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
     finite = np.sort(misfits[np.isfinite(misfits)])
     bound = min(PROMISING * misfit / BETTER, *finite[MOST_JUDGED - 1 : MOST_JUDGED], np.inf)
     return np.flatnonzero((misfits <= bound) & np.isfinite(misfits))
+
+
+# --- Find other orders of the actuators that explain data of a redundant robot as well as the
+# stated one, which explains them: the data cannot show which is true.
+
+MEASURED = 12
+"""Number of measured residuals from which the order of a redundant robot's actuators is certain:
+those of four positions, by which no machine of another order agrees with its redundant readings.
+"""
+
+ORDERS = ("swapped-readings", "reversed-readings", "permuted-readings")
+"""Slips in the order of the actuators."""
+
+
+def find_equal_orders(free: FreeParameters, data: Measurements) -> tuple[Interpretation, ...]:
+    """Find other orders of the actuators that explain data of a redundant robot as well as the
+    stated one, which explains them.
+
+    Only data whose measured rows are few leave that open: poses are then known from the readings.
+    """
+    measured = sum(o.n_residuals for o in data.observations)
+    if not is_redundant(free) or measured >= MEASURED:
+        return ()
+    few = data.take(select_measured(data))
+    equal = []
+    for interpretation in list_reading_interpretations(few, free.robot.actuators):
+        if interpretation.slip in ORDERS:
+            comparison = judge_data(free, interpretation.apply(few))
+            if comparison is not None and refine_misfit(comparison)[0] <= ALLOWED:
+                equal.append(interpretation)
+    return tuple(equal)
+
+
+def select_measured(data: Measurements) -> IntArray:
+    """Return the measured poses, and others spread over the data up to `FEWEST_POSES`."""
+    measured = np.unique(np.concatenate([o.rows.ravel() for o in data.observations] or [[]]))
+    others = np.setdiff1d(np.arange(data.n_poses), measured)
+    missing = max(FEWEST_POSES - len(measured), 0) if len(others) else 0
+    spread = np.linspace(0, len(others) - 1, missing)
+    return np.union1d(measured, others[np.unique(spread.astype(np.intp))]).astype(np.intp)
+
+
+# --- Report interpretations that explain data as well as the stated one, which explains them: the
+# data cannot show which is true.
+
+HEIGHT, SIGNIFICANT = (Column("z", Dimension.LENGTH),), 10.0
+"""Columns of a height, and standard deviations of the noise from which its sign matters."""
+
+
+def report_equals(free: FreeParameters, data: Measurements, misfit: float) -> Finding | None:
+    """Report other orders of the actuators, or the other sign of heights, that explain data as well
+    as they are written; None without any.
+    """
+    opposite = compute_opposite_misfit(free, data)
+    if opposite <= max(EQUALLY * misfit, 1.0):
+        return report_finding(
+            "conventions.height-sign-undecided",
+            robot=free.robot.name,
+            misfit=misfit,
+            other_misfit=opposite,
+        )
+    if not is_redundant(free):
+        return None
+
+    orders = find_equal_orders(free, data)
+    if not orders:
+        return None
+    return report_finding(
+        "conventions.orders-undecided",
+        robot=free.robot.name,
+        alternatives=tuple(order.describe() for order in orders),
+    )
+
+
+def compute_opposite_misfit(free: FreeParameters, data: Measurements) -> float:
+    """Return the misfit of data that consist of heights alone with the opposite sign of these; NaN
+    for other data, and for heights within the noise.
+    """
+    if not data.observations or any(o.kind.columns != HEIGHT for o in data.observations):
+        return float("nan")
+    sizes = [np.nan_to_num(o.whitener[:, 0, 0] * o.measured[:, 0]) for o in data.observations]
+    if not np.abs(np.concatenate(sizes)).max(initial=0.0) > SIGNIFICANT:
+        return float("nan")
+    opposite = tuple(replace(o, measured=-o.measured) for o in data.observations)
+    return compute_quick_misfit(free, replace(data, observations=opposite))

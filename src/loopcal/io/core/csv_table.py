@@ -15,21 +15,191 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.decimal_columns import parse_decimals
-from loopcal.io.core.limits import LINE_LENGTH, TABLE_COLUMNS, TABLE_LINES, TABLE_ROWS, TABLE_SIZE
-from loopcal.io.core.names import LONGEST_COMPOSED, LONGEST_NAME, find_fault
-from loopcal.io.core.numbers import parse_exact
+from loopcal.io.core.limits import (
+    LINE_LENGTH,
+    LONGEST_COMPOSED,
+    LONGEST_NAME,
+    TABLE_COLUMNS,
+    TABLE_LINES,
+    TABLE_ROWS,
+    TABLE_SIZE,
+    find_fault,
+)
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.plain_text import quote
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import LARGEST, Dimension, find_unit
+
+# --- Many numbers as text at once, to the same doubles as one after the other by `parse_exact`.
+
+MOST_DIGITS = 18
+"""Digits of a plain decimal, so that its whole number is below 2^63."""
+
+WIDTH = MOST_DIGITS + 2
+"""Characters of the longest plain decimal: with its sign and its point."""
+
+COLUMN_CHUNK = 1 << 16
+"""Cells that are converted at once."""
+
+UNDECIDED = 1e-9
+"""Distance from the middle between two doubles, as a share of half their distance, below which the
+rounded product is not certain: twice 10^-25 of the number, far beyond all rounding.
+"""
+
+SPLITTER = 2.0**27 + 1.0
+"""Splits a double into two halves of 26 bits (Dekker)."""
+
+
+def parse_decimals(cells: Sequence[str], factor: float) -> tuple[FloatArray, BoolArray]:
+    """Return the products of plain decimals and a factor, each rounded once.
+
+    Parameters
+    ----------
+    cells : (n,) texts without surrounding blanks. factor : positive, SI per unit of the text.
+
+    Returns
+    -------
+    values : (n,) as `parse_exact` returns them; zero for the other cells.
+    is_plain : (n,) whether a cell is a plain decimal whose product is certain.
+    """
+    values, is_plain = np.zeros(len(cells)), np.zeros(len(cells), dtype=bool)
+    high, low = _scale_factor(factor)
+    for begin in range(0, len(cells), COLUMN_CHUNK):
+        part = slice(begin, begin + COLUMN_CHUNK)
+        whole, decimals, is_negative, is_decimal = _read_digits(_encode(cells[part]))
+        product, is_certain = _multiply(whole, high[decimals], low[decimals])
+        is_plain[part] = is_decimal & is_certain
+        signed = np.where(is_negative, -product, product)
+        values[part] = np.where(is_plain[part], signed, 0.0)
+    return values, is_plain
+
+
+def _encode(cells: Sequence[str]) -> np.ndarray:
+    """Return the characters (WIDTH + 1, n) of texts, 0 behind their end."""
+    size = WIDTH + 1  # one more, so that a longer text is noticed
+    try:
+        texts = np.array(cells, dtype=f"S{size}")
+    except UnicodeEncodeError:
+        texts = np.array([cell.encode("ascii", "replace") for cell in cells], dtype=f"S{size}")
+    return np.ascontiguousarray(texts.view(np.uint8).reshape(len(cells), size).T)
+
+
+def _read_digits(characters: np.ndarray) -> tuple[IntArray, IntArray, BoolArray, BoolArray]:
+    """Return the whole numbers (n,), their decimals (n,), whether they are negative, and whether
+    the texts with these characters (c, n) are plain decimals; numbers of others mean nothing.
+    """
+    n = characters.shape[1]
+    whole, digits, decimals = (np.zeros(n, dtype=np.int64) for _ in range(3))
+    is_negative = characters[0] == ord("-")
+    is_decimal = characters[-1] == 0
+    has_point = np.zeros(n, dtype=bool)
+    for place, column in enumerate(characters):
+        if not column.any():
+            break
+        digit = column - np.uint8(ord("0"))  # wraps around below "0"
+        is_digit, is_point = digit <= 9, column == ord(".")
+        whole = np.where(is_digit & (digits < MOST_DIGITS), 10 * whole + digit, whole)
+        digits += is_digit
+        decimals += is_digit & has_point
+        is_allowed = is_digit | (is_point & ~has_point) | (column == 0)
+        if place == 0:
+            is_allowed |= is_negative | (column == ord("+"))
+        is_decimal &= is_allowed
+        has_point |= is_point
+    is_decimal &= (digits > 0) & (digits <= MOST_DIGITS)
+    return whole, np.minimum(decimals, MOST_DIGITS), is_negative, is_decimal
+
+
+def _scale_factor(factor: float) -> tuple[FloatArray, FloatArray]:
+    """Return factor / 10^k for k = 0..MOST_DIGITS as sums of two doubles (k,)."""
+    exact = [Fraction(repr(factor)) / 10**k for k in range(MOST_DIGITS + 1)]
+    high = [float(value) for value in exact]
+    low = [float(value - Fraction(h)) for value, h in zip(exact, high, strict=True)]
+    return np.array(high), np.array(low)
+
+
+def _multiply(whole: IntArray, high: FloatArray, low: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the doubles nearest to whole * (high + low), and where they are certain."""
+    m = whole.astype(np.float64)
+    rest = (whole - m.astype(np.int64)).astype(np.float64)
+    product = m * high
+    left = _find_rounding(m, high, product) + (m * low + rest * high)
+    nearest = product + left
+    left -= nearest - product
+    half = 0.5 * np.abs(np.nextafter(nearest, np.where(left < 0.0, -np.inf, np.inf)) - nearest)
+    return nearest, half - np.abs(left) >= UNDECIDED * half
+
+
+def _find_rounding(a: FloatArray, b: FloatArray, product: FloatArray) -> FloatArray:
+    """Return a * b - product exactly, where `product` is a * b rounded."""
+    a_high, b_high = (x * SPLITTER - (x * SPLITTER - x) for x in (a, b))
+    a_low, b_low = a - a_high, b - b_high
+    error = a_high * b_high - product + a_high * b_low + a_low * b_high
+    return np.asarray(error + a_low * b_low)
+
+
+# --- Numbers as text: the fewest digits that read back as the same double.
+
+DIGITS = range(12, 18)
+"""Significant digits that are tried, fewest first; 17 always suffice for one double."""
+
+
+def format_scaled(value: float, factor: float) -> str:
+    """Return value / factor with the fewest digits whose double times `factor` is `value` again.
+
+    Parameters
+    ----------
+    value : in SI. factor : SI per unit of the text.
+
+    Returns
+    -------
+    All 17 digits where rounding prevents that any shorter text returns the value.
+    """
+    scaled = value / factor
+    texts = (f"{scaled:.{digits}g}" for digits in DIGITS)
+    return next((text for text in texts if float(text) * factor == value), repr(float(scaled)))
+
+
+def format_exact(value: float, factor: float) -> str:
+    """Return the shortest text (12 to 17 digits) from which `parse_exact` makes the same double.
+
+    17 digits suffice for every double: rounding to them changes a number by at most 0.5e-16 of it,
+    and half the distance of two doubles is at least 0.55e-16 of them.
+    """
+    scaled = Decimal(value) / Decimal(repr(factor))
+    texts = (f"{float(scaled):.{digits}g}" for digits in DIGITS)
+    # rounded once: through a double, the last digit may be that of a neighbor
+    nearest = f"{scaled:.{DIGITS[-1]}g}"
+    return next((text for text in texts if parse_exact(text, factor) == value), nearest)
+
+
+def parse_exact(text: str, factor: float) -> float:
+    """Return the double nearest to the decimal product of a text and a factor, rounded once.
+
+    Raises
+    ------
+    decimal.InvalidOperation : the text is not a number.
+    """
+    return float(Decimal(text) * Decimal(repr(factor)))
+
+
+def parse_finite(text: str) -> float | None:
+    """Return the finite number that a text states; None for any other text."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and text.isascii() and "_" not in text else None
+
 
 WHAT = "measurement file"
 CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/exports.md)"
@@ -350,7 +520,7 @@ def _is_header(cell: str) -> bool:
 
 
 def _refuse_names(table: Table) -> None:
-    """Raise FileError for the first cell that is no name; see `loopcal.io.core.names`."""
+    """Raise FileError for the first cell that is no name; see `loopcal.io.core.limits`."""
     for column in NAME_COLUMNS:
         if column not in table.units:
             continue

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
-from loopcal.io.core.descriptors import watch_folder
 from loopcal.io.core.json_text import convert_document, format_content, read_json
 from loopcal.io.core.limits import TABLE_SIZE
 from loopcal.io.core.outputs import FILES, replace_folder, resolve_folder
-from loopcal.io.core.replacement import list_leftovers, remove_leftovers
+from loopcal.io.core.replacement import list_leftovers, remove_leftovers, watch_folder
 from loopcal.io.core.text_file import report_write_errors, sha256
 
 _BLANK = "0" * 64

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.io.core.descriptors import sync_file
 from loopcal.io.core.limits import PROGRAM_SIZE, FileLimit
-from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers
+from loopcal.io.core.replacement import create_temporary, place_file, remove_leftovers, sync_file
 
 OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """To open a file without waiting; not every system has all of these flags."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError, UnitError, suggest_names
-from loopcal.findings import report_finding
-from loopcal.io.core.limits import YAML_SIZE
-from loopcal.io.core.names import find_fault_below
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.limits import YAML_DEPTH, YAML_NODES, YAML_SIZE, FileLimit, find_fault_below
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.plain_text import escape, quote
 from loopcal.units import Dimension, parse_quantity
@@ -91,7 +91,7 @@ def read_yaml(path: str | Path, what: str, has_names: bool = True) -> YamlFile:
     Parameters
     ----------
     path : the file. what : what it should be, for messages.
-    has_names : whether its keys and texts are names (`loopcal.io.core.names`), not prose.
+    has_names : whether its keys and texts are names (`loopcal.io.core.limits`), not prose.
 
     Raises
     ------
@@ -140,8 +140,6 @@ def _load_tree(text: str, path: Path, what: str, first_line: int) -> Any:
     from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-    from loopcal.io.core.bounded_yaml import KeyTypeError, LimitError
-
     try:
         return _parse_text(text) if len(text) <= KEPT_LENGTH else _parse_text.__wrapped__(text)
     except DuplicateKeyError as error:
@@ -173,8 +171,6 @@ def _parse_text(text: str) -> Any:
 def make_round_trip_yaml() -> Any:
     """Return ruamel.yaml's round-trip reader and writer with the settings of this project."""
     from ruamel.yaml import YAML
-
-    from loopcal.io.core.bounded_yaml import make_bounded_composer
 
     yaml = YAML(typ="rt", pure=True)
     yaml.Composer = make_bounded_composer
@@ -276,3 +272,272 @@ def _finite(value: float, file: YamlFile, location: Location) -> float:
         shown = "too large" if isinstance(value, int) else value  # it may have thousands of digits
         raise file.error(f"{name_location(location)!r} is {shown}; write a finite number", location)
     return value
+
+
+# --- A composer of YAML that refuses deep documents, those whose aliases stand for too much, and
+# keys that are lists or mappings.
+
+
+class LimitError(Exception):
+    """A document beyond `limit`, at a line that is counted from 0."""
+
+    def __init__(self, limit: FileLimit, line: int) -> None:
+        super().__init__(limit.of)
+        self.limit = limit
+        self.line = line
+
+
+class KeyTypeError(Exception):
+    """A key that is a list or a mapping, at a line that is counted from 0."""
+
+    def __init__(self, line: int) -> None:
+        super().__init__("a key is a list or a mapping")
+        self.line = line
+
+
+def make_bounded_composer(loader: Any) -> Any:
+    """Return a composer of ruamel.yaml that counts values and levels, and checks keys.
+
+    Parameters
+    ----------
+    loader : of ruamel.yaml.
+
+    Raises
+    ------
+    LimitError, KeyTypeError, MarkedYAMLError : while it composes, as soon as a limit is exceeded;
+        a key that is no scalar, which ruamel.yaml cannot always store; or an alias that stands for
+        a value that contains it.
+    """
+    from ruamel.yaml.composer import Composer
+    from ruamel.yaml.error import MarkedYAMLError
+    from ruamel.yaml.events import AliasEvent
+    from ruamel.yaml.nodes import ScalarNode
+
+    class BoundedComposer(Composer):
+        """A composer that counts."""
+
+        def __init__(self) -> None:
+            super().__init__(loader)
+            self._level = self._count = 0
+            self._parser: Any = None
+            self._sizes: dict[str, int] = {}
+
+        @property
+        def parser(self) -> Any:
+            """The parser of the loader, kept because it is asked for a dozen times in a value."""
+            if self._parser is None:
+                self._parser = super().parser
+            return self._parser
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            """Return the next node; check that a key is a scalar."""
+            event = self.parser.peek_event()
+            line = event.start_mark.line
+            node = self._compose_counted(parent, index, event)
+            is_key = parent is not None and index is None
+            if is_key and not isinstance(node, ScalarNode):
+                raise KeyTypeError(line)
+            return node
+
+        def _compose_counted(self, parent: Any, index: Any, event: Any) -> Any:
+            """Return the next node, whose event is the next one; count its values."""
+            if isinstance(event, AliasEvent):
+                if event.anchor in self.anchors and event.anchor not in self._sizes:
+                    problem = f"alias {event.anchor!r} stands for a value that contains the alias"
+                    raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+                self._add(self._sizes.get(event.anchor, 1), event)
+                return super().compose_node(parent, index)
+            before = self._count
+            self._add(1, event)
+            self._level += 1
+            if self._level > YAML_DEPTH.count:
+                raise LimitError(YAML_DEPTH, event.start_mark.line)
+            # YAML allows an anchor again, for another value; ruamel.yaml warns where it is known
+            self.anchors.pop(event.anchor, None)
+            self._sizes.pop(event.anchor, None)
+            node = super().compose_node(parent, index)
+            self._level -= 1
+            if event.anchor is not None:
+                self._sizes[event.anchor] = self._count - before
+            return node
+
+        def _add(self, values: int, event: Any) -> None:
+            """Count values; raise LimitError where they are too many."""
+            self._count += values
+            if self._count > YAML_NODES.count:
+                raise LimitError(YAML_NODES, event.start_mark.line)
+
+    return BoundedComposer()
+
+
+# --- Text of YAML: names in quotes where they need them, and one key added to or removed from a
+# file.
+
+PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off)\Z)[a-z][\w.-]*", re.IGNORECASE)
+"""Text that every version of YAML reads as the same text without quotes."""
+
+
+def quote_scalar(text: str) -> str:
+    """Return text as a YAML scalar in one line, in double quotes where it needs them."""
+    return text if PLAIN.fullmatch(text) else _escape(json.dumps(text, ensure_ascii=False))
+
+
+def format_flow_mapping(texts: Mapping[str, str]) -> str:
+    """Return a mapping in one line, from names and the YAML texts of their values."""
+    return f"{{{', '.join(f'{quote_scalar(name)}: {text}' for name, text in texts.items())}}}"
+
+
+def add_key(file: YamlFile, entry: str, content: Mapping[str, Any] | None = None) -> YamlFile:
+    """Return a file with one more key.
+
+    Parameters
+    ----------
+    file : without the key. entry : the key and its value in block style at the left margin, in
+        complete lines; a comment in them is lost where the file is in flow style.
+    content : what the entry says, as far as the caller knows; otherwise it is parsed.
+    """
+    added = _parse(entry, file).content if content is None else dict(content)
+    return _choose(file, _list_additions(file, entry, added), file.content | added)
+
+
+def remove_key(file: YamlFile, key: str) -> YamlFile:
+    """Return a file without one of its keys."""
+    if key not in file.content:
+        return file
+    wanted = {name: value for name, value in file.content.items() if name != key}
+    return _choose(file, _list_removals(file.text, key), wanted)
+
+
+def _choose(file: YamlFile, candidates: Iterator[str], wanted: dict[str, Any]) -> YamlFile:
+    """Return the first text that reads as the wanted content, or that content as JSON."""
+    exact = json.dumps(wanted, sort_keys=True)
+    for candidate in candidates:
+        try:
+            changed = _parse(candidate, file)
+        except FileError:
+            continue
+        if json.dumps(changed.content, sort_keys=True) == exact:
+            return changed
+    rows = ",\n ".join(_format_inside({name: value}) for name, value in wanted.items())
+    return _parse(f"{{{rows}}}\n", file)
+
+
+def _parse(text: str, file: YamlFile) -> YamlFile:
+    """Parse a changed text of a file, or a part of it, whose names were checked before."""
+    return parse_yaml(text, file.path, "changed file", has_names=False)
+
+
+def _list_additions(file: YamlFile, entry: str, added: dict[str, Any]) -> Iterator[str]:
+    """Yield texts with a further key, first those that are quick to make."""
+    text = file.text
+    end = "\r\n" if "\r\n" in text else "\n"
+    whole = text if text.endswith("\n") else text + end
+    yield whole + entry.replace("\n", end)
+    root = make_round_trip_yaml().compose(text)
+    start, stop = root.start_mark.index, root.end_mark.index
+    if root.flow_style:
+        inside = _format_inside(added)
+        for comma in (",", ""):
+            yield f"{text[: stop - 1]}{comma}{end}{inside}{text[stop - 1 :]}"
+        return
+    start = root.value[0][0].start_mark.index
+    column = start - _find_line(text, start)
+    indented = "".join(" " * column + line + end for line in entry.splitlines())
+    for place in (_find_line(whole, stop) if stop < len(text) else len(whole), start - column):
+        yield whole[:place] + indented + whole[place:]
+
+
+def _list_removals(text: str, key: str) -> Iterator[str]:
+    """Yield texts without a key and its value."""
+    root = make_round_trip_yaml().compose(text)
+    for name, value in root.value:
+        if name.value != key:
+            continue
+        start, stop = name.start_mark.index, max(_list_ends(value), default=0)
+        if root.flow_style:
+            behind = re.compile(r"\s*,").match(text, stop)
+            if behind is not None:
+                yield text[:start] + text[behind.end() :].lstrip(" ")
+            yield re.sub(r",\s*\Z", "", text[:start]) + text[stop:]
+        else:
+            after = text.find("\n", stop - 1) + 1 or len(text)  # the value may end with a break
+            yield text[: _find_line(text, start)] + text[after:]
+
+
+def _list_ends(node: Any) -> Iterator[int]:
+    """Yield where the scalars and flow collections of a node end; a block ends with its last."""
+    if isinstance(node.value, str) or node.flow_style:
+        yield node.end_mark.index
+        return
+    for child in node.value:
+        for part in child if isinstance(child, tuple) else (child,):
+            yield from _list_ends(part)
+
+
+def _find_line(text: str, place: int) -> int:
+    """Return where the line of a character begins."""
+    return text.rfind("\n", 0, place) + 1
+
+
+def _format_inside(content: dict[str, Any]) -> str:
+    """Return a mapping as JSON in one line, without its braces."""
+    return _escape(json.dumps(content, ensure_ascii=False)[1:-1])
+
+
+def _escape(text: str) -> str:
+    """Return JSON with escapes for all characters that YAML does not allow or breaks lines at."""
+    return "".join(c if c.isprintable() else _escape_one(c) for c in text)
+
+
+def _escape_one(character: str) -> str:
+    code = ord(character)
+    return f"\\u{code:04x}" if code < 1 << 16 else f"\\U{code:08x}"
+
+
+# --- Names of other files in a file: they stay in the folder of the file that names them.
+
+KEYS = ("poses", "controller")
+"""Settings of measurement files that name another file."""
+
+
+def find_reference(file: YamlFile, key: str) -> Path | None:
+    """Return the file that the setting `key` names; None where there is no such file.
+
+    Raises
+    ------
+    FileError : the path leaves the folder of `file`; at its line.
+    """
+    return find_file_beside(file, str(file.content[key]), (key,))
+
+
+def find_file_beside(file: YamlFile, name: str, location: Location) -> Path | None:
+    """Return the file that `file` names at a location; None where there is no such file.
+
+    Raises
+    ------
+    FileError : the path leaves the folder of `file`; at its line.
+    """
+    path = file.path.parent / name
+    if not Path(name).is_absolute() and not _is_inside(path, file.path.parent):
+        key = name_location(location)
+        finding = report_finding("files.reference-outside", key=key, path=escape(name))
+        raise file.error(finding, location)
+    return path if path.is_file() else None
+
+
+def list_absolute_references(file: YamlFile) -> tuple[Finding, ...]:
+    """Return a finding for each absolute path in the settings of a file."""
+    stated = ((key, str(file.content[key])) for key in KEYS if key in file.content)
+    return tuple(
+        report_finding("files.reference-absolute", file=str(file.path), path=path, key=key)
+        for key, path in stated
+        if Path(path).is_absolute()
+    )
+
+
+def _is_inside(path: Path, folder: Path) -> bool:
+    """Return whether a path, with its symbolic links followed, is in a folder."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a loop of links
+        return False

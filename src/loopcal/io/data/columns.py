@@ -20,15 +20,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.io.core.csv_table import Table, suggest_header
-from loopcal.io.core.decimal_columns import parse_decimals
-from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
-from loopcal.mechanism import Mechanism
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.csv_table import (
+    Table,
+    format_exact,
+    format_scaled,
+    parse_decimals,
+    parse_exact,
+    suggest_header,
+)
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 if TYPE_CHECKING:
-    from loopcal.measure import Kind
+    from loopcal.measure.kinds.kind import Kind
 
 LINK = ";"
 """Separates the names of poses that one row compares."""
@@ -397,3 +403,24 @@ def name_covariance(a: str, b: str, robot: Mechanism) -> str:
 def get_dimension(coordinate: str) -> Dimension:
     """Return the dimension of a controlled coordinate: x, y, z are lengths, others angles."""
     return Dimension.LENGTH if coordinate in ("x", "y", "z") else Dimension.ANGLE
+
+
+# --- Names that files of measurements, poses and plans cannot have as a column.
+
+SHEET_COLUMNS = ("step", "role", "hold", "tolerance")
+"""Further columns of the operator's sheet of a plan."""
+
+
+def find_column_fault(name: str, what: str) -> Finding | None:
+    """Return why a column cannot have this name; None where it can.
+
+    Parameters
+    ----------
+    name : of an actuator or of a measured column. what : what has this name, for the message.
+    """
+    if "[" in name or "]" in name or name != name.strip():
+        return report_finding("files.name-not-a-column", what=what, name=name)
+    is_taken = name in (*ROLES, *SHEET_COLUMNS) or find_open_column(name) is not None
+    if is_taken or name.startswith((COMMANDED, MEASURED, SIGMA, COVARIANCE)):
+        return report_finding("files.name-of-a-column", what=what, name=name)
+    return None

@@ -23,21 +23,22 @@ from loopcal.io.data.columns import (
     name_measured,
     refuse_unknown_columns,
 )
-from loopcal.io.data.instrument_settings import read_instrument
+from loopcal.io.data.kind_settings import SETTINGS as SHARED_ERRORS
 from loopcal.io.data.kind_settings import (
     list_kind_settings,
+    read_instrument,
     read_kind,
     read_noise,
     read_noise_source,
+    read_shared_errors,
 )
-from loopcal.io.data.shared_error_settings import SETTINGS as SHARED_ERRORS
-from loopcal.io.data.shared_error_settings import read_shared_errors
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import EXAMPLES, SMALLEST_SD
 
 if TYPE_CHECKING:
-    from loopcal.measure import InstrumentRecord, Kind, Observations
+    from loopcal.measure.kinds.kind import Kind
+    from loopcal.measure.observations import InstrumentRecord, Observations
 
 SETTINGS: Mapping[str, str] = {
     "format": "1",
@@ -131,7 +132,7 @@ def read_observations(
     FileError : a cell that does not fit, at its line.
     DataError : noise that is not a covariance; with the file.
     """
-    from loopcal.measure import Observations
+    from loopcal.measure.observations import Observations
 
     entry = _select_rows(table, entry, members)
     links, rows = entry.kind.poses_per_row, entry.rows
@@ -208,8 +209,8 @@ def _read_robot_kind(
     file: YamlFile, node: Mapping[str, Any], robot: Mechanism, place: Location
 ) -> Kind:
     """Return a kind of the settings, mounted on the robot's tool; refuse what it cannot measure."""
-    from loopcal.measure import check_redundancy
-    from loopcal.measure.kinds.stage_platforms import BASE
+    from loopcal.measure.data_checks import check_redundancy
+    from loopcal.measure.kinds.kind import BASE
 
     kind = read_kind(file, node, place).with_tool(robot.tool)
     stages = [stage.name for stage in robot.stages]

@@ -18,27 +18,45 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError, suggest_names
-from loopcal.io.core.numbers import format_scaled
+from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.core.records import read_record
-from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
-from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
-from loopcal.io.data.column_names import find_column_fault
-from loopcal.mechanism import PoseRecord
+from loopcal.io.core.yaml_file import (
+    Location,
+    YamlFile,
+    format_flow_mapping,
+    quote_scalar,
+    refuse_unknown_keys,
+)
+from loopcal.io.data.columns import find_column_fault
+from loopcal.mechanism.families.records import PoseRecord
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, EXAMPLES, SI_SYMBOLS, Dimension, find_sd_fault
+from loopcal.units import (
+    DISPLAY_UNITS,
+    EXAMPLES,
+    SI_SYMBOLS,
+    Angle,
+    Dimension,
+    Length,
+    Ratio,
+    find_sd_fault,
+)
 
 if TYPE_CHECKING:
-    from loopcal.measure import Kind
+    from loopcal.measure.kinds.kind import Kind
+    from loopcal.measure.nuisance import StatedValue
+    from loopcal.measure.observations import InstrumentRecord, Observations
+    from loopcal.parameters import Parameter
 
 DIRECTIONS = ("along", "axis", "normal", "up")
 NOISE_UNITS = {
@@ -70,7 +88,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
     FileError : no or an unknown kind, a setting that does not fit it, or a name of a target that no
         column can have.
     """
-    from loopcal.measure import KINDS
+    from loopcal.measure.kinds import KINDS
 
     name, known = node.get("kind"), ", ".join(KINDS)
     if name is None:
@@ -241,3 +259,223 @@ def _format_frame(T: FloatArray) -> str:
     texts = {k: format_quantity(float(v) + 0.0, Dimension.LENGTH) for k, v in lengths}
     texts |= {k: format_quantity(float(v) + 0.0, Dimension.ANGLE) for k, v in turns}
     return format_flow_mapping(texts)
+
+
+# --- Prior knowledge of setup parameters (frames, targets, surfaces, offsets) in measurement
+# files.
+
+KEY, FIXED = "unknowns", "fixed"
+EXAMPLE = (
+    f"write '{FIXED}', {{sd: 1 mm}}, {{start: 12 mm, sd: 1 mm}} or {{start: 12 mm, {FIXED}: true}}"
+)
+
+
+def _make_nuisance_record(quantity: Any) -> type:
+    """Return a record of the knowledge of a parameter of one dimension."""
+    number = quantity | None
+    fields = [("start", number, None), ("sd", number, None), ("fixed", bool, False)]
+    return make_dataclass("KnownParameter", fields, frozen=True)
+
+
+RECORDS = {
+    Dimension.LENGTH: _make_nuisance_record(Length),
+    Dimension.ANGLE: _make_nuisance_record(Angle),
+    Dimension.RATIO: _make_nuisance_record(Ratio),
+}
+
+
+def read_stated_values(
+    files: Sequence[tuple[YamlFile, Sequence[Observations], Mapping[str, float]]],
+    labels: tuple[str, ...],
+) -> tuple[StatedValue, ...]:
+    """Return the knowledge that files state of the setup parameters of their own rows.
+
+    Parameters
+    ----------
+    files : settings of each file, its rows, and the standard deviations of their biases and drifts
+        by name without the session, 0 where there is none. labels : names of the poses.
+
+    Raises
+    ------
+    FileError : a name that is not a parameter of the file, a bad statement, contradicting files.
+    DataError : two kinds of a file state one parameter differently.
+    """
+    from loopcal.measure.nuisance import StatedValue, collect_nuisance_parameters
+
+    known: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
+    for file, observations, shared in files:
+        stated = file.content.get(KEY, {})
+        if not isinstance(stated, dict):
+            sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
+            raise file.error(sentence, (KEY,))
+        of_file: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
+        entries: tuple[Parameter, ...] = ()
+        if stated or shared:
+            entries = collect_nuisance_parameters(observations, labels).table.entries
+        for name, sd in shared.items():
+            of_sessions = [e.name for e in entries if e.name == name or e.name.endswith(f".{name}")]
+            of_file |= {n: (StatedValue(n, sd), file, (KEY,)) for n in of_sessions}
+        for pattern, node in stated.items():
+            place = (KEY, pattern)
+            matching = _match(file, entries, pattern)
+            of_file |= {k.name: (k, file, place) for k in _read_one(file, node, matching, place)}
+        for name, (value, _, place) in of_file.items():
+            if name in known and known[name][0] != value:
+                _, other, other_place = known[name]
+                line = f"{other.path}:{other.line(other_place)}"
+                sentence = f"parameter {name!r} is stated differently in {line}; state it once"
+                raise file.error(sentence, place)
+        known = of_file | known
+    return tuple(value for value, _, _ in known.values())
+
+
+def format_stated_values(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
+    """Return the setting `unknowns` as text, for the parameters among `entries`."""
+    dimensions = {entry.name: entry.dimension for entry in entries}
+    texts: dict[str, str] = {}
+    for value in known:
+        if value.name not in dimensions:
+            continue
+        dimension = dimensions[value.name]
+        text = FIXED
+        if value.sd:
+            text = f"{{sd: {format_quantity(value.sd, dimension)}}}"
+        if value.nominal is not None:
+            start = f"start: {format_quantity(value.nominal, dimension)}"
+            text = f"{{{start}, {text[1:]}" if value.sd else f"{{{start}, {FIXED}: true}}"
+        texts[value.name] = text
+    return format_flow_mapping(texts) if texts else ""
+
+
+def _match(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[Parameter]:
+    """Return the parameters that a name or pattern denotes."""
+    exact = [entry for entry in entries if entry.name == pattern]
+    whole = exact or [entry for entry in entries if fnmatchcase(entry.name, pattern)]
+    matching = whole or [entry for entry in entries if fnmatchcase(entry.name, f"*.{pattern}")]
+    if not matching:
+        names = [entry.name for entry in entries]
+        allowed = ", ".join(names[:12]) or "none; state some, as 'unknown: [frame]' of the kind"
+        sentence = f"this file has no setup parameter {pattern!r}{suggest_names(pattern, names)}"
+        raise file.error(f"{sentence}; it has {allowed}", (KEY, pattern))
+    return matching
+
+
+def _read_one(
+    file: YamlFile, node: Any, matching: Sequence[Parameter], place: Location
+) -> list[StatedValue]:
+    """Return the knowledge that one line states of each parameter that it denotes."""
+    from loopcal.measure.nuisance import StatedValue
+
+    if node == FIXED:
+        return [StatedValue(entry.name) for entry in matching]
+    if not isinstance(node, dict):
+        raise file.error(f"{node!r} does not state knowledge of a parameter; {EXAMPLE}", place)
+    dimensions = {entry.dimension for entry in matching}
+    if len(dimensions) > 1 and ("start" in node or "sd" in node):
+        sentence = "this pattern matches lengths and angles; state them in separate lines"
+        raise file.error(sentence, place)
+    stated = read_record(file, node, RECORDS[matching[0].dimension], None, place)
+    if stated.fixed == ("sd" in node):
+        raise file.error(f"state either 'sd' or '{FIXED}: true'; {EXAMPLE}", place)
+    if not stated.fixed and (fault := find_sd_fault(stated.sd or 0.0)):
+        sentence = f"the standard deviation is {node['sd']}; {fault}, or {FIXED}"
+        raise file.error(sentence, (*place, "sd"))
+    sd = 0.0 if stated.fixed else stated.sd or 0.0
+    return [StatedValue(entry.name, sd, stated.start) for entry in matching]
+
+
+# --- The instrument in the settings of a measurement file: a name, or facts for traceability.
+
+INSTRUMENT_KEY = "instrument"
+
+
+def read_instrument(
+    file: YamlFile, node: Mapping[str, Any], location: Location
+) -> InstrumentRecord | None:
+    """Return the instrument that settings state; None where they state none.
+
+    Raises
+    ------
+    FileError : an unknown key, a number without quotes, or not a date, at its line.
+    """
+    from loopcal.measure.observations import InstrumentRecord
+
+    stated, place = node.get(INSTRUMENT_KEY), (*location, INSTRUMENT_KEY)
+    if stated is None:
+        return None
+    if isinstance(stated, str):
+        return InstrumentRecord(name=stated)
+    if not isinstance(stated, dict) or not stated:
+        sentence = (
+            f"{INSTRUMENT_KEY!r} is neither a name nor facts of an instrument; write its name, or"
+        )
+        example = (
+            f'{INSTRUMENT_KEY}: {{name: AT960, serial_number: "750123", certificate: D-K-15123}}'
+        )
+        raise file.error(f"{sentence} '{example}'", place)
+    try:
+        return read_record(file, stated, InstrumentRecord, None, place)
+    except DataError as error:
+        raise file.error(str(error), place) from None
+
+
+def format_instrument(record: InstrumentRecord) -> str:
+    """Return the setting of an instrument as YAML text in one line."""
+    stated = record.to_dict()
+    if list(stated) == ["name"]:
+        return quote_scalar(record.name)
+    return format_flow_mapping({name: quote_scalar(value) for name, value in stated.items()})
+
+
+# --- Errors that the rows of a session share, in the settings of a kind.
+
+UNKNOWN = "unknown"
+SETTINGS: Mapping[str, str] = {
+    "session_bias": "`unknown`, or component -> standard deviation or `unknown`: an offset that "
+    "all rows of a session share",
+    "session_drift": "the same for a change from the first to the last row of a session, linear "
+    "in time or, without the column `time`, in the order of the rows",
+}
+ITEMS: Mapping[str, str] = {"session_bias": "bias", "session_drift": "drift"}
+
+
+def read_shared_errors(
+    file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location
+) -> tuple[Kind, dict[str, float]]:
+    """Return a kind with its shared errors as unknowns, and parameter -> standard deviation [SI] of
+    those with a prior; 0 where a component has no such error.
+
+    Raises
+    ------
+    FileError : an unknown component, or not a standard deviation.
+    """
+    from loopcal.measure.kinds.kind import list_components, name_shared_error
+
+    priors: dict[str, float] = {}
+    for key, item in ITEMS.items():
+        if key not in node:
+            continue
+        place, stated = (*location, key), node[key]
+        components = dict(list_components(kind))
+        if stated != UNKNOWN and not (isinstance(stated, dict) and stated):
+            example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in components)
+            sentence = f"{key!r} is {stated!r}; write '{key}: {UNKNOWN}', or standard deviations"
+            raise file.error(f"{sentence}, as '{key}: {{{example}}}'", place)
+        kind = replace(cast(Any, kind), unknown=tuple(dict.fromkeys((*kind.unknown, item))))
+        if stated == UNKNOWN:
+            continue
+        priors |= {name_shared_error(kind, item, name): 0.0 for name, _ in components}
+        for pattern, text in stated.items():
+            matching = [(n, d) for n, d in components if fnmatchcase(n, str(pattern))]
+            if not matching:
+                refuse_unknown_keys(file, [pattern], [name for name, _ in components], place)
+            for name, dimension in matching:
+                parameter = name_shared_error(kind, item, name)
+                priors.pop(parameter, None)
+                if text == UNKNOWN:
+                    continue
+                priors[parameter] = file.quantity(text, dimension, (*place, pattern))
+                if fault := find_sd_fault(priors[parameter]):
+                    sentence = f"the standard deviation is {text}; {fault}, or {UNKNOWN}"
+                    raise file.error(sentence, (*place, pattern))
+    return kind, priors

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.io.core.csv_table import format_row, refuse_settings_beside
-from loopcal.io.core.names import find_fault, format_comment
+from loopcal.io.core.limits import find_fault, format_comment
 from loopcal.io.core.text_file import write_text
-from loopcal.io.core.yaml_text import format_flow_mapping, quote_scalar
-from loopcal.io.data.column_names import find_column_fault
+from loopcal.io.core.yaml_file import format_flow_mapping, quote_scalar
 from loopcal.io.data.columns import (
     COVARIANCE,
     FIT,
@@ -27,19 +26,26 @@ from loopcal.io.data.columns import (
     USE_COLUMN,
     Column,
     ContextColumn,
+    find_column_fault,
     list_columns,
     name_covariance,
     name_measured,
 )
-from loopcal.io.data.instrument_settings import format_instrument
-from loopcal.io.data.kind_settings import format_kind, format_quantity
+from loopcal.io.data.kind_settings import (
+    format_instrument,
+    format_kind,
+    format_quantity,
+    format_stated_values,
+)
 from loopcal.io.data.measurement_file import FORMAT
-from loopcal.io.data.nuisance_settings import format_stated_values
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
-    from loopcal.measure import Instrument, Kind, Measurements, Observations
+    from loopcal.measure.instrument import Instrument
+    from loopcal.measure.kinds.kind import Kind
+    from loopcal.measure.measurements import Measurements
+    from loopcal.measure.observations import Observations
 
 EQUAL = 1e-9
 """Relative difference up to which the standard deviations of all rows are written as one number,
@@ -101,7 +107,7 @@ def format_measurements(
     ----------
     states_use : write the column `use` also where no pose is held out.
     """
-    from loopcal.measure import check_redundancy
+    from loopcal.measure.data_checks import check_redundancy
 
     _refuse_names(data)
     observations = data.all_observations
@@ -210,7 +216,8 @@ def format_data_sheet(
     ------
     DataError : the instrument measures a pose that does not exist, or the number of names is wrong.
     """
-    from loopcal.measure import Measurements, Observations
+    from loopcal.measure.measurements import Measurements
+    from loopcal.measure.observations import Observations
 
     sensors = instrument.with_tool(robot).sensors
     rows = []

@@ -4,7 +4,7 @@
 The sheet states poses, readings and the instrument; a profile states how the export is read. Points
 are joined with the sheet by their names, or by their order: all targets of the first pose, then
 those of the second, and so on. Numbers keep the digits and the unit of the export. Before anything
-is written, the points are to be examined: `loopcal.diagnose.examine_points`.
+is written, the points are to be examined: `loopcal.diagnose.point_names.examine_points`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from loopcal.io.core.text_file import read_text, write_text
 from loopcal.io.data.kind_rows import KindRows, read_kinds
 from loopcal.io.data.measurement_file import load_measurements
 from loopcal.io.exports.conversion import convert_export, list_headers
-from loopcal.io.exports.profile import Profile
-from loopcal.io.exports.profile_reader import check_columns
-from loopcal.measure import Measurements, Observations
-from loopcal.measure.kinds.points.target_kind import name_point
-from loopcal.mechanism import Mechanism
+from loopcal.io.exports.profile import Profile, check_columns
+from loopcal.measure.kinds.points import name_point
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
 from loopcal.units import Dimension, find_unit
 
 Row = dict[str, str]

@@ -6,9 +6,9 @@ A format is a `Format` with `read`, `write` or both, in a module of its own, and
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import hangprinter, parameter_table
-from loopcal.io.formats.delta_printers import delta_gcode, klipper
-from loopcal.io.formats.linuxcnc import hal_file, ini_file
+from loopcal.io.formats import delta_gcode, hangprinter, klipper, parameter_table
+from loopcal.io.formats import linuxcnc as hal_file
+from loopcal.io.formats import linuxcnc as ini_file
 from loopcal.io.formats.program_format import Format
 from loopcal.io.formats.urdf import urdf_format
 

@@ -24,9 +24,9 @@ from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
-from loopcal.io.formats.value_file import format_short
+from loopcal.io.formats.program_format import format_short
 from loopcal.io.runs.plan_folder import SHEET, VIA
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -113,7 +113,7 @@ def format_gcode(
 ) -> str:
     """Return a program that starts at home, visits all stops in order, and returns to home.
 
-    `home` : (c,) of `loopcal.planning.check_route`, which has checked all of these paths.
+    `home` : (c,) of `loopcal.planning.path.check_route`, which has checked all of these paths.
     """
     refuse_coordinates(robot)
     poses = sum(use != VIA for use in stops.uses)

@@ -32,7 +32,7 @@ from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import LARGEST
 
 if TYPE_CHECKING:
-    from loopcal.measure import Measurements
+    from loopcal.measure.measurements import Measurements
 
 MM, DEG = 1e-3, math.pi / 180.0
 FREEDOMS, MOST_LINES = 3, 26
@@ -204,7 +204,7 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     ------
     FileError : no pose is known, or the known poses do not determine an anchor.
     """
-    from loopcal.geometry.alignment import ANCHOR_RANK, solve_line_anchor
+    from loopcal.geometry import ANCHOR_RANK, solve_line_anchor
 
     act = (
         f"add known poses at several heights to {POSITIONS!r} (mm), or add the key {ANCHORS!r} (mm)"
@@ -299,7 +299,9 @@ def _build_measurements(samples: Samples, options: ImportOptions) -> Measurement
 
     Without known poses all positions are NaN, to be filled in.
     """
-    from loopcal.measure import Measurements, Observations, Position
+    from loopcal.measure.kinds.position import Position
+    from loopcal.measure.measurements import Measurements
+    from loopcal.measure.observations import Observations
 
     n, k = len(samples.motors), len(samples.known)
     known = samples.known * MM if k else np.full((n, FREEDOMS), np.nan)

@@ -13,9 +13,8 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import build_robot, load_robot
-from loopcal.io.runs.run import Run
-from loopcal.io.runs.run_folder import load_run_or_robot
-from loopcal.mechanism import Mechanism
+from loopcal.io.runs.run_folder import Run, load_run_or_robot
+from loopcal.mechanism.model import Mechanism
 
 
 def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> Format:

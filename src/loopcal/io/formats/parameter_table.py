@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.findings import Finding, report_finding
-from loopcal.io.core.numbers import format_scaled
+from loopcal.io.core.csv_table import format_scaled
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.units import find_unit
 

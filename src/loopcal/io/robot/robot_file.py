@@ -13,37 +13,181 @@ A loaded robot keeps the text of its file, so that writing it back changes only 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+import inspect
+import math
+import re
+import textwrap
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import numpy as np
 
-from loopcal.errors import DataError, FileError, MechanismError, suggest_names
+from loopcal.errors import DataError, FileError, MechanismError, UnitError, suggest_names
 from loopcal.findings import report_finding
-from loopcal.io.core.records import read_record, read_units
+from loopcal.io.core.csv_table import format_scaled
+from loopcal.io.core.records import Units, get_field_types, read_record, read_units
 from loopcal.io.core.text_file import as_path, name_files, write_text
-from loopcal.io.core.yaml_file import YamlFile, read_yaml
-from loopcal.io.core.yaml_text import remove_key
-from loopcal.io.data.column_names import find_column_fault
-from loopcal.io.robot.identified_table import (
-    TABLE,
-    add_table,
-    read_identified_values,
-    read_possible_values,
-    remove_mark,
+from loopcal.io.core.yaml_file import (
+    Location,
+    YamlFile,
+    add_key,
+    quote_scalar,
+    read_yaml,
+    refuse_unknown_keys,
+    remove_key,
 )
-from loopcal.mechanism import (
-    FAMILIES,
-    Assembly,
-    Mechanism,
-    RobotRecord,
-    build,
-    match_parameter_names,
-    stages,
-)
-from loopcal.mechanism.families.summed_records import SumError
+from loopcal.io.data.columns import find_column_fault
+from loopcal.mechanism.assembly import Assembly
+from loopcal.mechanism.compilation import build, find_impossible_values
+from loopcal.mechanism.families import FAMILIES
+from loopcal.mechanism.families.limb_records import SumError
+from loopcal.mechanism.families.records import RobotRecord, match_parameter_names
+from loopcal.mechanism.families.stages import PlacedStages, StageError, StageRecord, Stages
+from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension, find_unit, to_si
+
+# --- The `identified:` table of a corrected robot file: values of parameters.
+
+TABLE = "identified"
+PLUS_MINUS = "+/-"
+KEYS = ("name", "value", PLUS_MINUS, "unit")
+NOT_CALIBRATED = "# NOT CALIBRATED"
+"""Beginning of a robot file that a failed calibration made."""
+EXAMPLE = "'{name: .., value: .., unit: ..}'"
+
+
+def format_table(robot: Mechanism, plus_minus: FloatArray | None = None) -> str:
+    """Return the table as YAML: free parameters, and others that differ from their nominal value.
+
+    Parameters
+    ----------
+    robot : its values and the units of its file.
+    plus_minus : (p,) uncertainty of each value [SI]; what is not finite is written as null.
+
+    Returns
+    -------
+    Lines with a final break; nothing where all values are nominal and no uncertainty is given.
+    """
+    return _format_rows(_list_rows(robot, plus_minus))
+
+
+def _list_rows(robot: Mechanism, plus_minus: FloatArray | None) -> list[dict[str, str]]:
+    """Return the rows of the table with the keys KEYS; numbers as their texts."""
+    if plus_minus is None and (robot.values == robot.parameters.nominal).all():
+        return []
+    rows = []
+    for i, parameter in enumerate(robot.parameters.entries):
+        if parameter.free or robot.values[i] != parameter.nominal:
+            shown = find_unit(robot.units[parameter.dimension])
+            value = format_scaled(float(robot.values[i]), shown.factor_to_si)
+            half = math.nan if plus_minus is None else float(plus_minus[i]) / shown.factor_to_si
+            text = f"{half:.2g}" if math.isfinite(half) else "null"
+            cells = (parameter.name, value, text, shown.symbol)
+            rows.append(dict(zip(KEYS, cells, strict=True)))
+    return rows
+
+
+def _format_rows(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return rows as YAML; nothing without rows."""
+    lines = [f"{TABLE}:  # delete this table to restore the nominal robot\n"] if rows else []
+    for row in rows:
+        name, unit = quote_scalar(row["name"]), quote_scalar(row["unit"])
+        numbers = f"value: {row['value']}, {PLUS_MINUS}: {row[PLUS_MINUS]}"
+        lines.append(f"  - {{name: {name}, {numbers}, unit: {unit}}}\n")
+    return "".join(lines)
+
+
+def _read_number(text: str) -> float | None:
+    """Return what YAML reads from the text of a number, or from `null`."""
+    if text == "null":
+        return None
+    return int(text) if text.lstrip("-").isdigit() else float(text)
+
+
+def add_table(file: YamlFile, robot: Mechanism, plus_minus: FloatArray | None = None) -> YamlFile:
+    """Return a robot file without a table with that of `format_table`."""
+    rows = _list_rows(robot, plus_minus)
+    if not rows:
+        return file
+    numbers = ("value", PLUS_MINUS)
+    content: list[dict[str, Any]] = [
+        {key: _read_number(text) if key in numbers else text for key, text in row.items()}
+        for row in rows
+    ]
+    return add_key(file, _format_rows(rows), {TABLE: content})
+
+
+def remove_mark(text: str) -> str:
+    """Return the text of a robot file without the lines that say that its calibration failed."""
+    while text.startswith(NOT_CALIBRATED):
+        text = text.partition("\n")[2]
+    return text
+
+
+def read_identified_values(file: YamlFile, robot: Mechanism) -> FloatArray:
+    """Return the robot's values (p,) [SI], with those of the file's table in place.
+
+    Raises
+    ------
+    FileError
+        A bad row, an unknown or duplicate parameter, a value that is not a number, a wrong unit.
+    """
+    values = robot.values.copy()
+    for name, value in read_rows(file, robot).items():
+        values[robot.parameters.index(name)] = value
+    return values
+
+
+def read_possible_values(file: YamlFile, robot: Mechanism) -> FloatArray:
+    """Return the values as `read_identified_values`; refuse those that no machine has.
+
+    A file of a calibration that failed keeps such values, to be looked at.
+    """
+    values = read_identified_values(file, robot)
+    if file.text.startswith(NOT_CALIBRATED):
+        return values
+    for name, finding in find_impossible_values(robot, values)[:1]:
+        rows = [row.get("name") for row in file.content[TABLE]]
+        place: Location = (TABLE, rows.index(name)) if name in rows else (TABLE,)
+        advice = "correct the value, or delete this table to restore the nominal robot"
+        raise file.error(f"{finding}; {advice}", place)
+    return values
+
+
+def read_rows(file: YamlFile, robot: Mechanism) -> dict[str, float]:
+    """Return the values [SI] of the file's table by name; raise as `read_identified_values`."""
+    rows = file.content[TABLE]
+    if not isinstance(rows, list):
+        raise file.error(f"{TABLE!r} must be a list of {EXAMPLE}", (TABLE,))
+    values: dict[str, float] = {}
+    for i, row in enumerate(rows):
+        place: Location = (TABLE, i)
+        if not isinstance(row, dict):
+            raise file.error(f"this row is not a mapping; write {EXAMPLE}", place)
+        refuse_unknown_keys(file, list(row), KEYS, place)
+        for key in (k for k in KEYS if k != PLUS_MINUS and k not in row):
+            raise file.error(f"this row has no {key!r}; write {EXAMPLE}", place)
+        name, value, symbol = row["name"], row["value"], row["unit"]
+        if name not in robot.parameters.names:
+            hint = suggest_names(str(name), robot.parameters.names)
+            sentence = f"{name!r} is not a parameter of this robot{hint}; correct the name"
+            raise file.error(sentence, place)
+        if name in values:
+            raise file.error(f"duplicate parameter {name!r}; remove one", place)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise file.error(f"the value of {name!r} is {value!r}; write a number", place)
+        dimension = robot.parameters.dimensions[robot.parameters.index(name)]
+        try:
+            values[name] = to_si(value, find_unit(str(symbol), dimension))
+        except UnitError as error:
+            raise file.error(f"{name!r}: {error}", place) from None
+    return values
+
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
@@ -107,8 +251,6 @@ def build_robot(file: YamlFile) -> Mechanism:
     with name_files(file.path):
         record = read_record(file, content, FAMILIES[name], units)
         if name == KEY:
-            from loopcal.io.robot.stage_records import place_stages
-
             record = place_stages(file, record, units)
         symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file, record)
@@ -242,7 +384,7 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     """
     try:
         expanded = record.expand()
-    except stages.StageError as error:
+    except StageError as error:
         raise file.error(str(error), (KEY, error.index)) from None
     except SumError as error:
         raise file.error(str(error), ("actuators", error.actuator)) from None
@@ -260,3 +402,279 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
         except MechanismError as error:
             raise file.error(str(error), ("common_errors", i)) from None
     return record.assembly(expanded)
+
+
+# --- The stages of a robot file: each one is a serial joint, or a robot of another family.
+
+OWN_KEYS = ("on", "mount", "joint", "family")
+"""Keys of a stage that are not those of its family; both have a name."""
+
+
+def place_stages(file: YamlFile, chain: RobotRecord, units: Units) -> PlacedStages:
+    """Return a chain with the records of its stages.
+
+    Raises
+    ------
+    FileError : a stage is neither a joint nor a robot, or a key of it does not fit; at its line.
+    """
+    assert isinstance(chain, Stages)
+    robots = tuple(_read_stage(file, i, stage, units) for i, stage in enumerate(chain.stages))
+    own = {field.name: getattr(chain, field.name) for field in fields(chain)}
+    return PlacedStages(**own, robots=robots)
+
+
+def _read_stage(file: YamlFile, i: int, stage: StageRecord, units: Units) -> RobotRecord | None:
+    """Return the record of a stage of another family, None for a serial joint."""
+    content: dict[str, Any] = file.content[KEY][i]
+    if (stage.joint is None) == (stage.family is None):
+        both = stage.joint is not None
+        raise file.error(
+            f"stage {stage.name!r} states {'both' if both else 'neither'} 'joint' "
+            f"{'and' if both else 'nor'} 'family'; write 'joint:' for a serial joint, or 'family:' "
+            "with the keys of that family",
+            (KEY, i),
+        )
+    if stage.family is None:
+        refuse_unknown_keys(file, list(content), list(get_field_types(StageRecord)), (KEY, i))
+        return None
+    families = {name: record for name, record in FAMILIES.items() if record is not Stages}
+    if stage.family not in families:
+        hint = suggest_names(stage.family, list(families))
+        raise file.error(
+            f"{stage.family!r} is not a family of a stage{hint}; allowed: "
+            f"{', '.join(sorted(families))}",
+            (KEY, i, "family"),
+        )
+    rest = {key: value for key, value in content.items() if key not in OWN_KEYS}
+    return read_record(file, rest, families[stage.family], units, (KEY, i))
+
+
+# --- Stored values of parameters to compare a fit with: published ones, or those of a firmware.
+
+STORED_WHAT = "file of stored values"
+
+
+def load_stored_values(path: str | Path, robot: Mechanism) -> dict[str, float] | Mechanism:
+    """Return the stored values of a robot's parameters by name [SI], or a robot that has them.
+
+    Parameters
+    ----------
+    path : a robot file, or a file with the table `identified`. robot : that is calibrated.
+
+    Raises
+    ------
+    FileError : unreadable, neither of the two, or a bad row; with its line.
+    """
+    file = read_yaml(find_robot_file(path), STORED_WHAT)
+    if "family" in file.content:
+        return build_robot(file)
+    if TABLE not in file.content:
+        raise file.error(
+            f"neither a robot file nor a list of values; write a list {TABLE!r} of {EXAMPLE}"
+        )
+    refuse_unknown_keys(file, list(file.content), (TABLE,))
+    return read_rows(file, robot)
+
+
+# --- Reference of file keys, taken from the records that read them: types, defaults, docstrings.
+
+SECTION = re.compile(r"^(Attributes|Examples|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
+SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)
+LONG = re.compile(
+    r"^(?P<names>(?:\w+, )*\w+)(?: : [^\n]{0,48})?\n(?P<phrase>(?: {4}[^\n]*(?:\n|$))+)",
+    re.MULTILINE,
+)
+SI = re.compile(r" \[(?:m|rad|m per turn|m, rad|m or rad)\]")
+ELSEWHERE = re.compile(r"(?:Others: )?[Ss]ee (?:`\w+`|the module)(?:, |; |\. ?|$)")
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a file.
+
+    Parameters
+    ----------
+    name : as written. holds : its type, such as `length`, `[x, y]`, or the name of a record.
+    default : value without the key, "needed" where the key is mandatory, "" where it is empty.
+    meaning : phrase of the docstring, possibly empty.
+    """
+
+    name: str
+    holds: str
+    default: str
+    meaning: str
+
+
+def list_keys(record: type) -> tuple[Key, ...]:
+    """Return the keys that a record takes, its own before inherited ones."""
+    meanings = collect_meanings(record)
+    hints = get_field_types(record)
+    fields = {f.name.removesuffix("_"): f for f in dataclasses.fields(record) if f.init}
+    bases = [base for base in record.__mro__[1:] if dataclasses.is_dataclass(base)]
+    inherited = {name for base in bases for name in get_field_types(base)}
+    order = sorted(fields, key=lambda name: name in inherited)
+    return tuple(
+        Key(n, describe_type(hints[n]), _describe_default(fields[n]), meanings.get(n, ""))
+        for n in order
+    )
+
+
+def collect_meanings(record: type) -> dict[str, str]:
+    """Return name -> phrase from the docstrings of a record and of its bases."""
+    meanings: dict[str, str] = {}
+    for base in reversed(record.__mro__):
+        meanings |= _parse_entries(inspect.cleandoc(base.__doc__ or ""))
+    return {name.removesuffix("_"): phrase for name, phrase in meanings.items()}
+
+
+def name_record(record: type) -> str:
+    """Return the name of a record in the file reference: `Pose` for `PoseRecord`."""
+    return record.__name__.removesuffix("Record")
+
+
+def describe_type(annotation: Any) -> str:
+    """Return what an annotation allows, in terms of a file."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        marks = [mark for mark in arguments[1:] if isinstance(mark, Dimension)]
+        names = {Dimension.LENGTH: "length", Dimension.ANGLE: "angle"}
+        return names.get(marks[0], "number") if marks else describe_type(arguments[0])
+    if origin in (Union, types.UnionType):
+        branches = (describe_type(a) for a in arguments if a is not type(None))
+        return " or ".join(dict.fromkeys(branches))
+    if origin is Literal:
+        return " or ".join(f"`{value}`" for value in arguments)
+    if origin in (tuple, list):
+        if arguments[-1:] == (Ellipsis,) or origin is list:
+            return f"list of {describe_type(arguments[0])}"
+        return f"[{', '.join(describe_type(a) for a in arguments)}]"
+    if origin is not None and issubclass(origin, Mapping):
+        return f"name: {describe_type(arguments[1])}"
+    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+        return name_record(annotation)
+    names = {str: "text", float: "number", int: "whole number", bool: "true or false"}
+    return "anything" if annotation is Any else names.get(annotation, str(annotation))
+
+
+def _parse_entries(doc: str) -> dict[str, str]:
+    """Return name -> phrase of the Attributes and Parameters sections of a docstring.
+
+    An entry is `name : type` with an indented phrase below it, or `name : phrase`, of which
+    several may share a line.
+    """
+    titles_and_bodies = SECTION.split(doc)
+    sections = zip(titles_and_bodies[1::2], titles_and_bodies[2::2], strict=True)
+    text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
+    entries: dict[str, str] = {}
+    for match in LONG.finditer(text):
+        entries |= _clean_phrase(match["names"], match["phrase"])
+    text = LONG.sub("", text)
+    matches = list(SHORT.finditer(text))
+    ends = [*(match.start() for match in matches), len(text)][1:]
+    for match, end in zip(matches, ends, strict=True):
+        entries |= _clean_phrase(match[1], text[match.end() : end])
+    return entries
+
+
+def _clean_phrase(names: str, text: str) -> dict[str, str]:
+    """Return name -> phrase of one entry; nothing for one that only points elsewhere."""
+    phrase = ELSEWHERE.sub("", SI.sub("", " ".join(text.split()))).rstrip(". ")
+    return dict.fromkeys(names.split(", "), phrase) if phrase else {}
+
+
+def _describe_default(field: dataclasses.Field[Any]) -> str:
+    """Return a default as a file would state it."""
+    if field.default is MISSING and field.default_factory is MISSING:
+        return "needed"
+    if field.default_factory is not MISSING or field.default in (None, (), ""):
+        return ""
+    if isinstance(field.default, tuple):
+        return f"[{', '.join(f'{v:g}' if isinstance(v, float) else str(v) for v in field.default)}]"
+    return f"{field.default:g}" if isinstance(field.default, float) else str(field.default)
+
+
+# --- Robot files made from others: a new robot of a family, and a robot with more parameters
+# fixed.
+
+EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar", "stages": "arm-6r"}
+"""The shipped robot of a family that does not have the name of the family."""
+
+WIDTH = 120
+
+
+def format_new_robot(family: str, name: str) -> str:
+    """Return the text of a robot file of a valid robot, in which the user replaces the numbers.
+
+    Parameters
+    ----------
+    family : a family, or the name of a shipped robot to start from. name : of the new robot.
+
+    Raises
+    ------
+    MechanismError : neither a family nor a shipped robot.
+    """
+    shipped = list_shipped_robots()
+    example = EXAMPLES.get(family, family)
+    if example not in shipped:
+        known = list(dict.fromkeys([*FAMILIES, *shipped]))
+        sentence = (
+            f"{family!r} is neither a family nor a shipped robot{suggest_names(family, known)}"
+        )
+        raise MechanismError(f"{sentence}; allowed: {', '.join(known)}")
+    text = shipped[example].read_text("utf-8")
+    record = str(read_yaml(shipped[example], "robot file").content["family"])
+    new = {"name": quote_scalar(name)}
+    new["source"] = "where these numbers come from"
+    for key, value in new.items():
+        line = f"{key}: {value}"
+        text = re.sub(rf"^{key}: .*$", lambda _, line=line: line, text, count=1, flags=re.MULTILINE)
+    lines = [
+        f"# A new robot of the family {record}, with the numbers of the shipped robot {example}.",
+        "# Replace them by your own.",
+        "#",
+        f"# Keys of this family (docs/files.md; `loopcal check {name}.yaml` shows how it is read):",
+    ]
+    for key in list_keys(FAMILIES[record]):
+        default = f", default {key.default}" if key.default not in ("", "needed") else ""
+        meaning = f"; {key.meaning}" if key.meaning else ""
+        entry = f"{key.name}: {key.holds}{default}{meaning}"
+        lines += textwrap.wrap(entry, WIDTH, initial_indent="#   ", subsequent_indent="#     ")
+    body = text.split("\n")
+    first = next(i for i, line in enumerate(body) if not line.startswith("#"))
+    return "\n".join([*lines, "", *body[first:]])
+
+
+def save_reduced_robot(robot: Mechanism, dropped: Mapping[str, str], path: str | Path) -> None:
+    """Write a robot's file with further parameters fixed; arguments as `format_reduced_robot`.
+
+    Raises
+    ------
+    FileError : the file cannot be written. MechanismError : as `format_reduced_robot`.
+    """
+    write_text(path, format_reduced_robot(robot, dropped))
+
+
+def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
+    """Return the text of a robot's file with further parameters fixed.
+
+    Parameters
+    ----------
+    robot : from `load_robot`, with any values.
+    dropped : parameter to fix -> comment that is written after it.
+
+    Raises
+    ------
+    MechanismError : the robot was not loaded from a file.
+    """
+    source = get_source(robot)
+    entries = dict.fromkeys(source.record.fixed, "") | dict(dropped)
+    if not entries:
+        return format_robot(robot)
+    names = {name: quote_scalar(name) for name in entries}
+    width = max(len(text) for text in names.values())
+    lines = [
+        f"  - {names[name]:<{width}}  # {comment}" if comment else f"  - {names[name]}"
+        for name, comment in entries.items()
+    ]
+    file = add_key(remove_key(source.nominal_file, "fixed"), "\n".join(["fixed:", *lines]) + "\n")
+    return add_table(file, robot).text

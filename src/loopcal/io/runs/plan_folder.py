@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import format_row
-from loopcal.io.core.numbers import parse_exact
+from loopcal.io.core.csv_table import format_row, parse_exact
 from loopcal.io.core.result_folder import FolderKind, refuse_folder, write_result_folder
 from loopcal.io.data.columns import COMMANDED, FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
-from loopcal.mechanism import POSITION, Mechanism
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import POSITION
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def format_plan_data(plan: Plan) -> str:
 
     They are empty where they are what is measured.
     """
-    from loopcal.measure import Closure
+    from loopcal.measure.kinds.joints import Closure
 
     sensors = tuple(
         replace(s, rows=plan.poses.groups) if s.kind.poses_per_row > 1 else s
@@ -199,7 +199,8 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
 
 def format_surface_data(plan: SurfacePlan) -> str:
     """Return the data file to fill in: gaps are zero, readings empty, rows in pose order."""
-    from loopcal.measure import Measurements, Observations
+    from loopcal.measure.measurements import Measurements
+    from loopcal.measure.observations import Observations
 
     robot = plan.robot
     observations = []

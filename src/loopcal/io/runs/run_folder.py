@@ -13,7 +13,8 @@ robot.yaml     the corrected robot file: the nominal file plus its `identified:`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.engine import collect_versions
-from loopcal.errors import FileError
+from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.result_folder import (
     FolderKind,
@@ -31,30 +32,224 @@ from loopcal.io.core.result_folder import (
     write_result_folder,
 )
 from loopcal.io.core.text_file import as_path, sha256
-from loopcal.io.robot.identified_table import remove_mark
-from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
-from loopcal.io.runs.run import Run
-from loopcal.io.runs.run_arrays import read_run_arrays
+from loopcal.io.core.yaml_file import read_yaml
+from loopcal.io.data.measurement_file import load_measurements
+from loopcal.io.robot.robot_file import (
+    NOT_CALIBRATED,
+    format_robot,
+    list_shipped_robots,
+    load_robot,
+    remove_mark,
+)
 from loopcal.io.runs.run_result import (
     FORMAT,
     RESULT,
     read_result,
+    read_run_arrays,
     refuse_other_estimates,
     refuse_other_parameters,
 )
-from loopcal.io.runs.run_verdict import (
-    FAILED_ROBOT,
-    ROBOT,
-    WARNING,
-    find_file_failure,
-    find_run_failure,
-    name_robot_file,
-)
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
+from loopcal.presentation import HtmlResult
 
 if TYPE_CHECKING:
-    from loopcal.estimate import Posterior
-    from loopcal.workflow import CalibrationReport
+    from loopcal.estimate.fit_linearization import FitUncertainty
+    from loopcal.estimate.posterior import Posterior
+    from loopcal.measure.fitted_rows import FittedRows
+    from loopcal.measure.measurements import Measurements
+    from loopcal.workflow.calibration_report import CalibrationReport
+
+
+# --- Whether the numbers of a run may be written for a machine: corrected robot, controller,
+# commands.
+
+ROBOT, FAILED_ROBOT = "robot.yaml", "robot-not-calibrated.yaml"
+"""The corrected robot file of a run, and that of a calibration that failed."""
+
+FAILED_VERDICT, CONVERGED = "not_calibrated", "converged"
+"""Verdict of a calibration that failed, and status of a fit that converged, in result.json."""
+
+WARNING = f"""\
+{NOT_CALIBRATED}: the calibration that made this file failed; see result.json beside it.
+"""
+
+
+def name_robot_file(report: CalibrationReport, force: bool = False) -> str:
+    """Return the name of a report's robot file; `force` names a failed one like any other."""
+    return FAILED_ROBOT if report.failures and not force else ROBOT
+
+
+def list_reasons(failures: Iterable[object]) -> tuple[str, ...]:
+    """Return the sentences of failures without their last full stop, to be joined."""
+    return tuple(str(failure).strip().rstrip(".") for failure in failures)
+
+
+def find_run_failure(path: Path, result: Mapping[str, Any]) -> Finding | None:
+    """Return why the numbers of a run are not for a machine; None where they are, or of no run.
+
+    Parameters
+    ----------
+    path : of the run. result : content of result.json; empty for a robot file.
+
+    Returns
+    -------
+    `gates.run-not-calibrated` where the run failed, or `gates.run-without-verdict` where it was
+    made before runs had a verdict and does not state that its gates were met.
+    """
+    if not result:
+        return None
+    status = str(result.get("fit", {}).get("status", ""))
+    reasons = list_reasons(result.get("reasons") or ())
+    if status not in ("", CONVERGED) and not reasons:
+        reasons = (f"the fit did not converge ({status.replace('_', ' ')})",)
+    has_failed = result.get("verdict") == FAILED_VERDICT or result.get("passed") is False
+    if has_failed or reasons:
+        return report_finding("gates.run-not-calibrated", run=str(path), reasons=reasons)
+    if "verdict" not in result and (status != CONVERGED or "passed" not in result):
+        return report_finding("gates.run-without-verdict", run=str(path))
+    return None
+
+
+def find_file_failure(path: Path) -> Finding | None:
+    """Return `gates.run-not-calibrated` for a robot file that states it; None for other paths."""
+    if not path.is_file() or not read_yaml(path, "robot file").text.startswith(NOT_CALIBRATED):
+        return None
+    return report_finding("gates.run-not-calibrated", run=str(path), reasons=())
+
+
+# --- A calibration that was read from its run folder.
+
+
+@dataclass(frozen=True, eq=False)
+class Run(HtmlResult):
+    """A calibration read from its run folder, or a robot file as if it were one.
+
+    Parameters
+    ----------
+    path : of the folder or file. result : content of result.json, empty for a robot file.
+    robot : the corrected robot. initial_robot : the robot before the calibration.
+    nuisance_values : name -> estimate of frames, targets and surfaces, such as `tracker.x` [SI].
+    initial_nuisance_values : the same with the geometry before the calibration.
+    arrays : content of arrays.npz, SI.
+    """
+
+    path: Path
+    result: dict[str, Any]
+    robot: Mechanism
+    initial_robot: Mechanism
+    nuisance_values: Mapping[str, float] = field(default_factory=dict)
+    initial_nuisance_values: Mapping[str, float] = field(default_factory=dict)
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    def __repr__(self) -> str:
+        verdict = self.result.get("verdict")
+        verdict = f", {verdict.replace('_', ' ')}" if verdict else ""
+        return f"<Run {str(self.path)!r}: {self.robot.name}{verdict}>"
+
+    @property
+    def failure(self) -> Finding | None:
+        """Why the numbers of this run are not for a machine; None where they are."""
+        return find_run_failure(self.path, self.result)
+
+    @property
+    def identified_robot(self) -> Mechanism:
+        """The robot with only those parameters free that the run identified; its file leaves the
+        others free, too.
+        """
+        from loopcal.estimate.free_parameters import free_only
+
+        names = [row["name"] for row in self.result["fit"]["parameters"]]
+        return free_only(self.robot, names)
+
+    @property
+    def fitted_rows(self) -> FittedRows | None:
+        """The rows that the run, and those that are its prior, were fitted to; None for a robot
+        file, and for run folders of older versions.
+        """
+        from loopcal.measure.fitted_rows import fitted_rows_from_arrays
+
+        return fitted_rows_from_arrays(self.arrays)
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Labels of the poses that were held out for validation."""
+        return tuple((self.result.get("split") or {}).get("held_out", ()))
+
+    @property
+    def excluded(self) -> tuple[str, ...]:
+        """Labels of the poses that were excluded from the fit."""
+        return tuple(self.result.get("fit", {}).get("dropped") or ())
+
+    def load_posterior(self) -> Posterior:
+        """Return estimates and uncertainties, as a prior for new data or for `accuracy_map`.
+
+        Raises
+        ------
+        EstimationError : the run does not contain them, or its robot file was changed.
+        """
+        from loopcal.estimate.posterior import posterior_from_arrays
+
+        return posterior_from_arrays(self.identified_robot, self.arrays)
+
+    def load_uncertainty(self) -> FitUncertainty | None:
+        """Return what the fit knows of machine and setup parameters together, to check other
+        measurements; None for a robot file, or a run that does not contain it.
+        """
+        from loopcal.estimate.fit_linearization import uncertainty_from_arrays
+
+        if not self.result:
+            return None
+        scale, names = self.result["fit"].get("sigma_scale"), tuple(self.nuisance_values)
+        return uncertainty_from_arrays(
+            self.identified_robot, names, self.arrays, 1.0 if scale is None else scale
+        )
+
+    def load_budget(self) -> dict[str, Any]:
+        """Return the uncertainty budget, see `ErrorBudget.to_dict`.
+
+        Raises
+        ------
+        DataError : the run has no intervals, or was made by an earlier version.
+        """
+        budget = self.result.get("expected_error")
+        if budget is None or budget.get("sources") is None:
+            raise DataError(report_finding("files.no-budget", run=str(self.path)))
+        return dict(budget)
+
+    def load_measurements(self, **allowed: bool) -> tuple[Measurements, Measurements | None]:
+        """Return the fitted and the held-out measurements, from the unchanged input files.
+
+        Parameters
+        ----------
+        allowed : see `loopcal.load_measurements`.
+
+        Returns
+        -------
+        fitted : without excluded poses. held_out : None where no pose was held out.
+
+        Raises
+        ------
+        FileError : the run names no data, or a file is missing or was changed since.
+        """
+        roles = ("data", "poses")
+        files = {r: f for r, f in list_inputs(self.result).items() if r.partition("-")[0] in roles}
+        if not files:
+            sentence = "this run names no measurement files; load them by load_measurements"
+            raise FileError(sentence, self.path)
+        for file in files.values():
+            if sha256(file["path"]) != file["sha256"]:
+                sentence = f"this file was changed since the run in {self.path}; restore it"
+                raise FileError(sentence, file["path"])
+        data = load_measurements([f["path"] for f in files.values()], self.robot, **allowed)
+        fitted = [label not in (*self.held_out, *self.excluded) for label in data.labels]
+        held_out = [label in self.held_out for label in data.labels]
+        return data.take(fitted), data.take(held_out) if any(held_out) else None
+
+
+def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
+    """Return role -> `path` and `sha256` of the input files of a result."""
+    return dict(result.get("made_by", {}).get("inputs", {}))
+
 
 ARRAYS = "arrays.npz"
 RUN = FolderKind("run", RESULT, ("made_by", "fit"), (ARRAYS, ROBOT, FAILED_ROBOT))

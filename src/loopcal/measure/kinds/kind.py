@@ -10,46 +10,357 @@ contract tests follow from this class. A kind receives platform poses, not the r
   columns, `_evaluate` and `_measure`;
 * `guess_values`, if its parameters follow from data in closed form.
 
-Example: `loopcal.measure.kinds.points.distance`. Shapes: t trials, r rows, c columns as in files,
+Example: `loopcal.measure.kinds.distance`. Shapes: t trials, r rows, c columns as in files,
 m residuals (often c), u nuisance parameters of the kind, j joints that it senses. A kind with
 `poses_per_row` l > 1 has an axis l for the poses that a row compares: T (t, r, l, 4, 4), jacobian
 (t, r, l, m, 6). Values of nuisance parameters are plain numbers that add up;
 `loopcal.measure.kinds.setup_parameters` says how a frame or a direction is written in them.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import Field, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, Field, dataclass, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 
-from loopcal import geometry
+from loopcal import geometry, mechanism
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
-from loopcal.measure.kinds import stage_platforms
-from loopcal.measure.kinds.rows import (
-    Column,
-    Evaluation,
-    InvalidRows,
-    MeasuredColumns,
-    drop_rounding,
-    zero_absent,
-)
-from loopcal.measure.kinds.settings_text import list_changed_settings
 from loopcal.measure.kinds.setup_parameters import SetupItem
-from loopcal.measure.kinds.shared_errors import (
-    DRIFT,
-    SHARED_ERRORS,
-    add_shared_errors,
-    make_shared_errors,
-    spread_components,
-    sum_shared_errors,
-)
+from loopcal.numerics.elimination import without_rounding
+from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
+
+# --- Rows of a kind: their columns, residuals and derivatives, and rows that are invalid.
+
+InvalidRows = tuple[tuple[int, str], ...]
+"""Index of each invalid row, and the end of a sentence that says why."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a measurement file: its name, and the dimension of its numbers."""
+
+    name: str
+    dimension: Dimension
+
+
+POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "z"))
+"""Columns of a position."""
+
+
+class Evaluation(NamedTuple):
+    """Residuals (predicted - measured) and their derivatives.
+
+    Components that were not measured are zero in all arrays.
+
+    Attributes
+    ----------
+    residual : (t, r, m) [SI]
+    jacobian : (t, r, m, 6)
+        By the platform twist (omega, v) in base axes; with an axis of poses before m where a row
+        compares several poses.
+    nuisance : (t, r, m, u) or None
+        By the nuisance parameters of the kind; None where it has none.
+    joints : (t, r, m, j) or None
+        By the values of the joints that the kind senses; None where it senses poses only.
+    """
+
+    residual: FloatArray
+    jacobian: FloatArray
+    nuisance: FloatArray | None = None
+    joints: FloatArray | None = None
+
+
+class MeasuredColumns(NamedTuple):
+    """Columns of rows as a kind compares its predictions with them, see `Kind.prepare_columns`.
+
+    Attributes
+    ----------
+    columns : (t, r, c) [SI], with a placeholder where nothing was measured.
+    reference : (t, r, k) the columns, or what a kind computes from them alone.
+    present : (t, r, m) residuals that exist. is_complete : whether all do.
+    """
+
+    columns: FloatArray
+    reference: FloatArray
+    present: BoolArray
+    is_complete: bool
+
+    def take(self, trials: IntArray) -> MeasuredColumns:
+        """Return the columns of some trials."""
+        arrays = (self.columns[trials], self.reference[trials], self.present[trials])
+        return MeasuredColumns(*arrays, self.is_complete)
+
+
+def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
+    """Return the rows of a mask (r,), each with its description."""
+    return tuple((int(i), describe(int(i))) for i in np.flatnonzero(wrong))
+
+
+def is_incomplete(columns: FloatArray) -> BoolArray:
+    """Return the rows of columns (.., c) in which some values are missing, but not all."""
+    missing = np.isnan(columns)
+    return np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
+
+
+def drop_rounding(evaluation: Evaluation) -> Evaluation:
+    """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as those by
+    the place of a target do between parallel poses.
+
+    They are compared with derivatives by the platform twist. A meter is compared with a radian
+    there; the tolerance is so small that the size of a machine does not matter.
+    """
+    if evaluation.nuisance is None:
+        return evaluation
+    by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
+    by_twist = by_twist.sum(axis=-2) if evaluation.jacobian.ndim > 4 else by_twist
+    return evaluation._replace(nuisance=without_rounding(evaluation.nuisance, by_twist[..., None]))
+
+
+def zero_absent(evaluation: Evaluation, present: BoolArray) -> Evaluation:
+    """Return the evaluation with zeros for components that are not `present` (t, r, m)."""
+    by_row = present[..., None]
+    has_links = evaluation.jacobian.ndim > present.ndim + 1
+    by_nuisance, by_joints = (
+        None if derivative is None else np.where(by_row, derivative, 0.0)
+        for derivative in (evaluation.nuisance, evaluation.joints)
+    )
+    return Evaluation(
+        np.where(present, evaluation.residual, 0.0),
+        np.where(present[..., None, :, None] if has_links else by_row, evaluation.jacobian, 0.0),
+        by_nuisance,
+        by_joints,
+    )
+
+
+# --- The settings of a kind that differ from their defaults, as text.
+
+
+def list_changed_settings(kind: Any) -> Iterator[str]:
+    """Give `name=value` of each setting of a kind (a dataclass) that differs from its default."""
+    for setting in fields(kind):
+        value, factory = getattr(kind, setting.name), setting.default_factory
+        usual = cast(Any, setting.default) if factory is MISSING else factory()
+        if setting.init and not np.array_equal(value, usual):
+            text = repr(value)
+            if isinstance(value, np.ndarray):
+                is_small = value.size <= 16
+                text = f"{np.round(value, 6).tolist() if is_small else f'<array {value.shape}>'}"
+            yield f"{setting.name}={text}"
+
+
+# --- The errors that the residuals of a kind are: of which quantity, and of which target.
+
+
+class ErrorGroup(NamedTuple):
+    """Residuals that are the components of one error.
+
+    Attributes
+    ----------
+    quantity : what the error is of, such as "position" or "length". dimension : of its number.
+    target : name of the target or joint, empty where a row has only one.
+    components : names of the components, such as ("x", "y", "z").
+    columns : their indices among the m residuals.
+    """
+
+    quantity: str
+    dimension: Dimension
+    target: str
+    components: tuple[str, ...]
+    columns: tuple[int, ...]
+
+
+def list_error_groups(kind: Kind) -> tuple[ErrorGroup, ...]:
+    """Return the errors of one row of a kind."""
+    residuals = kind.noise_columns
+    targets = {"": tuple(range(len(residuals)))}
+    if kind.sensed_joints and not kind.of:
+        targets = {name: (i,) for i, name in enumerate(kind.sensed_joints)}
+    elif residuals == kind.columns:
+        targets = dict(kind.target_columns)
+    quantities = {Dimension.LENGTH: kind.length_error, Dimension.ANGLE: kind.angle_error}
+    groups = []
+    for target, places in targets.items():
+        for dimension, quantity in quantities.items():
+            columns = tuple(i for i in places if residuals[i].dimension is dimension)
+            names = tuple(residuals[i].name.removeprefix(f"{target}.") for i in columns)
+            if columns:
+                label = target if len(targets) > 1 else ""
+                groups.append(ErrorGroup(quantity, dimension, label, names, columns))
+    return tuple(groups)
+
+
+# --- Errors that all rows of a session share, as unknowns of any kind: a bias, and a linear drift.
+
+BIAS, DRIFT = "bias", "drift"
+SHARED_ERRORS = (BIAS, DRIFT)
+"""Setup items that any kind may list as unknown."""
+
+
+def list_components(kind: Kind) -> dict[tuple[str, Dimension], list[int]]:
+    """Return the measured components of a kind with the indices of their noise columns: x of all
+    targets is one component.
+    """
+    members: dict[tuple[str, Dimension], list[int]] = {}
+    for group in list_error_groups(kind):
+        for name, column in zip(group.components, group.columns, strict=True):
+            members.setdefault((name, group.dimension), []).append(column)
+    return members
+
+
+def name_shared_error(kind: Kind, item: str, component: str) -> str:
+    """Return the name of the bias or drift of a component, such as `tracker.bias.x`: with the name
+    of the fixed point or frame where the settings state one, else that of the kind.
+    """
+    owner = kind.name
+    for setting in ("frame", "anchor_name"):
+        value = getattr(kind, setting, "")
+        if value and value != getattr(type(kind), setting):
+            owner = value
+    return f"{owner}.{item}.{component}"
+
+
+def make_shared_errors(kind: Kind) -> Mapping[str, SetupItem]:
+    """Return the bias and the drift of a kind: one parameter for each component."""
+    return {
+        item: SetupItem(
+            tuple(
+                Parameter(name_shared_error(kind, item, component), dimension, 0.0, scope="session")
+                for component, dimension in list_components(kind)
+            )
+        )
+        for item in SHARED_ERRORS
+    }
+
+
+def spread_components(kind: Kind) -> FloatArray:
+    """Return the matrix (m, b) that adds a value for each component to its noise columns."""
+    components = list_components(kind).values()
+    matrix = np.zeros((len(kind.noise_columns), len(components)))
+    for i, columns in enumerate(components):
+        matrix[columns, i] = 1.0
+    return matrix
+
+
+def sum_shared_errors(kind: Kind, values: FloatArray) -> FloatArray:
+    """Return the errors (.., b) of the components, from the values (.., u) of the nuisance
+    parameters: of the drift, those are the parts that the rows take.
+    """
+    items = [kind.item_values(values, name) for name in kind.shared_errors]
+    return np.asarray(sum(item for item in items if item is not None))
+
+
+def add_shared_errors(
+    kind: Kind, evaluation: Evaluation, measured: FloatArray, values: FloatArray
+) -> Evaluation:
+    """Return the evaluation of rows whose noise columns share a bias and a drift.
+
+    Parameters
+    ----------
+    evaluation : without them. measured : (.., r, c) [SI]. values : (.., r, u) of all nuisance
+        parameters.
+    """
+    slope = kind.linearize_noise(measured) @ spread_components(kind)
+    error = slope @ sum_shared_errors(kind, values)[..., None]
+    residual = evaluation.residual + error[..., 0]
+    shape = residual.shape
+    columns = [np.broadcast_to(slope, (*shape, slope.shape[-1]))] * len(kind.shared_errors)
+    if evaluation.nuisance is not None:
+        own = np.broadcast_to(evaluation.nuisance, (*shape, evaluation.nuisance.shape[-1]))
+        columns.insert(0, own)
+    return evaluation._replace(residual=residual, nuisance=np.concatenate(columns, axis=-1))
+
+
+def measure_progress(session: np.ndarray, time: FloatArray | None) -> FloatArray:
+    """Return the progress (r,) of rows through their session, from -0.5 to 0.5: by time [s] where
+    all rows state one, else in their order.
+
+    Parameters
+    ----------
+    session : (r,) its name. time : (r,) or None.
+    """
+    known = time is not None and bool(np.isfinite(time).all())
+    progress = np.zeros(len(session))
+    for name in find_distinct(session):
+        chosen = np.flatnonzero(session == name)
+        values = time[chosen] if known and time is not None else np.arange(float(len(chosen)))
+        low, high = values.min(), values.max()
+        if high > low:
+            progress[chosen] = (values - 0.5 * (low + high)) / (high - low)
+    return progress
+
+
+# --- Rows that measure another body than the end platform: that of a stage of a chain, or the
+# base.
+
+BASE = "base"
+"""Name of the base among the bodies that a kind may be `of`; no stage has it."""
+
+
+def check_stage(kind: str, of: str, poses_per_row: int, measures_points: bool) -> None:
+    """Refuse a stage of a kind that compares poses, and the base of one that measures no points.
+
+    Raises
+    ------
+    DataError
+    """
+    if of and poses_per_row > 1:
+        raise DataError(
+            f"the kind {kind!r} compares poses of the end platform; leave out `of: {of}`"
+        )
+    if of == BASE and not measures_points:
+        raise DataError(
+            f"the kind {kind!r} measures a moving body, but `of: {BASE}` is for targets that are "
+            "fixed to the base; leave it out, or use the kind position, bearing or distance"
+        )
+
+
+def list_sensed_numbers(of: str) -> tuple[str, ...]:
+    """Return the names of the numbers of the platform of a stage; none without a stage, or of the
+    base.
+    """
+    return mechanism.name_platform_entries(of) if of not in ("", BASE) else ()
+
+
+def find_platform(of: str, T: FloatArray, joints: FloatArray) -> FloatArray:
+    """Return the measured platforms (.., 4, 4): T, those of the stage `of`, or the base.
+
+    joints : (.., 12) of a stage.
+
+    Raises
+    ------
+    DataError
+        The numbers of the stage's platform are missing.
+    """
+    if not of:
+        return T
+    if of == BASE:
+        return np.broadcast_to(np.eye(4), T.shape)
+    if joints.shape[-1] != 12:
+        raise DataError(f"the platform of stage {of!r} is not given; pass its numbers as `joints`")
+    rows = joints.reshape(*joints.shape[:-1], 3, 4)
+    last = np.broadcast_to(np.eye(4)[3:], (*rows.shape[:-2], 1, 4))
+    return np.concatenate([rows, last], axis=-2)
+
+
+def depend_on_platform(of: str, result: Evaluation, T: FloatArray) -> Evaluation:
+    """Return an evaluation at platforms T (t, r, 4, 4), of a stage by the numbers of its platform.
+
+    Its rows do not depend on the twist of the end platform, those of the base on no motion.
+    """
+    if not of:
+        return result
+    if of == BASE:
+        return result._replace(jacobian=np.zeros_like(result.jacobian))
+    by_entries = result.jacobian @ geometry.differentiate_by_entries(T)
+    return result._replace(jacobian=np.zeros_like(result.jacobian), joints=by_entries)
 
 
 class Kind(ABC):
@@ -104,7 +415,7 @@ class Kind(ABC):
             sentence = f"{name!r} cannot be unknown in the kind {self.name!r}"
             raise DataError(f"{sentence}; allowed are {', '.join(allowed)}")
         set_fields(self, unknown=names)
-        stage_platforms.check_stage(self.name, self.of, self.poses_per_row, self.measures_points)
+        check_stage(self.name, self.of, self.poses_per_row, self.measures_points)
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
@@ -135,12 +446,12 @@ class Kind(ABC):
     @property
     def is_of_base(self) -> bool:
         """Whether its targets are fixed to the base, so that its rows depend on no pose."""
-        return self.of == stage_platforms.BASE
+        return self.of == BASE
 
     @property
     def sensed_joints(self) -> tuple[str, ...]:
         """Names of the j joints, driven or passive, whose values the residual depends on."""
-        return stage_platforms.list_sensed_numbers(self.of)
+        return list_sensed_numbers(self.of)
 
     def stack_joints(self, joints: Mapping[str, FloatArray], rows: IntArray) -> FloatArray | None:
         """Return the values (.., r, j) of the sensed joints at the poses of rows (r,), from those
@@ -154,7 +465,7 @@ class Kind(ABC):
 
     @classmethod
     @abstractmethod
-    def examples(cls) -> "tuple[Kind, ...]":
+    def examples(cls) -> tuple[Kind, ...]:
         """Return instances that together show every setting, for documentation and tests."""
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
@@ -303,11 +614,11 @@ class Kind(ABC):
         if not isinstance(measured, MeasuredColumns):
             measured = self.prepare_columns(measured)
         values = self.nominal_values[None, None] if nuisance is None else nuisance
-        T = stage_platforms.find_platform(self.of, T, joints)
+        T = find_platform(self.of, T, joints)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
         result = drop_rounding(self._evaluate(T, measured.reference, values, joints))
-        result = stage_platforms.depend_on_platform(self.of, result, T)
+        result = depend_on_platform(self.of, result, T)
         if self.shared_errors:
             result = add_shared_errors(self, result, measured.columns, values)
         return result if measured.is_complete else zero_absent(result, measured.present)
@@ -335,7 +646,7 @@ class Kind(ABC):
         joints = np.zeros_like(noise) if joints is None else joints
         if self.shared_errors:
             noise = noise + sum_shared_errors(self, values) @ spread_components(self).T
-        T = stage_platforms.find_platform(self.of, T, joints)
+        T = find_platform(self.of, T, joints)
         return self._measure(T, noise, values, joints)
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from loopcal import geometry
-from loopcal.geometry.rotations import stack_blocks
+from loopcal.geometry import stack_blocks
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 FAMILIES: LazyRegistry[type[RobotRecord]] = LazyRegistry(
     {
-        "3-prs": "loopcal.mechanism.families.three_prs:ThreePrs",
+        "3-prs": "loopcal.mechanism.families.prs:ThreePrs",
         "gough": "loopcal.mechanism.families.gough:Gough",
         "limbs": "loopcal.mechanism.families.limbs:Limbs",
         "linear-delta": "loopcal.mechanism.families.linear_delta:LinearDelta",
-        "ru-pus-prs": "loopcal.mechanism.families.ru_pus_prs:RuPusPrs",
+        "ru-pus-prs": "loopcal.mechanism.families.prs:RuPusPrs",
         "stages": "loopcal.mechanism.families.stages:Stages",
     }
 )

@@ -18,13 +18,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism.compilation.assembly_compilation import build
-from loopcal.mechanism.compilation.over_constraint import (
-    find_nearby_states,
-    find_self_stress,
-    is_over_constrained,
-)
-from loopcal.mechanism.families.limb_placement import frame_from_axis
+from loopcal.mechanism.compilation import build
 from loopcal.mechanism.families.limb_records import (
     JointRecord,
     LimbRecord,
@@ -35,11 +29,16 @@ from loopcal.mechanism.families.limb_records import (
     axis_vector,
 )
 from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.kinematics.batch_kinematics import forward_trials
-from loopcal.mechanism.kinematics.link_frames import compute_limb_frames
+from loopcal.mechanism.families.records import frame_from_axis
+from loopcal.mechanism.kinematics import compute_limb_frames, forward_trials
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.over_constraint import (
+    find_nearby_states,
+    find_self_stress,
+    is_over_constrained,
+)
 from loopcal.mechanism.states import Status, driven_values
-from loopcal.mechanism.transmission.terms import readings_from_joints
+from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 

@@ -11,24 +11,241 @@ the unit of a number from its annotation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
 
 import numpy as np
 
-from loopcal.errors import MechanismError
-from loopcal.mechanism.families.limb_placement import translate
+from loopcal.errors import MechanismError, suggest_names
+from loopcal.mechanism.assembly import AXES, Address, LinearMap
 from loopcal.mechanism.families.records import (
     AngleTolerance,
+    ErrorModel,
     LengthTolerance,
     Point,
     PoseRecord,
     RatioTolerance,
+    join_errors,
+    single_error,
+    standard_deviation,
+    translate,
 )
-from loopcal.mechanism.families.triangle_records import TriangleDrive
+from loopcal.mechanism.transmission import (
+    TRIANGLE_TERMS,
+    compute_range,
+    count_independent,
+    find_side,
+)
 from loopcal.typing import FloatArray
-from loopcal.units import Angle, Length, Ratio
+from loopcal.units import Angle, Dimension, Length, Ratio
+
+# --- Records of triangle drives: a linear actuator that turns a revolute joint through two
+# anchors.
+
+ON_AXIS = 1e-9
+"""Distance of an anchor from the axis, as a share of the larger one, that is no lever."""
+DEAD = 1e-6
+"""Sine of the angle from a dead point, below which the actuator does not turn the joint."""
+POINTS, SKEW = ("foot", "head"), "skew"
+
+
+@dataclass(frozen=True)
+class Skew:
+    """Rotation vector that tilts the axis of a joint in the frame of its two anchors."""
+
+    rx: Angle = 0.0
+    ry: Angle = 0.0
+    rz: Angle = 0.0
+
+
+@dataclass(frozen=True)
+class Triangle:
+    """The two anchors of a linear actuator beside a revolute joint, and the skew of its axis.
+
+    foot : on what carries the joint. head : on what the joint turns, with the joint at zero.
+    """
+
+    foot: Point
+    head: Point
+    skew: Skew = field(default_factory=Skew)
+
+
+@dataclass(frozen=True)
+class TriangleDrive:
+    """A linear actuator that turns a revolute joint through two anchors.
+
+    distance of the anchors = offset + gain * reading + harmonics. `unknown` names terms to identify
+    (offset, gain, backlash, harmonics) and dimensions of the triangle (foot.x, head.z, skew.rx; or
+    foot, head and skew for all of one), with the tolerances `length`, `angle` and `ratio`.
+    """
+
+    triangle: Triangle
+    reads: Literal["length"] = "length"
+    stroke: tuple[Length, Length] | None = None
+    gain: Ratio = 1.0
+    offset: Length = 0.0
+    period: Length = 0.0
+    sigma: Length | None = None
+    unknown: tuple[str, ...] = ()
+    length: LengthTolerance | None = None
+    angle: AngleTolerance | None = None
+    ratio: RatioTolerance | None = None
+
+
+@dataclass(frozen=True)
+class NamedTriangleDrive(TriangleDrive):
+    """A triangle drive of a serial joint, with the name of its actuator."""
+
+    name: str = ""
+
+
+def place_triangle(
+    name: str, drive: TriangleDrive, rotation: FloatArray, start: float
+) -> Mapping[str, float]:
+    """Return the terms of a triangle in the joint's own frame, by name.
+
+    Parameters
+    ----------
+    name : of the actuator. rotation : (3, 3) R_placed_joint, whose third column is the joint's
+        axis. start : angle of the joint near home [rad], which selects the side.
+
+    Raises
+    ------
+    MechanismError
+        An anchor on the axis, a start at a dead point, or a stroke that no angle reaches.
+    """
+    triangle = drive.triangle
+    points = np.array([triangle.foot, triangle.head]) @ rotation
+    skew = rotation.T @ [triangle.skew.rx, triangle.skew.ry, triangle.skew.rz]
+    terms = np.array([*points.ravel(), *skew[:2], 1.0, 0.0])
+    _refuse_anchors_on_axis(name, terms)
+    sine, middle = find_side(start, terms)
+    if abs(sine) < DEAD:
+        raise MechanismError(
+            f"actuator {name!r} does not turn its joint at {np.rad2deg(start):g} deg, a dead point "
+            "of its triangle, where both anchors and the axis are in one plane; state another "
+            "`start:` of the joint, or other anchors"
+        )
+    terms[-2:] = np.sign(sine), middle
+    _refuse_stroke(name, drive, terms)
+    return dict(zip(TRIANGLE_TERMS, (float(term) for term in terms), strict=True))
+
+
+def _refuse_anchors_on_axis(name: str, terms: FloatArray) -> None:
+    """Refuse an anchor on the axis of the joint; terms : (10,)."""
+    # b of l^2 = a - b cos(theta - gamma) is twice the product of both levers
+    low, high = compute_range(terms)
+    scale = max(np.linalg.norm(terms[0:3]), np.linalg.norm(terms[3:6]))
+    if high**2 - low**2 > 4 * ON_AXIS * scale**2:
+        return
+    raise MechanismError(
+        f"the triangle of actuator {name!r} is degenerate: an anchor is on the axis of the joint, "
+        "so that the length is the same at every angle; state anchors beside the axis"
+    )
+
+
+def _refuse_stroke(name: str, drive: TriangleDrive, terms: FloatArray) -> None:
+    """Refuse a stroke with a length that no angle of the joint reaches."""
+    low, high = (float(end) for end in compute_range(terms))
+    for reading in drive.stroke or ():
+        length = drive.offset + drive.gain * reading
+        if np.isfinite(length) and not low <= length <= high:
+            raise MechanismError(
+                f"the stroke of actuator {name!r} contains the length {length * 1e3:.6g} mm, which "
+                f"no angle of its joint reaches: the anchors are {low * 1e3:.6g} to "
+                f"{high * 1e3:.6g} mm apart; correct the stroke or the anchors"
+            )
+
+
+def list_triangle_parameters(drive: TriangleDrive) -> tuple[str, ...]:
+    """Return the names of all dimensions of a triangle."""
+    points = tuple(f"{point}.{axis}" for point in POINTS for axis in AXES[3:])
+    return (*points, *(f"{SKEW}.{axis}" for axis in AXES[:3]))
+
+
+def triangle_errors(
+    name: str, drive: TriangleDrive, rotation: FloatArray, other: tuple[str, ...]
+) -> ErrorModel:
+    """Return the unknown dimensions of a triangle, `q1.foot.x` and so on.
+
+    Parameters
+    ----------
+    name, drive, rotation : as in `place_triangle`. other : terms of the drive beside the triangle.
+
+    Raises
+    ------
+    MechanismError
+        A dimension that a triangle does not have, or a skew about the joint's own axis.
+    """
+    errors = []
+    for term in _expand_unknowns(drive, rotation):
+        known = list_triangle_parameters(drive)
+        if term not in known:
+            allowed = (*other, *POINTS, SKEW, *known)
+            raise MechanismError(
+                f"actuator {name!r} has no term {term!r}{suggest_names(term, allowed)}; allowed "
+                f"are {', '.join(allowed)}"
+            )
+        part, _, axis = term.partition(".")
+        direction = np.eye(3)[AXES.index(axis) % 3]
+        components = rotation.T @ direction
+        is_skew, parameter = part == SKEW, f"{name}.{term}"
+        if is_skew and np.linalg.norm(components[:2]) < ON_AXIS:
+            raise MechanismError(
+                f"{parameter} rotates the triangle about the joint's own axis, which changes no "
+                "length; leave it out"
+            )
+        stated = getattr(drive.triangle, part)
+        nominal = getattr(stated, axis) if is_skew else stated[AXES.index(axis) % 3]
+        tolerance = drive.angle if is_skew else drive.length
+        maps = tuple(
+            LinearMap(parameter, Address(name, "transmission", f"{part}.{own}"), float(share))
+            for own, share in zip("xy" if is_skew else "xyz", components, strict=False)
+            if abs(share) > 1e-12
+        )
+        dimension = Dimension.ANGLE if is_skew else Dimension.LENGTH
+        sd = standard_deviation(tolerance, parameter)
+        errors.append(single_error(parameter, dimension, nominal, sd, *maps))
+    return join_errors(errors)
+
+
+def complete_triangle(
+    name: str, drive: TriangleDrive, rotation: FloatArray, tolerance: LengthTolerance | None
+) -> ErrorModel:
+    """Return the dimensions of a triangle that, with its offset, have the effects of all others.
+
+    These are two coordinates of the foot across the axis of the joint, and the one of the head that
+    changes its lever most: see docs/theory/triangle-drives.md. Arguments are as above.
+    """
+    across = rotation[:, :2]
+    foot = sorted(np.argsort(-np.linalg.norm(across, axis=1), kind="stable")[:2].tolist())
+    head = int(np.argmax(np.abs(across @ (across.T @ drive.triangle.head))))
+    unknown = (*(f"foot.{AXES[3 + i]}" for i in foot), f"head.{AXES[3 + head]}")
+    return triangle_errors(name, replace(drive, unknown=unknown, length=tolerance), rotation, ())
+
+
+def is_of_triangle(drive: object, term: str) -> bool:
+    """Return whether an unknown of a drive is a dimension of its triangle."""
+    return isinstance(drive, TriangleDrive) and term.partition(".")[0] in (*POINTS, SKEW)
+
+
+def _expand_unknowns(drive: TriangleDrive, rotation: FloatArray) -> Iterator[str]:
+    """Yield the unknown dimensions, `foot` as foot.x, foot.y, foot.z.
+
+    A whole skew is that about the two axes across that of the joint, if it is along one.
+    """
+    for term in drive.unknown:
+        if term in POINTS:
+            yield from (f"{term}.{axis}" for axis in AXES[3:])
+        elif term == SKEW:
+            across = np.linalg.norm(rotation[:, :2], axis=1) > ON_AXIS
+            yield from (
+                f"{SKEW}.{a}" for a, is_across in zip(AXES[:3], across, strict=True) if is_across
+            )
+        elif is_of_triangle(drive, term):
+            yield term
+
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[Ratio, Ratio, Ratio]
 Place = Point | PoseRecord
@@ -368,3 +585,196 @@ def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
             f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; let it "
             f"{key.replace('s on', ' on')} the {allowed}, or model the branch as separate limbs"
         )
+
+
+# --- Drives of `limbs` files whose readings are sums of joint values: `sum: {m: 1, n: 2}`.
+
+WEIGHT = "weight"
+
+
+class SummedDrive(Protocol):
+    """What a drive of a sum states beside its transmission."""
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Names of the terms to identify."""
+        ...
+
+    @property
+    def weights(self) -> RatioTolerance | None:
+        """Tolerance of the weights."""
+        ...
+
+
+class SumError(MechanismError):
+    """An impossible sum; `actuator` is the name under which a file states it."""
+
+    def __init__(self, sentence: str, actuator: str) -> None:
+        super().__init__(sentence)
+        self.actuator = actuator
+
+
+def has_sums(actuators: Mapping[str, object]) -> bool:
+    """Return whether a drive of a file is a sum."""
+    return any(getattr(drive, "sum", None) for drive in actuators.values())
+
+
+def list_readings(
+    actuators: Mapping[str, object], joints: Mapping[str, str]
+) -> dict[str, tuple[str, Mapping[str, float]]]:
+    """Return the readings of a file with sums: name -> (key in the file, weights of joints).
+
+    joints : driven joints by name, each with the name that the file states; a drive that copies of
+    a limb have in common is one reading for each copy.
+
+    Raises
+    ------
+    SumError
+        A triangle drive, or a drive that is no sum and moves no joint.
+    """
+    readings: dict[str, tuple[str, Mapping[str, float]]] = {}
+    for key, drive in actuators.items():
+        weights: Mapping[str, float] | None = getattr(drive, "sum", None)
+        if weights is None:
+            raise SumError(
+                f"actuator {key!r} is a triangle drive beside sums; let it drive a stage of its "
+                "own in a file of the family stages",
+                key,
+            )
+        if weights:
+            readings[key] = key, weights
+            continue
+        own = [name for name, stated in joints.items() if key in (name, stated)]
+        if not own:
+            raise SumError(
+                f"actuator {key!r} drives no joint and states no `sum:`; write 'actuated: {key}' "
+                f"at a joint, or the sum that it reads of {', '.join(joints)}",
+                key,
+            )
+        readings |= {name: (key, {name: 1.0}) for name in own}
+    return readings
+
+
+def check_sums(
+    sums: Mapping[str, Mapping[str, float]], turning: Mapping[str, bool], known: Mapping[str, str]
+) -> None:
+    """Refuse sums that are no readings of the driven joints.
+
+    Parameters
+    ----------
+    sums : weights of all readings of a file by name; of a drive without a sum {joint: 1}.
+    turning : whether each driven joint is rotary. known : driven joint -> its limb.
+
+    Raises
+    ------
+    SumError
+        An unknown joint, a sum of an angle and a length, weights that are all zero or not finite,
+        a joint in no sum, more readings than joints, or sums that depend on each other.
+    """
+    for name, weights in sums.items():
+        _check_sum(name, weights, turning)
+    read = {joint for weights in sums.values() for joint, w in weights.items() if w != 0.0}
+    unread = [joint for joint in turning if joint not in read]
+    if unread:
+        raise SumError(
+            f"joint {unread[0]!r} of limb {known[unread[0]]!r} is in no sum, so no reading states "
+            f"it; add it to a `sum:`, or list {unread[0]!r} among the actuators",
+            next(iter(sums)),
+        )
+    W = np.array([[weights.get(joint, 0.0) for joint in turning] for weights in sums.values()])
+    a, joints = W.shape
+    if a > joints:
+        raise SumError(
+            f"{a} readings ({', '.join(sums)}) are sums of {joints} joints "
+            f"({', '.join(turning)}); leave out readings",
+            list(sums)[-1],
+        )
+    for i in range(a):
+        if count_independent(W[: i + 1]) <= i:
+            name = list(sums)[i]
+            raise SumError(
+                f"the weights of the sums are singular: that of actuator {name!r} follows from "
+                f"those of {', '.join(list(sums)[:i])}, so it states nothing new; correct a weight",
+                name,
+            )
+
+
+def _check_sum(name: str, weights: Mapping[str, float], turning: Mapping[str, bool]) -> None:
+    """Refuse a sum of unknown joints, of unlike joints, or without a weight."""
+    for joint, weight in weights.items():
+        if joint not in turning:
+            raise SumError(
+                f"the sum of actuator {name!r} names {joint!r}, which no limb states under "
+                f"'actuated:'{suggest_names(joint, list(turning))}; allowed are "
+                f"{', '.join(turning)}",
+                name,
+            )
+        if not np.isfinite(weight):
+            raise SumError(
+                f"the weight of {joint!r} in the sum of actuator {name!r} is {weight:g}; state a "
+                "finite number",
+                name,
+            )
+    if not any(weights.values()):
+        raise SumError(
+            f"all weights in the sum of actuator {name!r} are zero, so its reading states nothing; "
+            "give a weight other than 0",
+            name,
+        )
+    angles = [joint for joint in weights if turning[joint]]
+    lengths = [joint for joint in weights if not turning[joint]]
+    if angles and lengths:
+        raise SumError(
+            f"actuator {name!r} is a sum of the angle {angles[0]!r} and the length {lengths[0]!r}; "
+            "sum joints of one kind, and describe a screw with the `lead:` of its joint",
+            name,
+        )
+
+
+def is_weight(weights: Mapping[str, float], term: str) -> bool:
+    """Return whether an unknown of a drive is a weight of its sum."""
+    return bool(weights) and term.partition(".")[0] == WEIGHT
+
+
+def weight_errors(
+    name: str, drive: object, weights: Mapping[str, float], other: tuple[str, ...]
+) -> ErrorModel:
+    """Return the unknown weights of a sum, `q1.weight.m` and so on.
+
+    Parameters
+    ----------
+    other : terms of the drive beside the weights.
+
+    Raises
+    ------
+    SumError
+        The weight of a joint that is not in the sum.
+    """
+    unknown: tuple[str, ...] = getattr(drive, "unknown", ())
+    tolerance: RatioTolerance | None = getattr(drive, "weights", None)
+    errors = []
+    for joint in _expand_unknown_weights(unknown, weights):
+        if joint not in weights:
+            allowed = (*other, WEIGHT, *(f"{WEIGHT}.{known}" for known in weights))
+            raise SumError(
+                f"actuator {name!r} has no term {WEIGHT + '.' + joint!r}; allowed are "
+                f"{', '.join(allowed)}",
+                name,
+            )
+        parameter = f"{name}.{WEIGHT}.{joint}"
+        address = Address(name, "transmission", f"{WEIGHT}.{joint}")
+        sd = standard_deviation(tolerance, parameter)
+        entry = LinearMap(parameter, address)
+        errors.append(single_error(parameter, Dimension.RATIO, weights[joint], sd, entry))
+    return join_errors(errors)
+
+
+def _expand_unknown_weights(
+    unknown: tuple[str, ...], weights: Mapping[str, float]
+) -> Iterator[str]:
+    """Yield the joints whose weights are unknown; `weight` means all of a sum."""
+    for term in unknown:
+        if weights and term == WEIGHT:
+            yield from weights
+        elif is_weight(weights, term):
+            yield term.partition(".")[2]

@@ -16,15 +16,16 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.geometry.rotations import stack_matrix
+from loopcal.geometry import stack_matrix
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, LinearMap, Link
-from loopcal.mechanism.families.error_models import ErrorModel, single_error
-from loopcal.mechanism.families.limb_placement import translate
 from loopcal.mechanism.families.records import (
     AngleTolerance,
+    ErrorModel,
     LengthTolerance,
     RobotRecord,
+    single_error,
     standard_deviation,
+    translate,
     values_per_leg,
 )
 from loopcal.parameters import Parameter

@@ -11,36 +11,41 @@ revolute joint on it. Derivation: docs/theory/tripods.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Joint
-from loopcal.mechanism.families.error_models import (
-    ErrorModel,
-    ErrorTolerances,
-    displacement_error,
-    join_errors,
-    offset_error,
-    rod_length_error,
-    single_error,
-)
-from loopcal.mechanism.families.limb_placement import (
+from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Joint
+from loopcal.mechanism.families.records import (
     EX,
     EY,
     EZ,
+    AngleTolerance,
+    ErrorModel,
+    ErrorTolerances,
     JointPlacement,
+    LengthTolerance,
     PlacedLimb,
+    RobotRecord,
+    check_spherical,
+    complete_errors,
+    displacement_error,
+    join_errors,
     map_slide_tilt,
+    offset_error,
     place_limb,
     place_limb_with_ball,
+    rod_length_error,
+    rotate_about,
+    single_error,
+    standard_deviation,
+    translate,
 )
-from loopcal.mechanism.families.records import AngleTolerance, LengthTolerance, standard_deviation
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
+from loopcal.units import Dimension, Length
 
 
 @dataclass(frozen=True)
@@ -177,3 +182,153 @@ def carriage_errors(
         displacement_error(f"thC{number}{axis}", limb, "joint", f"r{axis}", angle) for axis in joint
     )
     return join_errors(errors)
+
+
+# --- RU-PUS-PRS solar trackers: a platform on a post, tilted about two axes by two carriages.
+
+POST_ANGLES = (
+    ("thOx", "pivot", "rx"),
+    ("thOz", "pivot", "rz"),
+    ("thU1y", "universal1", "ry"),
+    ("thU1z", "universal1", "rz"),
+    ("thU2x", "platform", "rx"),
+    ("thU2z", "platform", "rz"),
+)
+"""Rotations of the post's axes: name, element, axis of the carried frame (base or platform)."""
+
+LEFT_OUT = ("thOz", "thU1z")
+"""Parameters of the twenty-seven that the twenty-five leave out."""
+
+
+@dataclass(frozen=True)
+class RuPusPrs(RobotRecord):
+    """The file of an RU-PUS-PRS tracker.
+
+    Attributes
+    ----------
+    platform_radius, base_radius, rod, post : a, b, l and r [m]. stroke : allowed readings (low,
+        high) [m].
+    error_model : `ideal`, the named parameters, or `complete`. parameters : with `ideal`, the set
+        (see the module).
+    spherical : joints at the rods' ends as perfect `point`s, or with `complete` as `axes` with
+        errors of their own.
+    tolerances : of lengths and angles.
+    """
+
+    family = "ru-pus-prs"
+
+    platform_radius: Length = 0.0
+    base_radius: Length = 0.0
+    rod: Length = 0.0
+    post: Length = 0.0
+    stroke: tuple[Length, Length] | None = None
+    error_model: Literal["ideal", "complete"] = "ideal"
+    parameters: Literal["twenty-five", "twenty-seven"] = "twenty-five"
+    spherical: Literal["point", "axes"] = "point"
+    tolerances: TripodTolerances = field(default_factory=TripodTolerances)
+
+    def expand(self) -> Assembly:
+        """Return three limbs under a free platform."""
+        check_spherical(self.name, self.spherical, self.error_model)
+        a, b, axes = self.platform_radius, self.base_radius, self.spherical == "axes"
+        home, spread = self.home.matrix, self.tolerances.deviations
+        first = ChainFrames(translate(-b), translate(-a), self.rod, home)
+        second = ChainFrames(translate(0.0, b), translate(0.0, a), self.rod, home)
+        limbs = (
+            build_pus_limb("chain1", "q1", first, axes),
+            build_prs_limb("chain2", "q2", second, "x", axes),
+            self._post(),
+        )
+        if self.error_model == "complete":
+            errors = join_errors(complete_errors(limb, spread) for limb in limbs)
+        else:
+            errors = (
+                carriage_errors(limbs[0], 1, first, spread)
+                + carriage_errors(limbs[1], 2, second, spread, joint="yz")
+                + self._post_errors(limbs[2], spread)
+            )
+        return self.assemble(
+            (limb.limb for limb in limbs),
+            (Actuator(q, Dimension.LENGTH, self.stroke) for q in ("q1", "q2")),
+            errors,
+            freedoms=AXES,
+            controlled=("phi", "theta"),
+        )
+
+    def _post(self) -> PlacedLimb:
+        """Return revolute joint, link and universal joint; at home all frames are parallel."""
+        steps = (
+            JointPlacement(Joint("pivot", "R"), np.eye(4), EY),
+            JointPlacement(Joint("universal1", "R"), translate(0.0, 0.0, self.post), EX),
+            JointPlacement(Joint("universal2", "R"), np.eye(4), EY),
+        )
+        return place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4))
+
+    def _post_errors(self, post: PlacedLimb, spread: ErrorTolerances) -> ErrorModel:
+        """Return r and the angles of the post."""
+        left_out = LEFT_OUT if self.parameters == "twenty-five" else ()
+        return displacement_error(
+            "r", post, "universal1", "z", spread.length, self.post, positive=True
+        ) + join_errors(
+            displacement_error(name, post, element, axis, spread.angle)
+            for name, element, axis in POST_ANGLES
+            if name not in left_out
+        )
+
+
+# --- 3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls.
+
+
+@dataclass(frozen=True)
+class ThreePrs(RobotRecord):
+    """The file of a 3-PRS tripod.
+
+    Attributes
+    ----------
+    platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
+    error_model : `ideal`, the named parameters, or `complete`.
+    parameters : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`.
+    spherical : upper joints as perfect `point`s, or with `complete` as three `axes` with errors of
+        their own.
+    tolerances : of lengths and angles.
+    """
+
+    family = "3-prs"
+
+    platform_radius: Length = 0.0
+    base_radius: Length = 0.0
+    rod: Length = 0.0
+    stroke: tuple[Length, Length] | None = None
+    error_model: Literal["ideal", "complete"] = "ideal"
+    parameters: Literal["eleven", "fourteen"] = "eleven"
+    spherical: Literal["point", "axes"] = "point"
+    tolerances: TripodTolerances = field(default_factory=TripodTolerances)
+
+    def expand(self) -> Assembly:
+        """Return three PRS limbs under a free platform."""
+        check_spherical(self.name, self.spherical, self.error_model)
+        limbs, errors = [], ErrorModel()
+        for number in (1, 2, 3):
+            turn = rotate_about("z", 2 * np.pi / 3 * (number - 1))
+            base, platform = translate(self.base_radius), translate(self.platform_radius)
+            frames = ChainFrames(turn @ base, turn @ platform, self.rod, self.home.matrix)
+            axes = self.spherical == "axes"
+            limb = build_prs_limb(f"chain{number}", f"q{number}", frames, "y", axes)
+            limbs.append(limb.limb)
+            errors += self._errors(limb, number, frames)
+        return self.assemble(
+            limbs,
+            (Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)),
+            errors,
+            freedoms=AXES,
+            controlled=("z", "phi", "theta"),
+        )
+
+    def _errors(self, limb: PlacedLimb, number: int, frames: ChainFrames) -> ErrorModel:
+        """Return the error model of one chain."""
+        spread = self.tolerances.deviations
+        if self.error_model == "complete":
+            return complete_errors(limb, spread)
+        if self.parameters == "eleven":
+            return carriage_errors(limb, number, frames, spread, joint="xz")
+        return carriage_errors(limb, number, frames, spread, foot="xyz", guide="xyz", joint="xyz")

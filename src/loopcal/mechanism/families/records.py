@@ -10,17 +10,402 @@ import fnmatch
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError, suggest_names
-from loopcal.mechanism.assembly import Actuator, Assembly, Limb
-from loopcal.mechanism.families.error_models import ErrorModel
+from loopcal.mechanism.assembly import (
+    AXES,
+    Actuator,
+    Address,
+    Assembly,
+    Cone,
+    Joint,
+    Limb,
+    LinearMap,
+    Link,
+    SharedMap,
+)
 from loopcal.parameters import CommonError, Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import SD_RANGE, Angle, Dimension, Length, Ratio, is_sd
+
+# --- Limbs with joints about any axis, placed one after the other, in the form of the engine.
+
+EX, EY, EZ = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class JointPlacement:
+    """A joint of a limb, and where it is; the link before it has its name.
+
+    Attributes
+    ----------
+    place : (4, 4) of the joint in the frame carried up to it [m].
+    axis : (3,) in the placed frame, of any length but zero.
+    """
+
+    joint: Joint
+    place: FloatArray
+    axis: FloatArray
+
+
+class PlacedLimb(NamedTuple):
+    """A limb for the engine, with the frames in which its file is written.
+
+    Attributes
+    ----------
+    rotations : name of a link -> (3, 3) R_carried_link, from the link's axes to the carried ones.
+    placements : name of a link -> (4, 4) its placement in the frame carried before it [m].
+    """
+
+    limb: Limb
+    rotations: Mapping[str, FloatArray]
+    placements: Mapping[str, FloatArray]
+
+    @property
+    def name(self) -> str:
+        """Name of the limb."""
+        return self.limb.name
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the links from base to tip, then of the attachment."""
+        return (*(link.name for link in self.limb.links), self.limb.attachment.name)
+
+
+def place_limb(
+    name: str,
+    steps: tuple[JointPlacement, ...],
+    tip: FloatArray,
+    ending: str,
+    attachment: FloatArray,
+    length: float = 0.0,
+    actuator: str | None = None,
+    cones: tuple[Cone, ...] = (),
+) -> PlacedLimb:
+    """Return a limb made of its joints, its tip and its attachment.
+
+    Parameters
+    ----------
+    steps : the joints from base to tip; the first placement is in the base frame.
+    tip : (4, 4) of the tip in the last carried frame [m]; its link is called `tip`, or `base` if
+        the limb has no joints.
+    attachment : (4, 4) in the platform frame [m]; its link is called `platform`.
+    length, actuator, cones : of the rod of a `distance` ending [m].
+    """
+    back, links, rotations, placements = np.eye(4), [], {}, {}
+    for step in steps:
+        link, turn = step.joint.name, frame_from_axis(step.axis, step.joint.name)
+        links.append(Link(link, back @ step.place @ rotation_matrix(turn)))
+        rotations[link], placements[link] = turn, step.place
+        back = rotation_matrix(turn.T)
+    last = "tip" if steps else "base"
+    links.append(Link(last, back @ tip))
+    rotations |= {last: np.eye(3), "platform": np.eye(3)}
+    placements |= {last: tip, "platform": attachment}
+    joints, end = tuple(step.joint for step in steps), Link("platform", attachment)
+    limb = Limb(name, tuple(links), joints, ending, end, length, actuator, cones)
+    return PlacedLimb(limb, rotations, placements)
+
+
+def place_limb_with_ball(
+    name: str,
+    steps: tuple[JointPlacement, ...],
+    center: FloatArray,
+    attachment: FloatArray,
+    axes: FloatArray | None,
+) -> PlacedLimb:
+    """Return a limb that ends in a ball joint on the platform.
+
+    Parameters
+    ----------
+    center : (3,) of the ball in the last carried frame [m]. attachment : (4, 4) in the platform.
+    axes : None for a perfect ball. A ball of three rotary joints z, y, x through its center, with
+        errors of their own, has the orientation (3, 3) at which they are all at zero.
+    """
+    if axes is None:
+        return place_limb(name, steps, translate(*center), "ball", attachment)
+    ball = tuple(
+        JointPlacement(Joint(f"ball{i + 1}", "R"), place, axis)
+        for i, (place, axis) in enumerate(
+            ((geometry.make_pose(axes, center), EZ), (np.eye(4), EY), (np.eye(4), EX))
+        )
+    )
+    return place_limb(name, (*steps, *ball), np.eye(4), "rigid", attachment)
+
+
+def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
+    """Return a rotation (3, 3) whose third column is along `axis`.
+
+    The axes x, y and z give a cyclic permutation.
+
+    Raises
+    ------
+    MechanismError
+        The axis is zero.
+    """
+    length = float(np.linalg.norm(axis))
+    if not length > 0:
+        raise MechanismError(f"joint {name!r} has the axis [0, 0, 0]; state a direction")
+    z = np.asarray(axis, dtype=float) / length
+    # the cyclic successor of the largest component is never parallel to the axis
+    across = np.eye(3)[(int(np.argmax(np.abs(z))) + 1) % 3]
+    x = across - float(across @ z) * z
+    x /= float(np.linalg.norm(x))
+    return np.array([x, np.cross(z, x), z], dtype=float).T
+
+
+def map_displacement(
+    parameter: str, limb: PlacedLimb, element: str, axis: str, coefficient: float = 1.0
+) -> tuple[LinearMap, ...]:
+    """Map a parameter onto a translation along, or a rotation about, an axis of the carried frame.
+
+    A translation along x acts along up to three axes of the link's own frame: the components of
+    R_carried_link' e_x.
+    """
+    direction = coefficient * np.eye(3)[AXES.index(axis) % 3]
+    return map_direction(parameter, limb, element, direction, turns=axis in AXES[:3])
+
+
+def map_direction(
+    parameter: str, limb: PlacedLimb, element: str, direction: FloatArray, *, turns: bool
+) -> tuple[LinearMap, ...]:
+    """Map a parameter onto a rotation about (or translation along) `direction` (3,).
+
+    The direction is in the carried frame.
+    """
+    components = limb.rotations[element].T @ direction
+    axes = AXES[:3] if turns else AXES[3:]
+    # what is below rounding of a direction is no component
+    return tuple(
+        LinearMap(parameter, Address(limb.name, element, axis), float(part))
+        for axis, part in zip(axes, components, strict=True)
+        if abs(part) > 1e-12 * np.abs(components).max()
+    )
+
+
+def map_slide_tilt(
+    parameter: str, limb: PlacedLimb, element: str, axis: str
+) -> tuple[LinearMap, ...]:
+    """Map a parameter onto the tilt of a slide's axis that does not rotate what slides on it.
+
+    exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k if w' = -(P A_k)' w. The
+    translation of what is placed off the slide is compensated to first order.
+
+    Raises
+    ------
+    MechanismError
+        The joint is not a slide.
+    """
+    names = limb.elements
+    place = names.index(element)
+    if place >= len(limb.limb.joints) or limb.limb.joints[place].kind != "P":
+        raise MechanismError(
+            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a slide allows; "
+            "leave out `alone: true`"
+        )
+    w, after = np.eye(3)[AXES.index(axis)], names[place + 1]
+    behind = limb.placements[after]
+    maps = map_displacement(parameter, limb, element, axis)
+    maps += map_direction(parameter, limb, after, -behind[:3, :3].T @ w, turns=True)
+    shift = -behind[:3, :3].T @ np.cross(w, behind[:3, 3])
+    if shift.any():
+        maps += map_direction(parameter, limb, after, shift, turns=False)
+    return maps
+
+
+def translate(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
+    """Return a translation (4, 4) [m]."""
+    return geometry.make_pose(np.eye(3), np.array([x, y, z], dtype=float))
+
+
+def rotation_matrix(rotation: FloatArray) -> FloatArray:
+    """Return a rotation (3, 3) as (4, 4)."""
+    return geometry.make_pose(rotation, np.zeros(3))
+
+
+def rotate_about(axis: str, angle: float) -> FloatArray:
+    """Return a rotation (4, 4) about x, y or z [rad]."""
+    return rotation_matrix(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
+
+
+# --- Error models: named parameters with their maps, by hand for `ideal`, by rule for `complete`.
+
+KEPT_AXES: Mapping[str, tuple[str, ...]] = {"R": ("rx", "ry", "x", "y"), "P": ("rx", "ry")}
+"""Displacements of a link that its joint does not repeat."""
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Parameters with their maps; `+` joins two."""
+
+    parameters: tuple[Parameter, ...] = ()
+    maps: tuple[LinearMap, ...] = ()
+    shared: tuple[SharedMap, ...] = ()
+
+    def __add__(self, other: ErrorModel) -> ErrorModel:
+        return join_errors((self, other))
+
+    def without_effects_of(self, named: ErrorModel) -> ErrorModel:
+        """Return these parameters without those whose effect `named` or earlier ones have already.
+
+        A parameter whose name is taken gets the suffix `.own`.
+        """
+        addresses = dict.fromkeys(entry.address for entry in named.maps + self.maps)
+        place = {address: i for i, address in enumerate(addresses)}
+        taken, left = {p.name for p in named.parameters}, []
+        basis = np.zeros((0, len(place)))
+        for errors in (named, self):
+            effects = {p.name: np.zeros(len(place)) for p in errors.parameters}
+            for entry in errors.maps:
+                effects[entry.parameter][place[entry.address]] += entry.coefficient
+            for parameter in errors.parameters:
+                effect = effects[parameter.name]
+                rest = effect - (basis @ effect) @ basis
+                if np.linalg.norm(rest) <= 1e-9 * np.linalg.norm(effect):
+                    continue
+                basis = np.vstack([basis, rest / np.linalg.norm(rest)])
+                if errors is self:
+                    suffix = ".own" if parameter.name in taken else ""
+                    left.append(self._rename(parameter, parameter.name + suffix))
+        return join_errors(left)
+
+    def _rename(self, parameter: Parameter, name: str) -> ErrorModel:
+        """Return one of the parameters, with its maps, under another name."""
+        maps = (entry for entry in self.maps if entry.parameter == parameter.name)
+        renamed = tuple(replace(entry, parameter=name) for entry in maps)
+        return ErrorModel((replace(parameter, name=name),), renamed)
+
+
+def join_errors(models: Iterable[ErrorModel]) -> ErrorModel:
+    """Return all parameters and maps of error models."""
+    joined = tuple(models)
+    return ErrorModel(
+        tuple(parameter for model in joined for parameter in model.parameters),
+        tuple(entry for model in joined for entry in model.maps),
+        tuple(entry for model in joined for entry in model.shared),
+    )
+
+
+class ErrorTolerances(NamedTuple):
+    """Standard deviations of lengths and angles [m, rad]; None where none is stated."""
+
+    length: float | None = None
+    angle: float | None = None
+
+
+def single_error(
+    name: str,
+    dimension: Dimension,
+    nominal: float,
+    tolerance: float | None,
+    *maps: LinearMap,
+    positive: bool = False,
+) -> ErrorModel:
+    """Return an error model of one named parameter.
+
+    `positive` : whether only values above zero exist; a nominal value of zero then allows others.
+    """
+    has_sign = positive and nominal > 0.0
+    parameter = Parameter(name, dimension, float(nominal), tolerance, positive=has_sign)
+    return ErrorModel((parameter,), maps)
+
+
+def displacement_error(
+    name: str,
+    limb: PlacedLimb,
+    element: str,
+    axis: str,
+    tolerance: float | None,
+    nominal: float = 0.0,
+    positive: bool = False,
+) -> ErrorModel:
+    """Return a displacement of a link, of AXES in its carried frame, as a parameter."""
+    maps = map_displacement(name, limb, element, axis)
+    dimension = get_axis_dimension(axis)
+    return single_error(name, dimension, nominal, tolerance, *maps, positive=positive)
+
+
+def point_errors(limb: PlacedLimb, element: str, tolerance: float | None, label: str) -> ErrorModel:
+    """Return the coordinates of a link's origin as parameters `limb.label.x`, `.y` and `.z`.
+
+    They are coordinates in the frame carried before the link; nominal values are those of its
+    placement, which is not rotated.
+    """
+    point = limb.placements[element][:3, 3]
+    return join_errors(
+        displacement_error(f"{limb.name}.{label}.{axis}", limb, element, axis, tolerance, nominal)
+        for axis, nominal in zip(AXES[3:], point, strict=True)
+    )
+
+
+def rod_length_error(limb: PlacedLimb, name: str, tolerance: float | None) -> ErrorModel:
+    """Return the length of the rod of a `distance` ending at reading zero as a parameter."""
+    rod = LinearMap(name, Address(limb.name, "rod", "length"))
+    length = limb.limb.length
+    return single_error(name, Dimension.LENGTH, length, tolerance, rod, positive=True)
+
+
+def offset_error(
+    name: str,
+    actuator: str,
+    dimension: Dimension,
+    nominal: float,
+    tolerance: float | None,
+    positive: bool = False,
+) -> ErrorModel:
+    """Return the value of a driven joint at reading zero as a parameter."""
+    offset = LinearMap(name, Address(actuator, "transmission", "offset"))
+    return single_error(name, dimension, nominal, tolerance, offset, positive=positive)
+
+
+def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = True) -> ErrorModel:
+    """Return the complete error model of a limb, see the module.
+
+    Without `offsets` the family names the offsets of the actuators itself.
+    """
+    errors: list[ErrorModel] = []
+
+    def add_displacements(element: str, axes: Iterable[str]) -> None:
+        for axis in axes:
+            name, dimension = f"{limb.name}.{element}.{axis}", get_axis_dimension(axis)
+            sd = spread.angle if dimension is Dimension.ANGLE else spread.length
+            address = Address(limb.name, element, axis)
+            errors.append(single_error(name, dimension, 0.0, sd, LinearMap(name, address)))
+
+    def add_offset(drive: str | None, dimension: Dimension) -> None:
+        if drive and offsets:
+            sd = spread.angle if dimension is Dimension.ANGLE else spread.length
+            errors.append(offset_error(f"{drive}.offset", drive, dimension, 0.0, sd))
+
+    for joint in limb.limb.joints:
+        add_displacements(joint.name, KEPT_AXES[joint.kind])
+        add_offset(joint.actuator, joint.dimension)
+    if limb.limb.ending != "rigid":
+        add_displacements(limb.limb.links[-1].name, AXES[3:])
+    add_displacements("platform", AXES if limb.limb.ending == "rigid" else AXES[3:])
+    add_offset(limb.limb.actuator, Dimension.LENGTH)
+    if limb.limb.ending == "distance" and not limb.limb.actuator:
+        errors.append(rod_length_error(limb, f"{limb.name}.length", spread.length))
+    return join_errors(errors)
+
+
+def get_axis_dimension(axis: str) -> Dimension:
+    """Return the dimension of a displacement along or about one of AXES."""
+    return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
+
+
+def check_spherical(name: str, spherical: str, error_model: str) -> None:
+    """Refuse balls of three axes without errors; raises MechanismError."""
+    if spherical == "axes" and error_model == "ideal":
+        raise MechanismError(
+            f"{name} states spherical: axes with error_model: ideal, whose parameters describe "
+            "perfect points; state error_model: complete, or spherical: point"
+        )
+
 
 Point = tuple[Length, Length, Length]
 

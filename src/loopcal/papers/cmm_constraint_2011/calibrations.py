@@ -10,12 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method
-from loopcal.estimate.published_methods.plane_line_products import (
-    PaperRows,
-    Weights,
-    identify_from_rows,
-)
+from loopcal.estimate.penalties import MAP, LeastSquares, Method
+from loopcal.estimate.plane_line_products import PaperRows, Weights, identify_from_rows
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
@@ -27,12 +23,7 @@ from loopcal.papers.cmm_constraint_2011.machines import (
 )
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
 from loopcal.papers.paper_studies import load_paper_study
-from loopcal.studies.simulation.calibrated_cells import (
-    CalibratedCell,
-    calibrate_cells,
-    find_cells,
-    set_size,
-)
+from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BEFORE, LS, PRIOR = "before", "LS", "MAP"

@@ -13,19 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.identification import identify
 from loopcal.estimate.information import collect_information
-from loopcal.estimate.published_methods.plane_line_products import (
-    Layout,
-    PaperRows,
-    identify_from_rows,
-)
-from loopcal.measure import Gaussian, Measurements, Observations
+from loopcal.estimate.plane_line_products import Layout, PaperRows, identify_from_rows
+from loopcal.measure.instrument import Gaussian
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.papers.cmm_constraint_2011.calibrations import LS, METHODS
 from loopcal.papers.cmm_constraint_2011.machines import Study, draw_true_machines
-from loopcal.planning.plane_line_sensors import make_plane_line_instrument
+from loopcal.planning.plane_line_planning import make_plane_line_instrument
 from loopcal.typing import FloatArray
 
 ERRORS, NOISES = 1e-3, (1e-6, 1e-5)

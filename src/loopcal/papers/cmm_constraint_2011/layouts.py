@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate.published_methods.plane_line_products import WEIGHTS
+from loopcal.estimate.plane_line_products import WEIGHTS
 from loopcal.papers.cmm_constraint_2011.calibrations import Cell, calibrate_cell
 from loopcal.papers.cmm_constraint_2011.machines import (
     GROUPS,

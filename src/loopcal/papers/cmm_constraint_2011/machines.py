@@ -13,13 +13,16 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate.published_methods.plane_line_products import Layout
-from loopcal.measure import make_random_stream
-from loopcal.mechanism import POSITION, Mechanism, Solution, forward_trials, sample_workspace
+from loopcal.estimate.plane_line_products import Layout
+from loopcal.measure.instrument import make_random_stream
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import POSITION
+from loopcal.mechanism.solutions import Solution
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.planning.design import MovedDesign
-from loopcal.planning.plane_line_groups import PlaneLineGroups
-from loopcal.planning.plane_line_planning import improve_groups
+from loopcal.planning.exchange import MovedDesign
+from loopcal.planning.plane_line_planning import PlaneLineGroups, improve_groups
 from loopcal.typing import FloatArray
 
 ROBOT = "hexapod-nategh-agheli"
@@ -147,7 +150,7 @@ class Study:
 
 def load_machine() -> Mechanism:
     """Return the hexapod as designed."""
-    from loopcal.io import load_robot
+    from loopcal.io.robot.robot_file import load_robot
 
     return load_robot(ROBOT)
 

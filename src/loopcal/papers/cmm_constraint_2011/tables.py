@@ -24,7 +24,7 @@ from loopcal.papers.cmm_constraint_2011.published import MM, Published
 from loopcal.papers.printed import Cell as Entry
 from loopcal.papers.printed import Table
 from loopcal.papers.wording import Wording, read_wording
-from loopcal.planning.plane_line_groups import PlaneLineGroups
+from loopcal.planning.plane_line_planning import PlaneLineGroups
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 

@@ -8,17 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.estimate.published_methods.per_leg import LegForm
-from loopcal.measure import (
-    Instrument,
-    Pose,
-    Sensor,
-    Trials,
-    Uniform,
-    make_random_stream,
-    simulate_trials,
-)
-from loopcal.mechanism import forward_trials
+from loopcal.estimate.published_steps import LegForm
+from loopcal.measure.instrument import Instrument, Sensor, Uniform, make_random_stream
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import Trials, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
 from loopcal.papers.hexapod_42.published import MM, TO_PRINTED, Published, to_values
 from loopcal.papers.hexapod_42.steps import (
     Study,
@@ -33,14 +27,9 @@ from loopcal.papers.hexapod_42.steps import (
 )
 from loopcal.papers.paper_studies import load_paper_study
 from loopcal.papers.printed import Cell
-from loopcal.studies import Study as PaperStudy
-from loopcal.studies.simulation.calibrated_cells import (
-    CalibratedCell,
-    calibrate_cells,
-    find_cells,
-    set_size,
-)
+from loopcal.studies.simulation.block import CalibratedCell, calibrate_cells, find_cells, set_size
 from loopcal.studies.specification.levels import PosesLevel
+from loopcal.studies.specification.study import Study as PaperStudy
 from loopcal.typing import BoolArray, FloatArray
 
 STATED = (1e-3, 1e-6)

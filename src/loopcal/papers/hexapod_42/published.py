@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.papers.printed import Printed, read_content
 from loopcal.typing import FloatArray
 
@@ -83,7 +83,7 @@ def read_published() -> Published:
 
 def load_nominal_machine() -> Mechanism:
     """Return the hexapod of Table 2 (the shipped robot hexapod-42)."""
-    from loopcal.io import load_robot
+    from loopcal.io.robot.robot_file import load_robot
 
     return load_robot("hexapod-42")
 

@@ -26,10 +26,14 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate.published_methods.per_leg import LegForm, identify_per_leg
+from loopcal.estimate.published_steps import LegForm, identify_per_leg
 from loopcal.geometry import OrientationForm, parse_orientation
-from loopcal.measure import Measurements, Observations, Pose, make_random_stream
-from loopcal.mechanism import Mechanism, Solution, forward, inverse
+from loopcal.measure.instrument import make_random_stream
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, forward, inverse
 from loopcal.papers.hexapod_42.published import MM
 from loopcal.typing import FloatArray
 

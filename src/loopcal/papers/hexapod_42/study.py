@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal import geometry
-from loopcal.mechanism import Mechanism, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import inverse
 from loopcal.papers.hexapod_42 import noise_study, table_4_study
 from loopcal.papers.hexapod_42.noise_study import PRESUMED, STATED, Level, MethodResult, to_si
 from loopcal.papers.hexapod_42.published import (

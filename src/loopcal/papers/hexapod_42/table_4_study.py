@@ -9,9 +9,11 @@ from itertools import permutations
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate import MAP, LeastSquares, identify
-from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.numerics.chi_square import compute_chi_square_quantile
+from loopcal.estimate.identification import identify
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
+from loopcal.numerics.statistics import compute_chi_square_quantile
 from loopcal.papers.hexapod_42.published import MM, Published
 from loopcal.papers.hexapod_42.steps import Study, compute_actual_poses, iterate, to_measurements
 from loopcal.papers.printed import Cell

@@ -15,13 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.diagnose import Identifiability, identifiability
-from loopcal.estimate import GCV, MAP, LeastSquares, Ridge, identify_trials
-from loopcal.estimate.published_methods.raw_steps import (
-    penalize_none,
-    penalize_ridge,
-    penalize_truncated,
-)
+from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
+from loopcal.estimate.penalties import GCV, MAP, LeastSquares, Ridge
+from loopcal.estimate.published_steps import penalize_none, penalize_ridge, penalize_truncated
+from loopcal.estimate.trial_identification import identify_trials
 from loopcal.numerics.decomposition import are_nonzero
 from loopcal.papers.tsvd_2016.machines import (
     AppendixNoise,

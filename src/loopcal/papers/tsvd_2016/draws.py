@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.estimate import GCV, MAP, FitOptions, LeastSquares, Ridge, identify_trials
-from loopcal.estimate.methods.penalties import Method
-from loopcal.measure import make_random_stream
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import GCV, MAP, LeastSquares, Method, Ridge
+from loopcal.estimate.trial_identification import identify_trials
+from loopcal.measure.instrument import make_random_stream
 from loopcal.papers.tsvd_2016.machines import (
     Study,
     draw_true_values,

@@ -15,25 +15,13 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.engine import State
-from loopcal.estimate.published_methods.raw_steps import RawProblem, make_raw_problem
-from loopcal.measure import (
-    Component,
-    Instrument,
-    Noise,
-    Sensor,
-    Trials,
-    Uniform,
-    make_random_stream,
-    simulate_trials,
-)
-from loopcal.mechanism import (
-    Mechanism,
-    Solution,
-    compute_readings,
-    forward_trials,
-    inverse,
-    inverse_trials,
-)
+from loopcal.estimate.published_steps import RawProblem, make_raw_problem
+from loopcal.measure.instrument import Instrument, Noise, Sensor, Uniform, make_random_stream
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.simulation import Trials, simulate_trials
+from loopcal.mechanism.kinematics import compute_readings, forward_trials, inverse_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.papers.tsvd_2016.published import MM, read_published
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -233,7 +221,7 @@ def measure_machines(
 
 def load_machine(name: str) -> Mechanism:
     """Return the machine as designed, from the shipped robot file: step 1."""
-    from loopcal.io import load_robot
+    from loopcal.io.robot.robot_file import load_robot
 
     return load_robot(ROBOTS[name])
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate.published_methods.raw_steps import penalize_ridge, penalize_truncated
+from loopcal.estimate.published_steps import penalize_ridge, penalize_truncated
 from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.papers.tsvd_2016.steps import iterate
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate.published_methods.raw_steps import (
+from loopcal.estimate.published_steps import (
     AHEAD,
     LIMIT,
     RawSteps,
@@ -31,7 +31,7 @@ from loopcal.estimate.published_methods.raw_steps import (
     list_raw_units,
     take_steps,
 )
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.typing import BoolArray, FloatArray, IntArray

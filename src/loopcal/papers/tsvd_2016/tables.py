@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism.model import Mechanism
 from loopcal.papers.printed import Cell, Comparison, Table
 from loopcal.papers.tsvd_2016.cases import PRIOR, WHITENED, Case, Sweep, to_paper_units
 from loopcal.papers.tsvd_2016.draw_tables import (

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.estimate.published_methods.raw_steps import LINEARIZATIONS
+from loopcal.estimate.published_steps import LINEARIZATIONS
 from loopcal.papers.reproduction import Verdict
 from loopcal.papers.tsvd_2016.draw_tables import DIVERGED
 from loopcal.papers.tsvd_2016.draws import (

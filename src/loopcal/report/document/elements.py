@@ -6,10 +6,31 @@ A sentence is a `str`; a table is the one that the terminal shows, too.
 
 from __future__ import annotations
 
+import ast
+import base64
+import hashlib
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from loopcal.apply.height_errors import HeightErrors, restore_heights
+from loopcal.apply.validation import Validation, restore_validation
+from loopcal.estimate.posterior import Posterior, posterior_from_arrays
+from loopcal.estimate.result import KindResiduals, residuals_from_arrays
+from loopcal.mechanism.model import Mechanism
+from loopcal.plain_text import escape
+from loopcal.report.scene.scene import load_script
 from loopcal.report.tables import Table
+from loopcal.serialization import restore_numbers
+from loopcal.workflow.verdict import Verdict
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 
 @dataclass(frozen=True)
@@ -111,3 +132,242 @@ def _describe(element: Element) -> dict[str, Any]:
     if isinstance(element, Listing):
         return {"list": [{"label": label, "text": text} for label, text in element.items]}
     return {"code": element.title, "text": element.text}
+
+
+# --- A document as one HTML file, which loads nothing.
+
+TEMPLATE, STYLE = "report.html.j2", "report.css"
+FOLDER = Path(__file__).parent
+
+WIDEST = 6
+"""Columns from which a table is set in a smaller font."""
+
+
+def render_html(document: Document) -> str:
+    """Return a document as HTML; a name that is not plain text is shown with escapes."""
+    style = (FOLDER / STYLE).read_text("utf-8")
+    elements = (element for section in document.sections for element in section.elements)
+    has_scene = any(isinstance(element, Picture) and element.scene for element in elements)
+    script = load_script() if has_scene else ""
+    allowed = f"script-src '{_digest(script)}'; " if script else ""
+    policy = f"default-src 'none'; {allowed}style-src '{_digest(style)}'; img-src data:"
+    return _load_template().render(
+        document=document,
+        style=style,
+        script=script,
+        policy=f"{policy}; base-uri 'none'; form-action 'none'",
+        widest=WIDEST,
+    )
+
+
+def _digest(text: str) -> str:
+    """Return the source of a content security policy that allows exactly this text."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+@cache
+def _load_template() -> Template:
+    """Return the template, with its tests for elements; text is escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    def show(value: Any) -> Any:
+        is_text = isinstance(value, str) and not isinstance(value, Markup)
+        return escape(value, "\n") if is_text else value
+
+    environment = Environment(
+        loader=FileSystemLoader(FOLDER),
+        autoescape=True,
+        finalize=show,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for name, kind in (
+        ("table", Table),
+        ("picture", Picture),
+        ("listing", Listing),
+        ("code", Code),
+    ):
+        environment.tests[name] = lambda value, kind=kind: isinstance(value, kind)
+    return environment.get_template(TEMPLATE)
+
+
+# --- What the report of a calibration shows: the content of a run, as numbers and objects.
+
+
+@dataclass(frozen=True)
+class ControllerValues:
+    """Identified values as a controller reads them.
+
+    Parameters
+    ----------
+    format : name of the format. what : a line about it. text : of the file. notes : what it cannot
+        express, and what it changes.
+    """
+
+    format: str
+    what: str
+    text: str = field(repr=False)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRecord:
+    """Content of a run.
+
+    Attributes
+    ----------
+    source : name of the run folder; empty for a report in memory.
+    result : content of result.json, with numbers that are not finite.
+    arrays : content of arrays.npz [SI].
+    robot : the corrected robot, of which the identified parameters are free. initial : the robot
+        before the calibration.
+    posterior : of a fit that converged; None where the run has none.
+    validation : errors at held-out poses; None without any, or where an older version wrote the
+        run.
+    heights : errors of measured heights; None without any.
+    residuals : of every kind; none where an older version wrote the run.
+    controllers : the values for controllers that can store them.
+    """
+
+    source: str
+    result: Mapping[str, Any] = field(repr=False)
+    arrays: Mapping[str, np.ndarray] = field(repr=False)
+    robot: Mechanism
+    initial: Mechanism
+    posterior: Posterior | None
+    validation: Validation | None
+    heights: HeightErrors | None
+    residuals: tuple[KindResiduals, ...]
+    controllers: tuple[ControllerValues, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict; runs of early versions state none and are undecided."""
+        return Verdict[str(self.result.get("verdict") or "undecided").upper()]
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit converged."""
+        return self.result["fit"]["status"] == "converged"
+
+    @property
+    def findings(self) -> tuple[Mapping[str, Any], ...]:
+        """The findings, the most important first."""
+        return tuple(self.result.get("findings") or ())
+
+    @property
+    def fitted_labels(self) -> tuple[str, ...]:
+        """Labels of the fitted poses, without those that options excluded; none where an older
+        version wrote the run.
+        """
+        labels = self.arrays.get("poses")
+        excluded = self.result["fit"].get("dropped") or ()
+        return () if labels is None else tuple(n for n in labels.tolist() if n not in excluded)
+
+    @property
+    def held_out_labels(self) -> tuple[str, ...]:
+        """Labels of the held-out poses."""
+        return tuple((self.result.get("split") or {}).get("held_out", ()))
+
+    @property
+    def readings(self) -> np.ndarray | None:
+        """(n, a) readings of the fitted poses; None where the run does not contain them."""
+        return self.arrays.get("frames_readings")
+
+
+def build_record(
+    result: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    robot: Mechanism,
+    initial: Mechanism,
+    source: str = "",
+    controllers: tuple[ControllerValues, ...] = (),
+) -> CalibrationRecord:
+    """Return the record of a run.
+
+    Parameters
+    ----------
+    result : content of result.json. arrays : of arrays.npz. robot : see `Run.identified_robot`.
+    """
+    content = restore_numbers(result)
+    stored = content.get("validation")
+    return CalibrationRecord(
+        source=source,
+        result=content,
+        arrays=arrays,
+        robot=robot,
+        initial=initial,
+        posterior=posterior_from_arrays(robot, arrays) if "posterior_unit" in arrays else None,
+        validation=None if stored is None else restore_validation(stored, arrays, robot),
+        heights=restore_heights(arrays, robot),
+        residuals=residuals_from_arrays(arrays),
+        controllers=controllers,
+    )
+
+
+# --- Options and method of a stored calibration in words.
+
+UNITS = {"limit_position": "m", "limit_angle": "rad"}
+"""Units of options that are numbers [SI]."""
+
+OBJECT = re.compile(r"(?<==)<([A-Za-z_]+)[^<>]*>")
+"""What Python writes of an argument that is an object."""
+
+UNSTATED = ("None", "()", "[]", "{}")
+"""Values of options that nobody stated."""
+
+
+def list_options(text: str) -> list[tuple[str, str]]:
+    """Return name and value of each stated option; the text itself where it is no call."""
+    call = _parse_call(text)
+    if call is None:
+        return [("options", text or "unknown")]
+    return [(f"option: {name.replace('_', ' ')}", value) for name, value in _list_values(call)]
+
+
+def describe_call(text: str) -> str:
+    """Return a call in words, such as `Ridge (parameter 0.1)`; the text where it is no call."""
+    call = _parse_call(text)
+    return text if call is None else _describe_option(call)
+
+
+def _parse_call(text: str) -> ast.Call | None:
+    """Return the call that a text is; None for other text."""
+    try:
+        node = ast.parse(OBJECT.sub(r"\1()", text), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
+    return node if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else None
+
+
+def _list_values(call: ast.Call) -> list[tuple[str, str]]:
+    """Return name and value of each argument that was stated; those of options within options have
+    names of their own.
+    """
+    values: list[tuple[str, str]] = []
+    for keyword in call.keywords:
+        name, node = keyword.arg or "", keyword.value
+        if ast.unparse(node) in UNSTATED:
+            continue
+        if isinstance(node, ast.Call) and name == "fit":
+            values += _list_values(node)
+        else:
+            values.append((name, " ".join([_describe_option(node), *UNITS.get(name, "").split()])))
+    return values
+
+
+def _describe_option(node: ast.expr) -> str:
+    """Return a value in words."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        arguments = [f"{name.replace('_', ' ')} {value}" for name, value in _list_values(node)]
+        arguments = [*(_describe_option(value) for value in node.args), *arguments]
+        return f"{node.func.id} ({', '.join(arguments)})" if arguments else node.func.id
+    if isinstance(node, ast.Tuple | ast.List):
+        return ", ".join(_describe_option(item) for item in node.elts)
+    if isinstance(node, ast.Constant):
+        if isinstance(node.value, bool):
+            return "yes" if node.value else "no"
+        return str(node.value)
+    return ast.unparse(node)

@@ -1,20 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene: a robot at home with its measured poses, its errors there, and its accuracy map.
 
-One scene is drawn twice: as a picture by `loopcal.report.figures.draw_scene`, and by the script of
+One scene is drawn twice: as a picture by `draw_scene`, and by the script of
 the 3-D view, for which `scene_data.py` writes it.
 """
 
 from __future__ import annotations
 
+import base64
+import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from loopcal.apply import AccuracyMap
-from loopcal.mechanism import Mechanism, Solution, forward
-from loopcal.typing import FloatArray
+from loopcal.apply.accuracy import AccuracyMap
+from loopcal.engine import State
+from loopcal.mechanism.kinematics import compute_limb_frames, locate_anchors
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, forward
+from loopcal.plain_text import escape
+from loopcal.report.figures.style import COLORS, ERROR, FRAME_COLORS, POSE, SEQUENTIAL
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 LONGEST = 0.15
 """Length of the longest drawn error, as a share of the robot's size."""
@@ -99,3 +111,350 @@ def round_down(value: float) -> float:
     """Return 1, 2 or 5 times a power of ten, at most a value above zero."""
     power = 10.0 ** math.floor(math.log10(value))
     return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value)
+
+
+# --- The parts of a robot as points and lines in the base frame: limbs, joints, rods, platform,
+# tool.
+
+AXIS, GUIDE = 0.06, 0.12
+"""Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
+as a share of the robot's size.
+"""
+
+SPHERE, COINCIDENT = (0.3, 0.2), 1e-9
+"""Distances of the first and the last joint from the point in which all axes of a spherical limb
+meet, and up to which distance points are one, all as shares of the robot's size.
+"""
+
+Role = Literal[
+    "limb", "axis", "guide", "joint", "slide", "rod", "rod drive", "end",
+    "base", "platform", "arm", "frame", "tool",
+]  # fmt: skip
+"""What a part is: the line along a limb; the axis and the place of a joint; the guide and the place
+of a slide; a rod, where it is driven, the end of a limb; the outlines of base and platform; the
+line from the platform to the tool, or from the anchors of a triangle drive to its joint; an axis of
+a frame; the tool point.
+"""
+
+LINES = ("limb", "axis", "guide", "rod", "base", "platform", "arm", "frame")
+"""Roles of lines; all others are single points."""
+
+PLANAR = {"x", "y", "rz"}
+"""Freedoms of a platform that moves in the x-y plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A line through m points, or one point, at n poses.
+
+    Attributes
+    ----------
+    role : one of `Role`. points : (n, m, 3) [m], in the base frame.
+    index : number of its limb, or of the axis of a frame; -1 where it belongs to neither.
+    is_driven : whether it is a joint, slide or rod with an actuator.
+    """
+
+    role: Role
+    points: FloatArray
+    index: int = -1
+    is_driven: bool = False
+
+
+def is_planar(robot: Mechanism) -> bool:
+    """Return whether the platform moves in the x-y plane only: one view shows everything."""
+    return set(robot.freedoms) <= PLANAR
+
+
+def list_parts(robot: Mechanism, state: State) -> tuple[Part, ...]:
+    """Return the parts of a robot at n poses: first the line of each limb, in their order.
+
+    Parameters
+    ----------
+    state : (1, n), of `robot.home_state` or of a solution.
+    """
+    T = state.T[0]
+    limbs = compute_limb_frames(robot, robot.values[None], state)
+    frames, traces = zip(*(_arrange_limb(limb[0], robot.size) for limb in limbs), strict=True)
+    foot, top = (np.stack([limb[:, j, :3, 3] for limb in frames], axis=1) for j in (0, -1))
+    lines = (Part("limb", trace, i) for i, trace in enumerate(traces))
+    joints = (part for i, limb in enumerate(frames) for part in _list_joints(robot, i, limb))
+    triangles, bodies = _list_triangles(robot, state), _list_bodies(robot, foot, top, T)
+    return (*lines, *joints, *triangles, *bodies)
+
+
+def _arrange_limb(frames: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return the frames (n, J + 2, 4, 4) of a limb as they are drawn, and the line (n, m, 3) along
+    it.
+
+    Where all axes of a limb meet in one point, its links have no lengths. They are drawn as arcs
+    about this point, each joint on its axis, from the motor inwards.
+    """
+    points, n_joints = frames[:, :, :3, 3], frames.shape[1] - 2
+    center = points[:, :1]
+    if n_joints < 2 or np.abs(points - center).max() > COINCIDENT * size:
+        return frames, points[:, :-1]
+    arms = frames[:, :n_joints, :3, 2] * (size * np.linspace(*SPHERE, n_joints))[:, None]
+    arranged = frames.copy()
+    arranged[:, :n_joints, :3, 3] += arms
+    arranged[:, n_joints:, :3, 3] = arranged[:, n_joints - 1, None, :3, 3]
+    share = np.linspace(0.0, 1.0, 13)[:, None]
+    first, second = arms[:, :-1, None], arms[:, 1:, None]
+    chords = (1 - share) * first + share * second
+    lengths = [np.linalg.norm(arm, axis=-1, keepdims=True) for arm in (first, second, chords)]
+    radius = (1 - share) * lengths[0] + share * lengths[1]
+    arcs = chords * (radius / np.maximum(lengths[2], 1e-9 * size))
+    return arranged, center + arcs.reshape(len(frames), -1, 3)
+
+
+def _list_joints(robot: Mechanism, i: int, frames: FloatArray) -> Iterator[Part]:
+    """Yield joints and rod of limb i with frames (n, J + 2, 4, 4)."""
+    limb, points = robot.assembly.limbs[i], frames[:, :, :3, 3]
+    for j, joint in enumerate(limb.joints):
+        axis, is_driven = frames[:, j, :3, 2], bool(joint.actuator)
+        if joint.kind == "P":
+            slid = ((points[:, j + 1] - points[:, j]) * axis).sum(axis=1)
+            reach = GUIDE * robot.size
+            ends = np.stack([np.minimum(slid, 0.0) - reach, np.maximum(slid, 0.0) + reach], axis=1)
+            yield Part("guide", points[:, j, None] + ends[:, :, None] * axis[:, None], i)
+            yield Part("slide", (points[:, j] + slid[:, None] * axis)[:, None], i, is_driven)
+        else:
+            ends = np.array([[-1.0], [1.0]]) * AXIS * robot.size
+            yield Part("axis", points[:, j, None] + ends * axis[:, None], i)
+            yield Part("joint", points[:, j, None], i, is_driven)
+    if limb.ending == "distance":
+        is_driven, rod = bool(limb.actuator), points[:, -2:]
+        yield Part("rod", rod, i)
+        place = rod.mean(axis=1, keepdims=True) if is_driven else rod[:, :1]
+        yield Part("rod drive", place, i, is_driven)
+    if limb.ending != "rigid":
+        yield Part("end", points[:, -1:], i)
+
+
+def _list_triangles(robot: Mechanism, state: State) -> Iterator[Part]:
+    """Yield the linear actuators that turn joints through two anchors."""
+    for anchors in locate_anchors(robot, state):
+        foot, head = np.moveaxis(anchors.points, 1, 0)
+        yield Part("arm", np.stack([foot, anchors.pin, head], axis=1))
+        yield Part("rod", anchors.points, anchors.limb)
+        yield Part("rod drive", anchors.points.mean(axis=1, keepdims=True), anchors.limb, True)
+        yield Part("end", anchors.points[:, 1:], anchors.limb)
+
+
+def _list_bodies(
+    robot: Mechanism, foot: FloatArray, top: FloatArray, T: FloatArray
+) -> Iterator[Part]:
+    """Yield base and platforms of points (n, k, 3), the frames of base and tool, and the tool."""
+    for role, points in _list_outlines(robot, foot, top):
+        yield Part(role, points[:, _order_outline(points[0])])
+    tool = T @ robot.tool
+    yield Part("arm", np.stack([T[:, :3, 3], tool[:, :3, 3]], axis=1))
+    for frame in (np.broadcast_to(np.eye(4), T.shape), tool):
+        for axis in range(3):
+            end = frame[:, :3, 3] + 2 * AXIS * robot.size * frame[:, :3, axis]
+            yield Part("frame", np.stack([frame[:, :3, 3], end], axis=1), axis)
+    yield Part("tool", tool[:, None, :3, 3])
+
+
+def _list_outlines(
+    robot: Mechanism, foot: FloatArray, top: FloatArray
+) -> Iterator[tuple[Role, FloatArray]]:
+    """Yield the points (n, k, 3) of base and platforms.
+
+    The platform of a stage has the ends of its limbs, and the feet of the stages that it carries.
+    """
+    if not robot.stages:
+        yield "base", foot
+        yield "platform", top
+        return
+    owner = np.repeat(
+        np.arange(len(robot.stages)), [len(s.robot.assembly.limbs) for s in robot.stages]
+    )
+    parent = np.array([stage.parent for stage in robot.stages])[owner]
+    yield "base", foot[:, parent == -1]
+    for i in range(len(robot.stages)):
+        yield "platform", np.concatenate([top[:, owner == i], foot[:, parent == i]], axis=1)
+
+
+def _order_outline(points: FloatArray) -> IntArray:
+    """Return the order of points (n, 3) by angle about their center, the first again at the end;
+    of points on a line their own order.
+    """
+    offset = points - points.mean(axis=0)
+    _, s, V = np.linalg.svd(offset, full_matrices=True)
+    if len(points) < 3 or s[1] < 1e-6 * max(s[0], 1e-300):
+        return np.arange(len(points))
+    order = np.argsort(np.arctan2(offset @ V[1], offset @ V[0]))
+    return np.append(order, order[0])
+
+
+# --- A scene as JSON for the script of the 3-D view (tools/viewer).
+
+SCRIPT = Path(__file__).parent / "viewer.min.js"
+
+MOST_NUMBERS = 200_000
+"""Coordinates of robots at measured poses in one scene: 1.1 MB of text."""
+
+BODY, BLACK, DRIVEN, UNBOUNDED = "#404040", "#000000", "#666666", "#8c8c8c"
+"""Colors of the platform, of axes and the tool, of the legend of driven parts, and of poses whose
+uncertainty is not bounded.
+"""
+
+
+@cache
+def load_script() -> str:
+    """Return the script of the 3-D view."""
+    return SCRIPT.read_text("utf-8")
+
+
+def choose_rows(robot: Mechanism, count: int) -> IntArray:
+    """Return the rows, of so many, at which the robot can be shown: all, or evenly spread ones."""
+    numbers = 3 * sum(part.points.shape[1] for part in list_parts(robot, robot.home_state))
+    most = max(1, MOST_NUMBERS // numbers)
+    if count <= most:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, most).astype(np.intp))
+
+
+def format_scene(scene: Scene) -> str:
+    """Return a scene as JSON in which no text can end a script element."""
+    robot = scene.robot
+    unit = find_unit(robot.units[Dimension.LENGTH])
+    parts = list_parts(robot, robot.home_state)
+    data = {
+        "name": escape(robot.name),
+        "unit": unit.symbol,
+        "size": robot.size / unit.factor_to_si,
+        "planar": is_planar(robot),
+        "parts": [describe_part(part) for part in parts],
+        "home": _encode(_join(parts) / unit.factor_to_si),
+        "names": _list_names(robot, parts, unit),
+        "poses": _describe_poses(scene, unit),
+        "map": _describe_map(scene, unit),
+        "legend": _list_legend(scene, parts),
+    }
+    return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _encode(values: FloatArray) -> str:
+    """Return numbers as base64 of 32-bit floats, the lowest byte first."""
+    return base64.b64encode(values.astype("<f4").tobytes()).decode()
+
+
+def _join(parts: tuple[Part, ...]) -> FloatArray:
+    """Return the points of parts (n, P, 3), one part behind the other."""
+    return np.concatenate([part.points for part in parts], axis=1)
+
+
+def describe_part(part: Part) -> dict[str, Any]:
+    """Return how a part is drawn."""
+    colors = {"axis": BLACK, "tool": BLACK, "platform": BODY, "arm": BODY, "base": BODY}
+    color = COLORS[part.index % len(COLORS)] if part.index >= 0 else BODY
+    if part.role == "frame":
+        color = FRAME_COLORS[part.index]
+    return {
+        "role": part.role,
+        "color": colors.get(part.role, color),
+        "count": part.points.shape[1],
+        "filled": part.is_driven or part.role == "tool",
+        "shape": "box" if part.role == "slide" else "ball",
+    }
+
+
+def _list_names(robot: Mechanism, parts: tuple[Part, ...], unit: Unit) -> list[dict[str, Any]]:
+    """Return names beside the feet of limbs, and of the axes of the base frame."""
+    feet = [(limb.name, part) for limb, part in zip(robot.assembly.limbs, parts, strict=False)]
+    marks = [(name, describe_part(part)["color"], part.points[0, 0]) for name, part in feet]
+    axes = [part for part in parts if part.role == "frame"]
+    axis_names = "xy" if is_planar(robot) else "xyz"
+    marks += [(name, FRAME_COLORS[i], axes[i].points[0, 1]) for i, name in enumerate(axis_names)]
+    return [
+        {"text": escape(name), "color": color, "point": (place / unit.factor_to_si).tolist()}
+        for name, color, place in marks
+    ]
+
+
+def _describe_poses(scene: Scene, unit: Unit) -> dict[str, Any]:
+    """Return measured poses with errors; those of a scene without are empty."""
+    robot, poses = scene.robot, scene.poses
+    rows = np.arange(0) if poses is None else choose_rows(robot, len(poses.tool))
+    nothing = np.zeros((0, 3))
+    tools, errors = (nothing, nothing) if poses is None else (poses.tool, poses.error)
+    robots = nothing
+    if poses is not None and len(rows):
+        robots = _join(list_parts(robot, poses.solution.take(rows).state))
+    return {
+        "labels": [] if poses is None else [escape(poses.labels[i]) for i in rows],
+        "rows": rows.tolist(),
+        "robots": _encode(robots / unit.factor_to_si),
+        "tools": _encode(tools / unit.factor_to_si),
+        "errors": _encode(errors / unit.factor_to_si),
+        "magnification": 1.0 if poses is None else poses.magnification,
+        "colors": {"pose": POSE, "error": ERROR},
+    }
+
+
+def _describe_map(scene: Scene, unit: Unit) -> dict[str, Any] | None:
+    """Return the reached poses of the accuracy map with their colors."""
+    from matplotlib import colormaps
+    from matplotlib.colors import Normalize, to_hex
+
+    if scene.accuracy is None:
+        return None
+    points, values = scene.map_points, scene.accuracy.uncertainty.position
+    reached = np.isfinite(points).all(axis=1)
+    known = np.isfinite(values)
+    if not (reached & known).any():
+        return None
+    scale = Normalize(values[known].min(), values[known].max())
+    shades = [
+        to_hex(colormaps[SEQUENTIAL](scale(value))) if np.isfinite(value) else UNBOUNDED
+        for value in values[reached]
+    ]
+    return {"points": _encode(points[reached] / unit.factor_to_si), "colors": shades}
+
+
+def _list_legend(scene: Scene, parts: tuple[Part, ...]) -> list[dict[str, str]]:
+    """Return the colors of the scene and their meaning."""
+    roles = {part.role for part in parts}
+    rows = [
+        (BODY, "platform", any(p.role == "platform" and _is_wide(p, scene.robot) for p in parts)),
+        (BLACK, "tool", True),
+        (BLACK, "axis of a revolute joint", "axis" in roles and not is_planar(scene.robot)),
+        (DRIVEN, "driven: larger, in the color of its limb", True),
+        *(_describe_errors(scene.poses) if scene.poses is not None else ()),
+        *_describe_scale(scene),
+    ]
+    return [{"color": color, "text": text} for color, text, is_drawn in rows if is_drawn]
+
+
+def _is_wide(part: Part, robot: Mechanism) -> bool:
+    """Return whether the points of a part differ."""
+    return bool(np.ptp(part.points[0], axis=0).max() > 1e-6 * robot.size)
+
+
+def _describe_errors(poses: PoseErrors) -> tuple[tuple[str, str, bool], ...]:
+    """Return the legend of poses and errors."""
+    text = f"position error before calibration, {poses.magnification:g} times magnified"
+    is_any = bool(len(poses.tool))
+    return ((POSE, "tool at a measured pose", is_any), (ERROR, text, is_any))
+
+
+def _describe_scale(scene: Scene) -> tuple[tuple[str, str, bool], ...]:
+    """Return the legend of the accuracy map."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    if scene.accuracy is None:
+        return ()
+    unit, values = DISPLAY_UNITS[Dimension.LENGTH], scene.accuracy.uncertainty.position
+    known = values[np.isfinite(values)] / unit.factor_to_si
+    if not len(known):
+        return ()
+    stops = [to_hex(colormaps[SEQUENTIAL](share)) for share in np.linspace(0.0, 1.0, 5)]
+    ends = " to ".join(f"{value:.3g}" for value in (known.min(), known.max()))
+    text = f"position uncertainty (rms) over the workspace, {ends} {unit.symbol}"
+    unbounded = bool(len(known) < len(values))
+    return (
+        (f"linear-gradient(to right, {', '.join(stops)})", text, True),
+        (UNBOUNDED, "uncertainty not bounded by the data", unbounded),
+    )

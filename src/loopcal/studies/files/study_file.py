@@ -3,23 +3,41 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io.core import limits
 from loopcal.io.core.records import read_record
-from loopcal.io.core.references import find_file_beside
-from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
+from loopcal.io.core.text_file import write_text
+from loopcal.io.core.yaml_file import (
+    Location,
+    YamlFile,
+    find_file_beside,
+    read_yaml,
+    refuse_unknown_keys,
+)
 from loopcal.io.data.measurement_file import load_poses
-from loopcal.io.robot.robot_file import check_format, find_robot_file, get_source, load_robot
-from loopcal.mechanism import Mechanism
-from loopcal.studies.simulation.held_points import check_effects
-from loopcal.studies.simulation.instruments import check_surfaces, make_instrument
-from loopcal.studies.simulation.machines import resolve_patterns
-from loopcal.studies.simulation.methods import make_fit_options
+from loopcal.io.robot.robot_file import (
+    check_format,
+    find_robot_file,
+    get_source,
+    list_shipped_robots,
+    load_robot,
+)
+from loopcal.mechanism.model import Mechanism
+from loopcal.studies.simulation.machines import (
+    check_effects,
+    check_surfaces,
+    make_fit_options,
+    make_instrument,
+    resolve_patterns,
+)
 from loopcal.studies.specification.levels import (
     FACTORS,
     EffectsLevel,
@@ -321,3 +339,39 @@ def _check_errors(level: ErrorsLevel, robots: Mapping[str, Mechanism]) -> None:
             )
         resolve_patterns(robot.parameters, level.tolerances)
         resolve_patterns(robot.parameters, level.deviations)
+
+
+# --- A study file to begin with.
+
+PLACE = "ROBOT"
+"""Stands for the robot in the template."""
+
+
+def write_template(path: Path, robot: str) -> None:
+    """Write a study file with a comment for each setting.
+
+    Parameters
+    ----------
+    robot : name of a shipped robot, or a robot file, which is named relative to the study file.
+
+    Raises
+    ------
+    FileError : there is no such robot, it cannot be read, or the file cannot be written.
+    """
+    load_robot(robot)
+    text = (files("loopcal.studies.files") / "template.yaml").read_text("utf-8")
+    write_text(path, text.replace(f"[{PLACE}]", f"[{quote_robot(path, robot)}]"))
+
+
+def quote_robot(path: Path, robot: str) -> str:
+    """Return how a study file names a robot: a shipped one by its name, another one by its file,
+    relative to the study file.
+
+    Raises
+    ------
+    FileError : there is no such robot.
+    """
+    file, name = find_robot_file(robot), robot
+    if robot not in list_shipped_robots():
+        name = Path(os.path.relpath(file, path.parent)).as_posix()
+    return name if name.replace("-", "").isalnum() else json.dumps(name, ensure_ascii=False)

@@ -7,7 +7,7 @@ A new folder takes its name when it is complete, so a driver that is killed leav
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -30,9 +30,8 @@ from loopcal.studies.files.store import (
     read_store,
     refuse_network,
 )
-from loopcal.studies.specification.changes import list_conflicts
-from loopcal.studies.specification.keys import NUMERICS
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import NUMERICS, Study, list_conflicts
+from loopcal.typing import Progress, report_no_progress
 
 STUDY_FILE = "study.yaml"
 """Name of the study file in the folder."""
@@ -205,3 +204,42 @@ def _list_files(source: StudySource) -> Iterator[tuple[str, Path]]:
         is_inside = not Path(name).is_absolute() and ".." not in Path(name).parts
         if is_inside and path.is_file() and name not in (STUDY_FILE, NAME):
             yield name, path
+
+
+# --- Join the folders of jobs that each computed a share of one study.
+
+
+def merge_studies(
+    part_folders: Sequence[Path], folder: Path, progress: Progress = report_no_progress
+) -> int:
+    """Copy the blocks of several folders of one study into one folder, and return how many are new.
+
+    Parameters
+    ----------
+    part_folders : folders of jobs, complete or not. folder : to make, or one of the same study.
+
+    Raises
+    ------
+    FileError : a part is of another study or damaged, or a folder cannot be used.
+    """
+    studies = [read_study(part) for part in part_folders]
+    first, largest = max(enumerate(studies), key=lambda item: item[1].replicates)
+    for part, study in zip(part_folders, studies, strict=True):
+        if changes := list_conflicts(study.to_json(), largest.to_json()):
+            code = "store.part-of-other-study"
+            raise FileError(
+                report_finding(code, other=str(part_folders[first]), changes=changes), part
+            )
+    for part in part_folders:
+        with read_store(part) as other:
+            other.check_pages()
+    file = part_folders[0] / STUDY_FILE
+    source = StudySource(largest, file if file.is_file() else None)
+    count = 0
+    with open_study(folder, source, resume=True) as store:
+        for i, part in enumerate(part_folders):
+            progress(i, len(part_folders), "joining folders")
+            with read_store(part) as other:
+                for cell in load_specification(other).cells:
+                    count += store.copy_blocks(other, cell.levels)
+    return count

@@ -11,11 +11,10 @@ from typing import Any
 
 from loopcal.errors import DataError
 from loopcal.io.core.text_file import replace_file
-from loopcal.studies.execution.optional_packages import import_optional
+from loopcal.studies.execution.executors import import_optional
 from loopcal.studies.files.store import StudyStore
 from loopcal.studies.results.study_result import iterate_trials
-from loopcal.studies.specification.cells import Cell, list_factors
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import Cell, Study, list_factors
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 TRIAL = "trial"

@@ -12,20 +12,34 @@ therefore wrong in at most 5 % of studies. A trial that failed is a machine that
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from loopcal.findings import report_finding
+from loopcal.findings.catalog import find_entry
+from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import write_bytes, write_text
+from loopcal.report.tables import ABSENT, Block, Column, Table, format_number, word_column
 from loopcal.studies.files.store import StudyStore
-from loopcal.studies.results.study_result import find_columns, iterate_trials
-from loopcal.studies.results.summary import LEVEL, Interval, compute_binomial_interval
-from loopcal.studies.specification.cells import Cell, list_varied_factors
-from loopcal.studies.specification.level_chains import LevelChain, list_chains
-from loopcal.studies.specification.levels import Question
+from loopcal.studies.results.study_result import (
+    LEVEL,
+    CellSummary,
+    Interval,
+    StudySummary,
+    compute_binomial_interval,
+    find_columns,
+    iterate_trials,
+)
+from loopcal.studies.specification.levels import LevelChain, Question, list_chains
 from loopcal.studies.specification.scores import check_question
-from loopcal.studies.specification.study import Study
+from loopcal.studies.specification.study import Cell, Study, list_factors, list_varied_factors
+from loopcal.units import Unit, find_unit
 
 Certainty = Literal["certain", "between", "none", "unknown"]
 
@@ -91,8 +105,6 @@ class AnsweredQuestion:
 
     def __str__(self) -> str:
         """Return the question, and one line for each answer with the shares that decide it."""
-        from loopcal.studies.results.question_view import describe_answers
-
         return describe_answers(self)
 
 
@@ -221,3 +233,295 @@ def _count_reached(
         defined += int((~np.isnan(values)).sum())
         trials, converged = trials + len(scores), converged + len(values)
     return (0, 0) if converged and not defined else (reached, trials)
+
+
+# --- Answers of a study as sentences and tables.
+
+NOTE = (
+    "Shares of the simulated machines within the limit; failed trials count as outside. The "
+    "intervals of one row hold together with 95 % probability. Levels between those of the study "
+    "were not simulated."
+)
+
+EXTEND = "More machines decide an answer that is not certain (loopcal study extend)."
+
+SHOWN_UNITS = {"m": "um", "rad": "urad", "1": ""}
+"""SI symbol of a score -> unit of its limit on the screen."""
+
+
+def view_answers(answered: Sequence[AnsweredQuestion]) -> list[Block]:
+    """Return the page of answered questions; empty without any."""
+    page: list[Block] = []
+    for item in answered:
+        page += [state_question(item), tabulate_answers(item), ""]
+    if any(answer.certainty == "between" for item in answered for answer in item.answers):
+        return [*page, f"{NOTE} {EXTEND}"]
+    return [*page, NOTE] if page else []
+
+
+def state_question(answered: AnsweredQuestion) -> str:
+    """Return a question as a heading."""
+    question = answered.question
+    symbol = SHOWN_UNITS[answered.score_unit]
+    number = answered.limit / (find_unit(symbol).factor_to_si if symbol else 1.0)
+    limit = f"{number:.6g} {symbol}".strip()
+    name = f"{answered.name}: " if answered.name else ""
+    score = question.score.replace("_", " ")
+    return (
+        f"{name}{question.wanted} level of {question.factor} with {score} up to {limit} on "
+        f"{_percent(question.share)} % of machines"
+    )
+
+
+def describe_answers(answered: AnsweredQuestion) -> str:
+    """Return a question as text, and one line for each answer with the shares that decide it."""
+    lines = [f"{state_question(answered)}:"]
+    for answer in answered.answers:
+        levels = [f"{factor} {level}" for factor, level in answer.levels.items()]
+        named = ", ".join([*levels, *([answer.chain] if answer.chain else [])])
+        said = say_answer(answer, answered.question.wanted)
+        shares = "; ".join(_say_share(share) for share in list_deciding_shares(answer))
+        lines.append(f"  {named}: {said} ({shares})" if named else f"  {said} ({shares})")
+    return "\n".join(lines)
+
+
+def tabulate_answers(answered: AnsweredQuestion) -> Table:
+    """Return a row for each combination of the other factors: the answer, and the shares that
+    decide it.
+    """
+    first = answered.answers[0]
+    others = list(first.levels)
+    has_chains = any(answer.chain for answer in answered.answers)
+    columns = [word_column(factor, wraps=True) for factor in others]
+    columns += [word_column(answered.question.factor, wraps=True)] if has_chains else []
+    columns += [word_column("answer", wraps=True), word_column("shares", wraps=True)]
+    rows = tuple(
+        (
+            *(answer.levels[factor] for factor in others),
+            *([answer.chain] if has_chains else []),
+            say_answer(answer, answered.question.wanted),
+            "; ".join(_say_share(share) for share in list_deciding_shares(answer)),
+        )
+        for answer in answered.answers
+    )
+    return Table("", tuple(columns), rows)
+
+
+def say_answer(answer: Answer, wanted: str) -> str:
+    """Return the answer in words, such as `20`, `not certain: 20 or 40`, or `no level`."""
+    names = answer.candidates
+    first = answer.shares[0 if wanted == "smallest" else -1].level
+    if answer.certainty == "unknown":
+        return "no trials with this score"
+    if answer.certainty == "none":
+        return "no level"
+    if answer.certainty == "certain":
+        return f"{names[0]}, the {wanted} of the study" if names[0] == first else names[0]
+    if not answer.may_be_none:
+        return (
+            f"not certain: {' or '.join(names)}"
+            if len(names) < 3
+            else (f"not certain: between {names[0]} and {names[-1]}")
+        )
+    return (
+        f"not certain: {' or '.join(names)}, or no level"
+        if len(names) < 3
+        else (f"not certain: one from {names[0]} to {names[-1]}, or no level")
+    )
+
+
+def list_deciding_shares(answer: Answer) -> list[LevelShare]:
+    """Return the shares of the candidates, and of the levels beside them; of all where there are
+    no candidates.
+    """
+    chosen = {share.level for share in answer.shares if share.level in answer.candidates}
+    if not chosen:
+        return list(answer.shares)
+    for level, next_level in pairwise(share.level for share in answer.shares):
+        if (level in answer.candidates) != (next_level in answer.candidates):
+            chosen |= {level, next_level}
+    return [share for share in answer.shares if share.level in chosen]
+
+
+def _say_share(share: LevelShare) -> str:
+    interval = share.share
+    if not share.trials:
+        return f"{share.level}: no trials"
+    low, high = _percent(interval.low), _percent(interval.high)
+    return f"{share.level}: {_percent(interval.value)} % ({low} to {high})"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.3g}"
+
+
+# --- Tables of a summary: for the screen, and with every factor as a column for files.
+
+JSON, CSV = "summary.json", "summary.csv"
+"""Files of a summary in the folder of its study."""
+
+NO_FIGURES: Mapping[str, bytes] = {}
+
+SUMMARY_NOTE = (
+    "Medians of the converged trials, and their 95 % intervals by the number of trials. Shares of "
+    "coverage should be 0.95."
+)
+FRAMES = {
+    "fitted": "Pose errors are stated without motions of frames that the measurements do not fix.",
+    "base": "Pose errors are in the base frame.",
+    "both": "Pose errors are stated without motions of frames that the measurements do not fix; "
+    "those whose names contain 'base' are in the base frame.",
+}
+"""Frame of the scores of a study -> what the page says about it."""
+
+SHOWN = ("position", "orientation", "position_base", "covered_parameters")
+"""Scores of the table on the screen by default."""
+
+UNITS = {"m": find_unit("mm"), "rad": find_unit("mrad"), "1": find_unit("1")}
+"""SI symbol -> unit on the screen."""
+
+
+def list_shown(study: Study, summary: StudySummary, names: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the scores to show: those with these names, or `SHOWN` as far as they differ from 0.
+
+    Raises
+    ------
+    DataError : a score that the study does not have.
+    """
+    find_columns(study, names)
+    return tuple(names or (name for name in SHOWN if _is_shown(summary, name)))
+
+
+def view_summary(study: Study, summary: StudySummary, shown: Sequence[str]) -> list[Block]:
+    """Return the page of a summary with the named scores."""
+    total = study.replicates * len(study.cells)
+    state = "" if summary.is_complete else f" (of {total}; the study is not complete)"
+    plural = "s" if len(study.cells) > 1 else ""
+    page: list[Block] = [
+        f"{study.title}: {len(study.cells)} cell{plural}, {summary.trials} trials{state}",
+        f"{SUMMARY_NOTE} {FRAMES[study.scores.frame]}",
+        tabulate_medians(study, summary, shown),
+    ]
+    counts: dict[str, int] = {}
+    for cell in summary.cells:
+        for code, count in cell.failed.items():
+            counts[code] = counts.get(code, 0) + count
+    return [*page, *explain_failures(counts, summary.trials)]
+
+
+def explain_failures(counts: Mapping[str, int], trials: int) -> list[Block]:
+    """Return a line for each code of failed trials (code -> trials): what it means, what to do."""
+    return [
+        f"Failed trials: {count} of {trials}. {report_finding(code)} {find_entry(code).action}"
+        for code, count in counts.items()
+    ]
+
+
+def build_document(
+    summary: StudySummary, answered: Sequence[AnsweredQuestion]
+) -> dict[str, object]:
+    """Return the content of summary.json."""
+    return {**vars(summary), "questions": list(answered)}
+
+
+def write_summary(
+    folder: Path,
+    study: Study,
+    summary: StudySummary,
+    answered: Sequence[AnsweredQuestion] = (),
+    figures: Mapping[str, bytes] = NO_FIGURES,
+) -> None:
+    """Write summary.json, with the answered questions, summary.csv, and figures (name -> content)
+    into the folder of a study.
+    """
+    table = tabulate_all(study, summary)
+    text = to_json(build_document(summary, answered))
+    write_text(folder / JSON, text)
+    write_text(folder / CSV, table.to_csv())
+    for name, content in figures.items():
+        write_bytes(folder / name, content)
+
+
+def tabulate_medians(study: Study, summary: StudySummary, names: Sequence[str]) -> Table:
+    """Return a table of the varied factors, and of the medians or mean shares of some scores."""
+    factors = list_varied_factors(study) or list_factors(study)[:1]
+    units = {column.name: UNITS[column.unit] for column in study.columns}
+    columns = [word_column(factor, wraps=True) for factor in factors]
+    columns += [Column("trials"), Column("failed")]
+    columns += [
+        Column(name.replace("_", " "), "" if units[name].symbol == "1" else units[name].symbol)
+        for name in names
+    ]
+    rows = tuple(
+        (
+            *(cell.levels[factor] for factor in factors),
+            str(cell.trials),
+            str(sum(cell.failed.values())),
+            *(_format_score(cell, name, units[name]) for name in names),
+        )
+        for cell in summary.cells
+    )
+    return Table("", tuple(columns), rows)
+
+
+def tabulate_all(study: Study, summary: StudySummary) -> Table:
+    """Return a table of all factors and all scores in SI, with intervals, for programs."""
+    factors = list_factors(study)
+    columns = [word_column(factor) for factor in factors]
+    columns += [Column(name) for name in ("trials", "failed", "converged")]
+    suffixes = ("", " low", " high")
+    names = [c for c in study.columns[1:] if any(x.find_score(c.name) for x in summary.cells)]
+    kinds = ("median", "high", "mean")
+    present = [
+        (c, kind)
+        for c in names
+        for kind in kinds
+        if any(getattr(x.find_score(c.name), kind, None) for x in summary.cells)
+    ]
+    words = {"median": " median", "high": " 95 %", "mean": " mean"}
+    columns += [
+        Column(f"{c.name}{words[kind]}{suffix}", "" if c.unit == "1" else c.unit)
+        for c, kind in present
+        for suffix in suffixes
+    ]
+    rows = []
+    for cell in summary.cells:
+        row = [*(cell.levels[factor] for factor in factors), str(cell.trials)]
+        row += [str(sum(cell.failed.values())), _write(cell.converged.value)]
+        for c, kind in present:
+            interval = getattr(cell.find_score(c.name), kind, None)
+            ends = (
+                (math.nan,) * 3
+                if interval is None
+                else (interval.value, interval.low, interval.high)
+            )
+            row += [_write(end) for end in ends]
+        rows.append(tuple(row))
+    return Table("", tuple(columns), tuple(rows))
+
+
+def _is_shown(summary: StudySummary, name: str) -> bool:
+    """Return whether a score is more than rounding in some cell."""
+    scores = [score for cell in summary.cells if (score := cell.find_score(name))]
+    return any(score.median is None or score.median.value > 1e-12 for score in scores)
+
+
+def _format_score(cell: CellSummary, name: str, unit: Unit) -> str:
+    """Return `value (low to high)` of a cell."""
+    score = cell.find_score(name)
+    interval = None if score is None else score.median or score.mean
+    return ABSENT if interval is None else format_interval(interval, unit)
+
+
+def format_interval(interval: Interval, unit: Unit) -> str:
+    """Return `value (low to high)` in a unit."""
+    value, low, high = (
+        format_number(number / unit.factor_to_si, 3)
+        for number in (interval.value, interval.low, interval.high)
+    )
+    return f"{value} ({low} to {high})"
+
+
+def _write(value: float) -> str:
+    """Return a number that a program reads back; nothing where it is not finite."""
+    return repr(float(value)) if math.isfinite(value) else ""

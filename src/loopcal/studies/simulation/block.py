@@ -4,26 +4,47 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.diagnose.error_frames import fit_frames
+from loopcal.errors import DataError
 from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.measure import BlockStream, Trials, make_random_stream, simulate_trials
-from loopcal.mechanism import Mechanism, Status, forward_trials
-from loopcal.studies.simulation.effects import make_disturbance
-from loopcal.studies.simulation.fits import NOT_REACHED, FittedTrials, fit_trials, is_reached
-from loopcal.studies.simulation.held_points import measure_held_points
-from loopcal.studies.simulation.instruments import hide_columns
-from loopcal.studies.simulation.machines import draw_machines
-from loopcal.studies.simulation.preparation import PreparedCell, prepare_cell
+from loopcal.estimate.options import FitOptions
+from loopcal.measure.instrument import BlockStream, make_random_stream
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.simulation import Trials, simulate_trials
+from loopcal.mechanism.kinematics import forward_trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.states import Status
+from loopcal.studies.simulation.fits import (
+    DIVERGED,
+    NOT_REACHED,
+    FittedTrials,
+    fit_trials,
+    is_reached,
+    state_times,
+)
+from loopcal.studies.simulation.machines import (
+    CellPoses,
+    compute_poses,
+    describe_poses,
+    draw_machines,
+    hide_columns,
+    measure_held_points,
+)
+from loopcal.studies.simulation.preparation import PreparedCell, make_disturbance, prepare_cell
+from loopcal.studies.specification.levels import MethodLevel
 from loopcal.studies.specification.scores import list_columns
-from loopcal.typing import FloatArray
+from loopcal.studies.specification.study import Study, compute_key, describe_block, format_json
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 HELD_OUT = 4
@@ -201,3 +222,230 @@ def _fit_motions(
         twists = frame_twists(places[i], robot.size) @ motion
         explained.append((geometry.transport_matrix(arm) @ twists)[..., 0])
     return np.stack(explained)
+
+
+# --- The work of a study, for any worker: the poses of a cell, and blocks of its trials.
+
+
+@dataclass(frozen=True)
+class PosesTask:
+    """Poses to draw or to plan. `content` : what determines them, as JSON. `key` : its hash."""
+
+    key: str
+    content: str
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """A block to compute.
+
+    Attributes
+    ----------
+    key : hash of everything that determines its numbers. cell : number of its cell.
+    block : number of the block in its cell. content : all that `compute_block` needs, as JSON.
+    """
+
+    key: str
+    cell: int
+    block: int
+    content: str
+
+
+@dataclass(frozen=True, eq=False)
+class BlockResult:
+    """The scores of the trials of a block.
+
+    Attributes
+    ----------
+    key : of its task. values : (B, s), columns as `Study.columns`, SI. Column 0 is the outcome: 0
+        for a trial that converged, else the number of a code in OUTCOMES. The other numbers of a
+        failed trial are NaN as far as they do not exist.
+    """
+
+    key: str
+    values: FloatArray
+
+
+def compute_block(task: BlockTask, threads: int = 1) -> BlockResult:
+    """Simulate and calibrate the machines of a block, and return their scores.
+
+    It is a pure function of `task.content`: the same numbers to the last bit in every process, for
+    every number of threads and workers.
+
+    Raises
+    ------
+    LoopcalError : the cell cannot be simulated at all, such as a kind that the robot does not have.
+    """
+    content: Mapping[str, Any] = json.loads(task.content)
+    return BlockResult(task.key, compute_scores(content, threads))
+
+
+def compute_task(task: BlockTask | PosesTask, threads: int = 1) -> BlockResult | CellPoses:
+    """Compute a block or poses; a pure function of the task, whatever the number of threads.
+
+    Raises
+    ------
+    LoopcalError : as `compute_block`.
+    """
+    if isinstance(task, PosesTask):
+        return compute_poses(json.loads(task.content))
+    return compute_block(task, threads)
+
+
+def make_poses_task(content: Mapping[str, Any]) -> PosesTask:
+    """Return the task of the poses of a block, from its description."""
+    description = describe_poses(content)
+    return PosesTask(compute_key(description), format_json(description))
+
+
+def make_block_task(key: str, cell: int, content: Mapping[str, Any], poses: CellPoses) -> BlockTask:
+    """Return the task of a block, from its description and its poses."""
+    complete = {**content, "measured": poses.measured, "held_out": poses.held_out}
+    return BlockTask(key, cell, content["block"], format_json(complete))
+
+
+def list_tasks(
+    study: Study, cells: Sequence[int] | None = None, blocks: Sequence[int] | None = None
+) -> Iterator[BlockTask]:
+    """Yield the tasks of these blocks of these cells, of all by default.
+
+    The poses of a cell are drawn or planned when its first task is made. The driver of a study
+    leaves them to workers instead, see `loopcal.studies.driver`.
+    """
+    for number in range(len(study.cells)) if cells is None else cells:
+        cell = study.cells[number]
+        poses: CellPoses | None = None
+        for block in range(study.blocks) if blocks is None else blocks:
+            content = describe_block(study, cell, block)
+            poses = compute_poses(describe_poses(content)) if poses is None else poses
+            yield make_block_task(compute_key(content), number, content, poses)
+
+
+# --- The calibrations of a cell in memory: the machines of `compute_block`, before they are
+# scored.
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedCell:
+    """t calibrated machines.
+
+    Attributes
+    ----------
+    levels : factor -> level. robot : nominal. readings : (n, a) [SI] of the controller.
+    truth, values : (t, p) [SI] true and estimated parameters; values are NaN where there are none.
+    measured : of each sensor (t, r, c) [SI]. outcome : (t,) numbers of OUTCOMES before held-out
+        poses are looked at. iterations : (t,).
+    """
+
+    levels: Mapping[str, str]
+    robot: Mechanism
+    readings: FloatArray
+    truth: FloatArray
+    values: FloatArray
+    measured: tuple[FloatArray, ...]
+    outcome: IntArray
+    iterations: IntArray
+
+    @property
+    def is_converged(self) -> BoolArray:
+        """(t,) which fits converged."""
+        return self.outcome == 0
+
+    @property
+    def is_diverged(self) -> BoolArray:
+        """(t,) which fits have no values because they diverged."""
+        return self.outcome == DIVERGED
+
+
+def calibrate_cells(study: Study, cells: Sequence[int] | None = None) -> Iterator[CalibratedCell]:
+    """Yield the calibrations of these cells, of all by default, one cell after the other."""
+    if not study.scores.verdict:  # held-out poses are not looked at
+        study = replace(study, scores=replace(study.scores, held_out=1, frame="base"))
+    for number, tasks in groupby(list_tasks(study, cells), lambda task: task.cell):
+        blocks = [calibrate_block(json.loads(task.content)) for task in tasks]
+        yield _join_blocks(study.cells[number].levels, blocks, study.replicates)
+
+
+def find_cells(study: Study, **levels: str) -> tuple[int, ...]:
+    """Return the numbers of the cells with these levels, factor=level."""
+    return tuple(
+        cell.number
+        for cell in study.cells
+        if all(cell.levels[factor] == level for factor, level in levels.items())
+    )
+
+
+def set_size(study: Study, seed: int, trials: int) -> Study:
+    """Return a study with another seed and so many trials in each cell; machine i of its first
+    block is the same for any number of trials.
+    """
+    return replace(study, seed=seed, replicates=trials, block=min(trials, study.block))
+
+
+def _join_blocks(
+    levels: Mapping[str, str], blocks: Sequence[CalibratedBlock], count: int
+) -> CalibratedCell:
+    """Return the first `count` trials of blocks."""
+    trials, fits = [block.trials for block in blocks], [block.fits for block in blocks]
+
+    def join(arrays: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate(arrays)[:count]
+
+    iterations = np.nan_to_num(join([f.iterations for f in fits]))
+    return CalibratedCell(
+        levels,
+        blocks[0].cell.robot,
+        trials[0].readings,
+        join([t.truth for t in trials]),
+        join([f.values for f in fits]),
+        tuple(join(measured) for measured in zip(*(t.measured for t in trials), strict=True)),
+        join([f.outcome for f in fits]),
+        iterations.astype(np.int64),
+    )
+
+
+# --- Repeat one trial of a study: its machine and its measurements, to the last bit.
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedTrial:
+    """A trial of a study.
+
+    Attributes
+    ----------
+    robot : nominal, with the tolerances of its cell. truth : the true machine.
+    data : its measurements. options : with which they are fitted. method : of its cell.
+    """
+
+    robot: Mechanism
+    truth: Mechanism
+    data: Measurements
+    options: FitOptions
+    method: MethodLevel
+
+
+def replay_trial(study: Study, cell: int, trial: int) -> ReplayedTrial:
+    """Return a trial of a cell; trials of a cell are numbered from 0, over all of its blocks.
+
+    Raises
+    ------
+    DataError : the study has no such cell or trial.
+    """
+    for name, number, count in (
+        ("cell", cell, len(study.cells)),
+        ("trial", trial, study.blocks * study.block),
+    ):
+        if not 0 <= number < count:
+            raise DataError(
+                f"this study has no {name} {number}; its {name}s are numbered from 0 to {count - 1}"
+            )
+    block, place = divmod(trial, study.block)
+    (task,) = list_tasks(study, [cell], blocks=[block])
+    content = json.loads(task.content)
+    prepared = prepare_cell(content)
+    trials = simulate_block(prepared, make_stream(prepared.seed, block))
+    data = state_times(trials.trial(place))
+    if prepared.scores.verdict:
+        data = prepared.hold_out(data)
+    truth = prepared.robot.with_values(trials.truth[place])
+    return ReplayedTrial(prepared.robot, truth, data, prepared.fit_options, prepared.method)

@@ -4,22 +4,59 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.estimate.losses import Huber, Loss, Tukey
+from loopcal.estimate.options import FitOptions
+from loopcal.estimate.penalties import (
+    GCV,
+    MAP,
+    LeastSquares,
+    Method,
+    Ridge,
+    TruncatedSVD,
+    TruncationGCV,
+)
+from loopcal.estimate.plane_line_products import Layout
+from loopcal.estimate.tolerance_components import InflatedTolerances
 from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.robot.robot_file import build_robot
-from loopcal.measure import Seed, sample_truth
-from loopcal.mechanism import Mechanism
+from loopcal.measure.instrument import Instrument, Seed, make_random_stream
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.nuisance import collect_nuisance_parameters
+from loopcal.measure.simulation import Trials, sample_truth
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.states import Status
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.parameters import ParameterTable
-from loopcal.studies.specification.levels import ErrorsLevel
+from loopcal.planning.constraints import PlanOptions
+from loopcal.planning.plane_line_planning import (
+    PlaneLineGroups,
+    find_line_axes,
+    improve_groups,
+    make_plane_line_instrument,
+)
+from loopcal.planning.pose_planning import plan
+from loopcal.studies.specification.levels import (
+    EffectsLevel,
+    ErrorsLevel,
+    InstrumentLevel,
+    MethodLevel,
+    NoiseLevel,
+    PosesLevel,
+    Scores,
+)
+from loopcal.studies.specification.study import read_record
 from loopcal.typing import FloatArray
 from loopcal.units import parse_quantity
+from loopcal.workflow.simulated_measurements import InstrumentDescription, build_instrument
 
 KEPT_ROBOTS = 8
 """Robots that a process keeps; building one takes as long as fitting a few of its machines."""
@@ -98,3 +135,255 @@ def resolve_patterns(table: ParameterTable, values: Mapping[str, str]) -> dict[s
             except UnitError as error:
                 raise DataError(f"{pattern!r} of {entry.name}: {error}") from None
     return resolved
+
+
+# --- The instrument of a cell.
+
+SURFACES = {"plane", "line"}
+"""Kinds of an instrument for points of planes and perpendicular lines."""
+
+
+def make_instrument(level: InstrumentLevel, noise: NoiseLevel) -> Instrument:
+    """Return the instrument of a level, with its sigmas times the factor of the noise.
+
+    Raises
+    ------
+    DataError : as `build_instrument`, or an unused column that it does not measure.
+    """
+    instrument = build_instrument(
+        InstrumentDescription(
+            kinds=level.kinds,
+            components=level.components,
+            orientation=level.orientation,
+            sigma_position=noise.factor * level.sigma_position,
+            sigma_angle=noise.factor * level.sigma_angle,
+            unknown_frames=level.unknown_frames,
+            distribution=level.distribution,
+        )
+    )
+    known = [name for sensor in instrument.sensors for name in list_column_names(sensor.kind)]
+    for name in level.unused:
+        if name not in known:
+            hint = suggest_names(name, known)
+            raise DataError(f"{name!r} is not measured{hint}; unused may name {', '.join(known)}")
+    if set(level.unused) >= set(known):
+        raise DataError("all measured columns are unused; leave at least one")
+    return instrument
+
+
+def place_instrument(
+    instrument: Instrument, robot: Mechanism, level: PosesLevel, coordinates: FloatArray
+) -> Instrument:
+    """Return an instrument at its poses (n, c): on the planes and lines of their groups, where the
+    level puts them there.
+
+    Raises
+    ------
+    DataError : points on planes and lines, and an instrument for something else.
+    """
+    if not level.is_on_surfaces:
+        return instrument
+    check_surfaces(instrument)
+    noise = {sensor.kind.name: sensor.noise for sensor in instrument.sensors}
+    axis = find_line_axes(robot, coordinates, level.groups)
+    points = np.arange(len(coordinates)).reshape(level.groups, -1)
+    return make_plane_line_instrument(robot, axis, points, lambda name, _: noise[name])
+
+
+def check_surfaces(instrument: Instrument) -> None:
+    """Raise DataError where an instrument does not touch planes and lines."""
+    kinds = [sensor.kind.name for sensor in instrument.sensors]
+    if set(kinds) != SURFACES:
+        raise DataError(
+            "points on planes and lines need an instrument of the kinds plane and line, not "
+            f"{', '.join(kinds)}; write 'kinds: [plane, line]'"
+        )
+
+
+def list_column_names(kind: Kind) -> list[str]:
+    """Return the names of the columns of a kind."""
+    return [column.name for column in kind.columns]
+
+
+def hide_columns(trials: Trials, unused: tuple[str, ...]) -> Trials:
+    """Return trials in which unused columns are not measured."""
+    if not unused:
+        return trials
+    measured = []
+    for sensor, values in zip(trials.instrument.sensors, trials.measured, strict=True):
+        is_hidden = np.array([name in unused for name in list_column_names(sensor.kind)])
+        measured.append(np.where(is_hidden, np.nan, values))
+    return replace(trials, measured=tuple(measured))
+
+
+# --- Points that an instrument holds on planes and perpendicular lines: the true machine moves
+# until its tool is there, so that all gaps are zero and the readings differ from machine to
+# machine.
+
+
+def make_layout(robot: Mechanism, coordinates: FloatArray, groups: int) -> Layout:
+    """Return the groups of points with controlled coordinates (n, c)."""
+    return Layout(robot, coordinates.reshape(groups, -1, coordinates.shape[1]))
+
+
+def measure_held_points(
+    layout: Layout, truth: FloatArray, instrument: Instrument, seed: Seed, is_exact: bool = False
+) -> Trials:
+    """Return the measurements of true machines (t, p) [SI] that are held.
+
+    Parameters
+    ----------
+    instrument : kinds plane and line at the points. The noise of the plane is that of each held
+        coordinate. is_exact : whether the points are held without noise.
+    """
+    n = layout.points
+    assigned = Instrument(tuple(sensor.assign_rows(n) for sensor in instrument.sensors))
+    (noise,) = {id(s.noise): s.noise for s in assigned.sensors if s.kind.name == "plane"}.values()
+    drawn = np.zeros((len(truth), n, 3))
+    if not is_exact:
+        streams = (make_random_stream(seed, trial) for trial in range(len(truth)))
+        drawn = np.stack([noise.draw(stream, 3 * n).reshape(n, 3) for stream in streams])
+    state, readings = layout.hold_points(truth, drawn)
+    gaps = [(len(truth), len(s.assigned_rows), len(s.noise.sigma)) for s in assigned.sensors]
+    labels = tuple(str(i + 1) for i in range(n))
+    return Trials(
+        assigned,
+        layout.robot.name,
+        layout.commanded_readings,
+        tuple(np.zeros(shape) for shape in gaps),
+        truth,
+        state.T,
+        state.status == Status.CONVERGED,
+        collect_nuisance_parameters(assigned.sensors, labels),
+        readings,
+    )
+
+
+def check_effects(effects: EffectsLevel) -> None:
+    """Raise DataError for effects that held points do not have."""
+    plain = EffectsLevel()
+    for name in ("drift", "jump", "thermal", "backlash"):
+        if getattr(effects, name) != getattr(plain, name):
+            raise DataError(
+                f"points that are held on planes and lines are simulated without {name}; remove it"
+            )
+
+
+# --- Measured and held-out poses of a cell, which are computed once and are part of its tasks.
+
+TOLERANCES = ("tolerance_factor", "tolerances")
+"""Settings of errors that change the tolerances, and with them planned poses."""
+
+SURFACE_SIGMA = 1e-3
+"""Noise for which points on surfaces are planned [m]; it does not change which are best."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellPoses:
+    """The poses of all blocks of a cell, and of all cells that have the same ones.
+
+    Attributes
+    ----------
+    measured, held_out : controlled coordinates [m, rad], a list for each pose.
+    """
+
+    measured: list[list[float]]
+    held_out: list[list[float]]
+
+
+def describe_poses(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return everything that determines the poses of a block, from its description.
+
+    Drawn poses depend on the machine only. Planned ones also depend on what is measured, and on the
+    tolerances.
+    """
+    level = read_record(PosesLevel, content["poses"])
+    description = {key: content[key] for key in ("robot", "poses", "seed")}
+    description["held_out"] = read_record(Scores, content["scores"]).held_out
+    if is_planned(level):
+        errors = content["errors"]
+        tolerances = {key: errors[key] for key in TOLERANCES if key in errors}
+        description |= {key: content[key] for key in ("instrument", "noise")}
+        description["errors"] = tolerances
+    return description
+
+
+def compute_poses(description: Mapping[str, Any]) -> CellPoses:
+    """Return the poses of a description: given ones, drawn from the workspace, or planned."""
+    level, seed = read_record(PosesLevel, description["poses"]), description["seed"]
+    robot = build_robot_of(description["robot"])
+    held_out = sample_workspace(robot.nominal, description["held_out"], seed + 1).coordinates
+    chosen_seed = seed if level.seed is None else level.seed
+    stream = choose_stream(chosen_seed, seed + 1)
+    if level.coordinates:
+        measured = np.array(level.coordinates)
+    elif level.is_on_surfaces:
+        measured = plan_plane_line_points(robot.nominal, level, stream)
+    elif not is_planned(level):
+        measured = sample_workspace(robot.nominal, level.count, stream).coordinates
+    else:
+        errors = read_record(ErrorsLevel, description["errors"])
+        instrument = make_instrument(
+            read_record(InstrumentLevel, description["instrument"]),
+            read_record(NoiseLevel, description["noise"]),
+        )
+        options = PlanOptions(n_poses=level.count, hold_out=0, seed=chosen_seed)
+        chosen = plan(change_tolerances(robot, errors).nominal, instrument, options=options)
+        measured = chosen.poses.coordinates
+    return CellPoses(measured.tolist(), held_out.tolist())
+
+
+def choose_stream(seed: int, held_out: int) -> int | np.random.Generator:
+    """Return the seed of drawn poses, or another stream in place of the seed of the held-out poses:
+    with the same one, the measured poses would be the held-out ones.
+    """
+    if seed != held_out:
+        return seed
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+
+
+def plan_plane_line_points(
+    robot: Mechanism, level: PosesLevel, seed: int | np.random.Generator
+) -> FloatArray:
+    """Return coordinates (n, c) of points on planes and perpendicular lines; cells that differ in
+    tolerances, noise or method have the same points.
+    """
+    points = level.count // level.groups
+    planned = PlaneLineGroups(robot, points, SURFACE_SIGMA, (level.axis,))
+    drawn, equations = planned.draw(level.groups, seed), level.groups * (points - 2)
+    is_complete = equations >= len(planned.free)
+    design = improve_groups(planned, drawn, level.sweeps, is_complete).design
+    return planned.place_points(design).reshape(level.count, -1)
+
+
+def is_planned(level: PosesLevel) -> bool:
+    """Return whether the poses of a level are planned, which takes as long as many trials."""
+    return level.choice == "planned" and not level.coordinates
+
+
+# --- The estimation method of a cell.
+
+
+def make_method(level: MethodLevel) -> Method:
+    """Return the method of a level; the default is that of `identify`."""
+    if level.has_steps:  # fitted in published_fits.py
+        return LeastSquares()
+    if level.method == "map":
+        return MAP()
+    if level.method == "least-squares":
+        return LeastSquares()
+    if level.method == "ridge":
+        return Ridge(GCV() if level.lam is None else level.lam)
+    if level.method == "truncated-svd":
+        return TruncatedSVD(TruncationGCV() if level.keep is None else level.keep)
+    return MAP(InflatedTolerances())
+
+
+def make_loss(level: MethodLevel) -> Loss | None:
+    """Return the loss of a level."""
+    return {"none": None, "huber": Huber(), "tukey": Tukey()}[level.loss]
+
+
+def make_fit_options(level: MethodLevel) -> FitOptions:
+    """Return the options of a fit."""
+    return FitOptions(method=make_method(level), loss=make_loss(level), noise=level.noise)

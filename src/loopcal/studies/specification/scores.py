@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, UnitError, suggest_names
-from loopcal.studies.specification.level_chains import list_chains
-from loopcal.studies.specification.levels import FACTORS, Question, Scores
+from loopcal.studies.specification.levels import FACTORS, Question, Scores, list_chains
 from loopcal.units import SI_SYMBOLS, Dimension, find_unit, parse_quantity
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.formats.delta_printers import klipper
-from loopcal.io.formats.delta_printers.klipper import read_config
+from loopcal.io.formats import klipper
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.klipper import read_config
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 
 SHORT = """\

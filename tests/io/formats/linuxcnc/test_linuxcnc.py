@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from loopcal import geometry as rigid
-from loopcal.diagnose import list_parameter_sets
+from loopcal.diagnose.cross_validation import list_parameter_sets
 from loopcal.errors import DataError, FileError
-from loopcal.io import load_robot
+from loopcal.io.formats import linuxcnc as hal_file
 from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.linuxcnc import hal_file
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from loopcal.io.robot import robot_file
-from loopcal.mechanism import Mechanism, inverse
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import inverse
 
 PINS = {
     "base": "base",

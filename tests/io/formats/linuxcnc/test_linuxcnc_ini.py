@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.cli import main
+from loopcal.cli.entry_point import main
 from loopcal.errors import DataError, FileError
-from loopcal.io import load_robot
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import ExportSource
+from loopcal.io.robot.robot_file import load_robot
 
 ADDED = [0.0123456789, -0.02, 0.0, 0.031, -0.04, 0.05]
 """Identified minus nominal length of each strut [mm]."""

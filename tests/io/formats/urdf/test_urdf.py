@@ -13,8 +13,9 @@ from loopcal.io.formats.program_format import ExportSource, Imported, ImportOpti
 from loopcal.io.formats.urdf import tree as urdf_tree
 from loopcal.io.formats.urdf import urdf_format as urdf
 from loopcal.io.formats.urdf.closures import read_mechanism
-from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.mechanism.joint_graph import find_stage_paths
+from loopcal.mechanism.joint_graph.paths import find_stage_paths
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
 from tests.io.formats.urdf.urdf_machines import UrdfSolver
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"

@@ -10,7 +10,8 @@ from loopcal.errors import FileError, LoopcalError
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.io.formats.urdf import urdf_format as urdf
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import forward, inverse
 from tests.io.formats.urdf.urdf_machines import UrdfSolver, make_hexapod, write_machine
 
 

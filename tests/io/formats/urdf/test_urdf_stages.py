@@ -9,13 +9,16 @@ import pytest
 from scipy.stats import chi2
 
 from loopcal.errors import LoopcalError
-from loopcal.estimate import identify
+from loopcal.estimate.identification import identify
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.io.formats.urdf import urdf_format as urdf
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.measure.instrument import Gaussian, Instrument, Sensor
+from loopcal.measure.kinds.poses import Pose
+from loopcal.measure.simulation import simulate
+from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.solutions import forward, inverse
 from tests.io.formats.urdf.urdf_chains import (
     make_digger,
     make_head_with_wrist,

@@ -23,19 +23,15 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError, MechanismError, suggest_names
 from loopcal.io.core.yaml_file import YamlFile, read_yaml, refuse_unknown_keys
-from loopcal.io.formats.urdf.elements import UrdfConstraint, UrdfJoint
-from loopcal.io.formats.urdf.tree import Urdf
-from loopcal.mechanism.joint_graph import (
-    Bodies,
+from loopcal.io.formats.urdf.tree import Urdf, UrdfConstraint, UrdfJoint
+from loopcal.mechanism.joint_graph.graph import (
     GraphJoint,
-    JointGraph,
-    Weld,
-    assemble_graph,
     find_perpendicular,
     list_axes_across,
     turn_between,
-    weld_bodies,
 )
+from loopcal.mechanism.joint_graph.loops import JointGraph
+from loopcal.mechanism.joint_graph.paths import Bodies, Weld, assemble_graph, weld_bodies
 from loopcal.plain_text import quote
 from loopcal.typing import FloatArray
 

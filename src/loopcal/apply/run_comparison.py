@@ -1,0 +1,705 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several calibrations side by side: parameters, changes of the machine, and held-out errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+
+from loopcal.apply.validation import report_reused_rows, validate
+from loopcal.diagnose.machine_changes import (
+    ChangeCause,
+    ParameterChanges,
+    compare_information,
+    estimate_cause,
+    explain_change,
+)
+from loopcal.diagnose.value_comparison import EQUAL, refuse_other_dimensions
+from loopcal.errors import DataError
+from loopcal.estimate.fit_linearization import FitUncertainty
+from loopcal.estimate.posterior import Posterior
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.fitted_rows import FittedRows
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import compute_single_level
+from loopcal.presentation import TableResult, draw
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import UNITS, Dimension, Unit, find_unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# --- What a comparison needs of a calibration, as `loopcal.Run` has it.
+
+
+class StoredRun(Protocol):
+    """A calibration that was read from its run folder; see `loopcal.Run`."""
+
+    @property
+    def path(self) -> Path:
+        """The run folder."""
+        ...
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """Content of result.json."""
+        ...
+
+    @property
+    def robot(self) -> Mechanism:
+        """The corrected robot."""
+        ...
+
+    @property
+    def initial_robot(self) -> Mechanism:
+        """The robot before the calibration."""
+        ...
+
+    @property
+    def nuisance_values(self) -> Mapping[str, float]:
+        """Estimates of setup parameters by name [SI]."""
+        ...
+
+    @property
+    def initial_nuisance_values(self) -> Mapping[str, float]:
+        """The same before the calibration."""
+        ...
+
+    @property
+    def arrays(self) -> Mapping[str, np.ndarray]:
+        """Content of arrays.npz."""
+        ...
+
+    @property
+    def failure(self) -> Finding | None:
+        """Why its numbers are not for a machine; None where they are."""
+        ...
+
+    @property
+    def fitted_rows(self) -> FittedRows | None:
+        """The rows that it was fitted to; None where they are not known."""
+        ...
+
+    def load_posterior(self) -> Posterior:
+        """Return estimates and uncertainties."""
+        ...
+
+    def load_uncertainty(self) -> FitUncertainty | None:
+        """Return what the fit knows of machine and setup parameters together."""
+        ...
+
+
+def find_row_noise(run: StoredRun) -> dict[str, FloatArray]:
+    """Return the standard deviation of the measured values of each kind [SI], from its residuals
+    and these divided by it.
+    """
+    result = {}
+    for name, raw in run.arrays.items():
+        if not name.startswith("residual_"):
+            continue
+        whitened = run.arrays.get(name.replace("residual_", "whitened_", 1))
+        if whitened is None or whitened.shape != raw.shape or raw.ndim != 2 or not len(raw):
+            continue
+        usable = np.isfinite(raw) & np.isfinite(whitened) & (whitened != 0.0)
+        ratio = np.abs(raw) / np.where(usable, np.abs(whitened), np.inf)
+        medians = [
+            float(np.median(column[mask])) if mask.any() else 0.0
+            for column, mask in zip(ratio.T, usable.T, strict=True)
+        ]
+        result[name.split("_", 2)[2]] = np.array(medians)
+    return result
+
+
+def list_data_digests(run: StoredRun) -> tuple[str, ...]:
+    """Return the SHA-256 of the measurement files of a run."""
+    files = run.result.get("made_by", {}).get("inputs", {})
+    roles = ("data", "poses")
+    return tuple(sorted(f["sha256"] for r, f in files.items() if r.partition("-")[0] in roles))
+
+
+# --- Refuse calibrations whose numbers cannot be compared, and say why.
+
+NEEDED = ("path", "result", "robot", "arrays", "load_posterior")
+"""Attributes by which an argument is recognized as a run."""
+
+
+def check_runs(runs: Sequence[StoredRun]) -> None:
+    """Refuse too few runs, the same one twice, and what is no run.
+
+    Raises
+    ------
+    DataError : `runs.too-few`, `runs.given-twice` or `runs.no-calibration`.
+    """
+    is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
+    if not is_list or not all(hasattr(run, name) for run in runs for name in NEEDED):
+        raise DataError("runs: give a list of runs, such as [load_run('may'), load_run('june')]")
+    if len(runs) < 2:
+        raise DataError(report_finding("runs.too-few", count=len(runs)))
+    known = set()
+    for run in runs:
+        place = run.path.resolve()
+        if place in known:
+            raise DataError(report_finding("runs.given-twice", run=str(run.path)))
+        known.add(place)
+        if not run.result.get("fit", {}).get("parameters"):
+            raise DataError(report_finding("runs.no-calibration", run=str(run.path)))
+
+
+def refuse_incomparable(
+    first: StoredRun, second: StoredRun, names: tuple[str, str], is_same_data: bool
+) -> None:
+    """Refuse two runs whose parameters do not mean the same.
+
+    Parameters
+    ----------
+    names : of both runs. is_same_data : whether both were fitted to the same rows; then they may
+        identify different parameters, because only methods and models are compared.
+
+    Raises
+    ------
+    DataError : `runs.other-...`; EstimationError : `comparison.other-dimensions`.
+    """
+    words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
+    mine, theirs = first.robot, second.robot
+    if name := _find_lonely(mine.parameters.names, theirs.parameters.names):
+        place = names[0] if name in mine.parameters.names else names[1]
+        raise DataError(report_finding("runs.other-parameters", **words, name=name, place=place))
+    for what, first_text, second_text in _list_structure(mine, theirs):
+        if first_text != second_text:
+            data: dict[str, Any] = {"what": what, "mine": first_text, "theirs": second_text}
+            raise DataError(report_finding("runs.other-mechanism", **words, **data))
+    free = [list_free(run) for run in (first, second)]
+    if not is_same_data and (name := _find_lonely(*free)):
+        place = names[0] if name in free[0] else names[1]
+        raise DataError(report_finding("runs.other-free", **words, name=name, place=place))
+    for i, name in enumerate(mine.parameters.names):
+        if name in free[0] or name in free[1]:
+            continue
+        dimension = mine.parameters.dimensions[i]
+        size = mine.size if dimension is Dimension.LENGTH else 1.0
+        values = [float(robot.values[i]) for robot in (mine, theirs)]
+        if abs(values[0] - values[1]) > EQUAL * size:
+            shown = [mine.to_quantity(value, dimension) for value in values]
+            data = {"name": name, "mine": shown[0], "theirs": shown[1]}
+            raise DataError(report_finding("runs.other-fixed-value", **words, **data))
+    refuse_other_dimensions(mine, theirs, names)
+
+
+def _find_lonely(first: Sequence[str], second: Sequence[str]) -> str:
+    """Return the first name that only one of two lists has; empty without any."""
+    different = [n for n in (*first, *second) if (n in first) != (n in second)]
+    return different[0] if different else ""
+
+
+def list_free(run: StoredRun) -> tuple[str, ...]:
+    """Return the names of the parameters that a run identified."""
+    return tuple(row["name"] for row in run.result["fit"]["parameters"])
+
+
+def _list_structure(first: Mechanism, second: Mechanism) -> list[tuple[str, str, str]]:
+    """Return what must be equal, in words, and its text in both robots."""
+    table = second.parameters
+    theirs = [table.dimensions[table.index(name)] for name in first.parameters.names]
+    pairs = zip(first.parameters.names, first.parameters.dimensions, theirs, strict=True)
+    return [
+        ("actuators", _name_actuators(first), _name_actuators(second)),
+        ("controlled coordinates", ", ".join(first.controlled), ", ".join(second.controlled)),
+        *((f"physical dimensions of {n}", a.value, b.value) for n, a, b in pairs),
+    ]
+
+
+def _name_actuators(robot: Mechanism) -> str:
+    """Return the actuators with their physical dimensions."""
+    return ", ".join(f"{a.name} ({a.dimension.value})" for a in robot.actuators)
+
+
+# --- The errors of several calibrations at the same held-out poses.
+
+QUANTITIES = ("position", "orientation", "length")
+"""Quantities whose errors are compared."""
+
+
+@dataclass(frozen=True)
+class QuantityErrors:
+    """Errors of a quantity after calibration [SI]: root mean square and largest of `count`."""
+
+    rms: float
+    largest: float
+    count: int
+
+
+@dataclass(frozen=True)
+class RunErrors:
+    """Errors of a run by quantity.
+
+    Attributes
+    ----------
+    run : name. own : at the held-out poses of the run itself, which other runs do not share.
+    common : at the poses that are common to all runs; empty where there are none.
+    """
+
+    run: str
+    own: Mapping[str, QuantityErrors]
+    common: Mapping[str, QuantityErrors]
+
+
+def collect_errors(
+    runs: Sequence[StoredRun], names: Sequence[str], data: Measurements | None
+) -> tuple[tuple[RunErrors, ...], int, tuple[Finding, ...]]:
+    """Return the errors of each run, the number of common poses, and findings.
+
+    Parameters
+    ----------
+    data : other measurements, at which all runs are validated; without it the common poses are
+        those that all runs of one data set held out.
+    """
+    own = [_read_errors(run, None) for run in runs]
+    if data is not None:
+        results = [_validate(run, data) for run in runs]
+        common = [errors for errors, _ in results]
+        found_rows = [finding for _, findings in results for finding in findings]
+        errors = zip(names, own, common, strict=True)
+        return tuple(RunErrors(*fields) for fields in errors), data.n_poses, tuple(found_rows)
+    poses = _find_common_poses(runs)
+    common = [_read_errors(run, poses) if poses else {} for run in runs]
+    errors = zip(names, own, common, strict=True)
+    return tuple(RunErrors(*fields) for fields in errors), len(poses), ()
+
+
+def _validate(
+    run: StoredRun, data: Measurements
+) -> tuple[dict[str, QuantityErrors], list[Finding]]:
+    """Return the errors of a run at other measurements."""
+    reused = report_reused_rows(run.fitted_rows, data)
+    validation = validate(
+        run.robot,
+        data,
+        before=run.initial_robot,
+        nuisance_values=run.nuisance_values,
+        nuisance_values_before=run.initial_nuisance_values,
+        uncertainty=run.load_uncertainty(),
+    )
+    errors = {
+        name: QuantityErrors(e.statistics.rms, e.statistics.max, e.statistics.count)
+        for name, e in validation.after.quantities.items()
+    }
+    return errors, [] if reused is None else [reused]
+
+
+def _find_common_poses(runs: Sequence[StoredRun]) -> tuple[str, ...]:
+    """Return the poses that all runs of the same files held out: names of poses of different files
+    do not mean the same.
+    """
+    digests = [list_data_digests(run) for run in runs]
+    if not digests[0] or any(run_digests != digests[0] for run_digests in digests):
+        return ()
+    held_out = [((run.result.get("split") or {}).get("held_out") or ()) for run in runs]
+    return tuple(label for label in held_out[0] if all(label in others for others in held_out))
+
+
+def _read_errors(run: StoredRun, poses: Sequence[str] | None) -> dict[str, QuantityErrors]:
+    """Return the stored errors at some of the held-out poses; at all of them where None."""
+    validation = run.result.get("validation") or {}
+    labels = validation.get("poses", ())
+    result = {}
+    for name in QUANTITIES:
+        stored = (validation.get("after") or {}).get(name)
+        if not stored or len(stored["errors"]) != len(labels):
+            continue
+        chosen = [
+            error
+            for label, error in zip(labels, stored["errors"], strict=True)
+            if error is not None and (poses is None or label in poses)
+        ]
+        if chosen:
+            sizes = np.abs(np.array(chosen, dtype=float))
+            rms = float(np.sqrt((sizes**2).mean()))
+            result[name] = QuantityErrors(rms, float(sizes.max()), len(sizes))
+    return result
+
+
+# --- Two calibrations: whether the machine has changed, and by what.
+
+CHANGE_LEVEL = 0.05
+"""Probability that any of the compared machines is declared changed although none is."""
+
+CAUSE_LEVEL = 0.01
+"""Probability of rejecting the true cause of a change."""
+
+TOO_WELL = 1e-3
+"""Probability of a chi-square as small as that of runs which share rows in another form."""
+
+COVERED = 1.96
+"""Standard deviations of the half-width of a 95 % interval of a change."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairComparison:
+    """A run against the first one.
+
+    Attributes
+    ----------
+    first, second : names of the runs.
+    data : "independent", "same", "shared" (some rows are common) or "unknown".
+    shared : number of common fitted rows.
+    shift, shift_sd : (p,) change of each parameter of `names` and its standard deviation, while all
+        others may have changed as well [SI]; NaN where the data do not determine it, or where
+        nothing is tested.
+    significant : (p,) which shifts are larger than the noise explains, at the level for all
+        parameters of all runs together.
+    chi_square, degrees, p_value : of the change in all directions that both data sets determine;
+        NaN and 0 where it is not tested.
+    moved : whether the machine has changed; None where it is not tested.
+    cause : what explains the change. cause_shift, cause_sd : change of its parameters [SI].
+    finding : the result with its code.
+    """
+
+    JSON_FIELDS: ClassVar[tuple[str, ...]] = (
+        "first",
+        "second",
+        "data",
+        "shared",
+        "names",
+        "shift",
+        "shift_sd",
+        "significant",
+        "chi_square",
+        "degrees",
+        "p_value",
+        "moved",
+        "cause",
+        "cause_shift",
+        "cause_sd",
+        "finding",
+    )
+
+    first: str
+    second: str
+    data: str
+    shared: int
+    names: tuple[str, ...]
+    shift: FloatArray
+    shift_sd: FloatArray
+    significant: BoolArray
+    chi_square: float
+    degrees: int
+    p_value: float
+    moved: bool | None
+    cause: ChangeCause
+    cause_shift: FloatArray
+    cause_sd: FloatArray
+    finding: Finding
+
+    def __repr__(self) -> str:
+        return f"<PairComparison: {self.finding}>"
+
+
+@dataclass(frozen=True)
+class DataRelation:
+    """How the fitted rows of two runs are related: `kind` as in `PairComparison.data`."""
+
+    kind: str
+    shared: int = 0
+    total: int = 0
+
+
+def relate_data(first: StoredRun, second: StoredRun) -> DataRelation:
+    """Return whether two runs were fitted to common rows."""
+    mine, theirs = first.fitted_rows, second.fitted_rows
+    if mine is None or theirs is None:
+        return DataRelation("unknown")
+    noise = {**find_row_noise(first), **find_row_noise(second)}
+    readings = len(first.robot.actuators)
+    shared = min(
+        rows.count_shared(other_rows, readings, noise)
+        for rows, other_rows in ((mine, theirs), (theirs, mine))
+    )
+    total = max(len(mine), len(theirs))
+    kind = "independent" if not shared else "same" if shared == total else "shared"
+    return DataRelation(kind, shared, total)
+
+
+def compare_pair(
+    first: StoredRun, second: StoredRun, names: tuple[str, str], relation: DataRelation, tests: int
+) -> PairComparison:
+    """Compare a run with the first one.
+
+    Parameters
+    ----------
+    names : of both runs. relation : of their data. tests : number of runs that are compared with
+        the first one.
+    """
+    words: dict[str, Any] = dict(zip(("first", "second"), names, strict=True))
+    if relation.kind == "same":
+        finding = report_finding("runs.same-data", **words, shared=relation.shared)
+        return _leave_open(first, names, relation, finding)
+    if relation.kind == "shared":
+        data: dict[str, Any] = {"shared": relation.shared, "total": relation.total}
+        finding = report_finding("runs.rows-shared", **words, **data)
+        return _leave_open(first, names, relation, finding)
+    for name, run in zip(names, (first, second), strict=True):
+        if reason := _find_obstacle(run):
+            finding = report_finding("runs.not-tested", **words, run=name, reason=reason)
+            return _leave_open(first, names, relation, finding)
+    posteriors = (first.load_posterior(), second.load_posterior())
+    changes = compare_information(*posteriors)
+    if not changes.degrees:
+        finding = report_finding("runs.not-tested", **words, run="", reason="nothing")
+        return _leave_open(first, names, relation, finding)
+    return _test(posteriors[0], changes, words, relation, tests)
+
+
+def _test(
+    earlier: Posterior,
+    changes: ParameterChanges,
+    words: Mapping[str, str],
+    relation: DataRelation,
+    tests: int,
+) -> PairComparison:
+    """Return the test of a change, and what explains it."""
+    level = compute_single_level(CHANGE_LEVEL, tests)
+    p_value = changes.compute_p_value(changes.chi_square, changes.degrees)
+    moved = p_value < level
+    cause, nothing = ChangeCause("none"), np.zeros(0)
+    cause_shift, cause_sd = nothing, nothing
+    numbers: dict[str, Any] = {"chi_square": changes.chi_square, "degrees": float(changes.degrees)}
+    if moved:
+        cause = explain_change(changes, CAUSE_LEVEL)
+        if cause.parameters:
+            cause_shift, cause_sd = estimate_cause(changes, cause)
+        more = _word_cause(earlier, cause, cause_shift, cause_sd)
+        judged = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL, **more}
+        finding = report_finding("runs.machine-changed", **words, **judged)
+    elif p_value > 1.0 - TOO_WELL:
+        judged = {**numbers, "probability": 1.0 - p_value}
+        finding = report_finding("runs.agree-too-well", **words, **judged)
+    else:
+        judged = {**numbers, "p_value": p_value, "level": CHANGE_LEVEL}
+        finding = report_finding("runs.machine-unchanged", **words, **judged)
+    shift, sd = changes.estimate_shifts()
+    single = compute_single_level(CHANGE_LEVEL, tests * int(np.isfinite(shift).sum()))
+    return PairComparison(
+        words["first"],
+        words["second"],
+        relation.kind,
+        relation.shared,
+        changes.names,
+        shift,
+        sd,
+        np.nan_to_num(changes.test_shifts(), nan=1.0) < single,
+        changes.chi_square,
+        changes.degrees,
+        p_value,
+        bool(moved),
+        cause,
+        cause_shift,
+        cause_sd,
+        finding,
+    )
+
+
+def _word_cause(
+    earlier: Posterior, cause: ChangeCause, shift: FloatArray, sd: FloatArray
+) -> dict[str, Any]:
+    """Return what a finding states of a cause."""
+    change = ""
+    if cause.kind == "parameter":
+        robot, name = earlier.robot, cause.names[0]
+        unit = robot.get_unit(robot.parameters.dimensions[robot.parameters.index(name)])
+        value, half = (float(x[0]) / unit.factor_to_si for x in (shift, COVERED * sd))
+        change = f"{value:+.3g} {unit.symbol} +/- {half:.2g} {unit.symbol}"
+    alternatives = tuple(" and ".join(names) for names in cause.alternatives)
+    return {
+        "kind": cause.kind,
+        "names": cause.names,
+        "change": change,
+        "alternatives": alternatives,
+    }
+
+
+def _find_obstacle(run: StoredRun) -> str:
+    """Return why a run cannot be tested, as in `runs.not-tested`; empty where it can."""
+    if run.fitted_rows is None or "information_rows" not in run.arrays:
+        return "older"
+    if run.result["fit"]["status"] != "converged":
+        return "diverged"
+    information = run.load_posterior().information
+    return "" if information is not None and information.variance > 0.0 else "intervals"
+
+
+def _leave_open(
+    run: StoredRun, names: tuple[str, str], relation: DataRelation, finding: Finding
+) -> PairComparison:
+    """Return a comparison without a test."""
+    free = tuple(row["name"] for row in run.result["fit"]["parameters"])
+    unknown = np.full(len(free), np.nan)
+    return PairComparison(
+        *names,
+        relation.kind,
+        relation.shared,
+        free,
+        unknown,
+        unknown,
+        np.zeros(len(free), dtype=bool),
+        float("nan"),
+        0,
+        float("nan"),
+        None,
+        ChangeCause("none"),
+        np.zeros(0),
+        np.zeros(0),
+        finding,
+    )
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """A run as one column of a comparison.
+
+    Attributes
+    ----------
+    name : of its folder. robot, method, verdict : as result.json states them.
+    estimates, plus_minus : parameter -> estimate and half-width of its 95 % interval [SI]; None
+        where there is no interval. A parameter that this run kept fixed is absent.
+    """
+
+    name: str
+    robot: str
+    method: str
+    verdict: str
+    estimates: dict[str, float]
+    plus_minus: dict[str, float | None]
+
+
+@dataclass(frozen=True, eq=False)
+class RunComparison(TableResult):
+    """Calibrations side by side; the first one is the reference of all others.
+
+    Attributes
+    ----------
+    runs : in the given order. parameters : names of all identified parameters.
+    units : of each parameter, in which it is shown.
+    pairs : each run but the first against the first.
+    errors : of each run at held-out poses. common_poses : number of poses that are common to all.
+    findings : results of the pairs, runs that failed, and notes.
+    """
+
+    runs: tuple[RunSummary, ...]
+    parameters: tuple[str, ...]
+    units: tuple[Unit, ...]
+    pairs: tuple[PairComparison, ...]
+    errors: tuple[RunErrors, ...]
+    common_poses: int
+    findings: tuple[Finding, ...]
+
+    @property
+    def moved(self) -> bool | None:
+        """Whether any machine differs from that of the first run; None where nothing was tested."""
+        answers = [pair.moved for pair in self.pairs if pair.moved is not None]
+        return any(answers) if answers else None
+
+    def plot(self) -> Figure:
+        """Draw the tested shift of each parameter from the first run, in standard deviations."""
+        return draw("result_figures.draw_run_shifts", self)
+
+    def __str__(self) -> str:
+        """Return the findings, one on each line."""
+        names = ", ".join(run.name for run in self.runs)
+        lines = [f"{f.severity.value}: {f}" for f in self.findings]
+        return "\n".join([f"Comparison of {names}:", *lines])
+
+    __repr__ = __str__
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result by name for JSON, SI; `units` are those in which people see it."""
+        return {
+            "runs": self.runs,
+            "parameters": self.parameters,
+            "units": [unit.symbol for unit in self.units],
+            "pairs": self.pairs,
+            "errors": self.errors,
+            "common_poses": self.common_poses,
+            "moved": self.moved,
+            "findings": self.findings,
+        }
+
+
+def compare_runs(runs: Sequence[StoredRun], data: Measurements | None = None) -> RunComparison:
+    """Compare calibrations side by side: sessions of one machine, several machines, or methods.
+
+    The first run is the reference. Where the data of two runs are independent, whether the machine
+    has changed is tested in the directions that both data sets determine, and what explains the
+    change is named. The false-alarm rate is 5 % for all runs together. Runs of the same rows are
+    compared without a test: their errors are correlated.
+
+    Parameters
+    ----------
+    runs : two or more, as from `load_run`.
+    data : other measurements, at which the errors of all runs are compared.
+
+    Raises
+    ------
+    DataError, EstimationError
+        Too few runs, one of them twice, or runs that cannot be compared: other parameters,
+        mechanisms, free parameters or fixed values.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> comparison = lc.compare_runs([lc.load_run("may"), lc.load_run("june")])  # doctest: +SKIP
+    >>> comparison.moved  # doctest: +SKIP
+    False
+    """
+    check_runs(runs)
+    names = _name_runs(runs)
+    first = runs[0]
+    findings, pairs = [], []
+    for name, run in zip(names[1:], runs[1:], strict=True):
+        relation = relate_data(first, run)
+        refuse_incomparable(first, run, (names[0], name), relation.kind == "same")
+        pairs.append(compare_pair(first, run, (names[0], name), relation, len(runs) - 1))
+        findings.append(pairs[-1].finding)
+    findings += [
+        report_finding("runs.failed-run", run=name)
+        for name, run in zip(names, runs, strict=True)
+        if run.failure is not None
+    ]
+    errors, poses, notes = collect_errors(runs, names, data)
+    findings += notes
+    if not poses and all(run_errors.own for run_errors in errors):
+        findings.append(report_finding("runs.no-common-poses"))
+    parameters = tuple(dict.fromkeys(n for run in runs for n in list_free(run)))
+    table = first.robot.parameters
+    dimensions = [table.dimensions[table.index(name)] for name in parameters]
+    units = tuple(find_unit(first.robot.get_unit(d).symbol) for d in dimensions)
+    summaries = tuple(_summarize(name, run) for name, run in zip(names, runs, strict=True))
+    return RunComparison(summaries, parameters, units, tuple(pairs), errors, poses, tuple(findings))
+
+
+def _name_runs(runs: Sequence[StoredRun]) -> tuple[str, ...]:
+    """Return the names of the folders, or their paths where a name is not unique."""
+    names = [run.path.resolve().name for run in runs]
+    return tuple(
+        str(run.path) if names.count(name) > 1 else name
+        for name, run in zip(names, runs, strict=True)
+    )
+
+
+def _summarize(name: str, run: StoredRun) -> RunSummary:
+    """Return the column of a run."""
+    fit = run.result["fit"]
+    estimates, plus_minus = {}, {}
+    for row in fit["parameters"]:
+        place = run.robot.parameters.index(row["name"])
+        unit, half = UNITS.get(row.get("unit", "")), row["plus_minus"]
+        estimates[row["name"]] = float(run.robot.values[place])
+        # runs of earlier versions may state no unit, and then no interval is known
+        plus_minus[row["name"]] = None if half is None or unit is None else half * unit.factor_to_si
+    verdict = str(run.result.get("verdict", "")).replace("_", " ")
+    return RunSummary(name, run.robot.name, fit.get("method", ""), verdict, estimates, plus_minus)

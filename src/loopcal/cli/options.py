@@ -1,0 +1,792 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.units import Dimension, parse_quantity
+
+if TYPE_CHECKING:
+    import numpy as np
+    from click.shell_completion import CompletionItem
+
+    from loopcal.diagnose.conventions.convention_check import ConventionCheck
+    from loopcal.estimate.options import FitOptions
+    from loopcal.estimate.tolerance_components import By
+    from loopcal.findings import Finding
+    from loopcal.measure.instrument import Instrument
+    from loopcal.measure.measurements import Measurements
+    from loopcal.mechanism.model import Mechanism
+    from loopcal.planning.constraints import Constraints
+    from loopcal.typing import FloatArray
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""Adds an option to the function of a command."""
+
+FILE = click.Path(path_type=Path)
+
+
+def complete_robot(
+    _context: click.Context, _argument: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the shipped robots that begin as a word; files where there is none."""
+    from click.shell_completion import CompletionItem
+
+    from loopcal.io.robot.robot_file import list_shipped_robots
+
+    names = [name for name in list_shipped_robots() if name.startswith(incomplete)]
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+robot_argument = click.argument("robot", metavar="ROBOT", shell_complete=complete_robot)
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
+)
+verbose_option = click.option(
+    "-v", "--verbose", is_flag=True, help="Print all findings and tables, not only the summary."
+)
+
+
+def _check_data(_context: click.Context, _argument: click.Parameter, paths: Any) -> Any:
+    """Refuse a YAML file, such as a robot file, in place of measurements."""
+    for path in paths if isinstance(paths, tuple) else () if paths is None else (paths,):
+        if path.suffix in (".yaml", ".yml"):
+            raise DataError(f"{path} is a YAML file; give a measurement file (CSV)")
+    return paths
+
+
+def data_argument(metavar: str, required: bool = True) -> Decorator:
+    """Return the argument of measurement files."""
+    kind = {"type": FILE, "nargs": -1, "required": required}
+    return click.argument("data", metavar=metavar, callback=_check_data, **kind)
+
+
+def data_option(name: str, help_text: str, **kind: Any) -> Decorator:
+    """Return an option that takes a measurement file."""
+    return click.option(
+        name, type=FILE, metavar="DATA", callback=_check_data, help=help_text, **kind
+    )
+
+
+class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
+    """A number with its unit on the command line, such as 0.02mm; its value is in SI.
+
+    Parameters
+    ----------
+    dimension : of the unit. is_positive : whether only numbers above 0 are allowed.
+    """
+
+    name = "quantity"
+
+    def __init__(self, dimension: Dimension, is_positive: bool = False) -> None:
+        self.dimension, self.is_positive = dimension, is_positive
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the SI value, or fail with what is allowed."""
+        if isinstance(value, float):
+            return value
+        try:
+            number = parse_quantity(value, self.dimension)
+        except UnitError as error:
+            self.fail(str(error), param, ctx)
+        if self.is_positive and not number > 0.0:
+            self.fail(f"{value!r} is not above 0; give a positive number", param, ctx)
+        return number
+
+
+class Count(click.IntRange):
+    """A whole number on the command line, up to a limit of `loopcal.io.core.limits`.
+
+    Parameters
+    ----------
+    limit : name of the `CountLimit`, which is not imported before the option is used.
+    least : smallest number that is allowed; None where the command itself refuses small ones.
+    """
+
+    def __init__(self, limit: str, least: int | None = None) -> None:
+        super().__init__(min=least)
+        self.limit = limit
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the number, or fail with what is allowed."""
+        from loopcal.io.core import limits
+
+        number, limit = super().convert(value, param, ctx), getattr(limits, self.limit)
+        if number > limit.most:
+            self.fail(f"the limit is {limit}; give a smaller number.", param, ctx)
+        return int(number)
+
+
+class PoseShare(click.types.FloatParamType):
+    """A share of the poses on the command line, from 0 to below 1."""
+
+    name = "share"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the share, or fail with what is allowed and what was probably meant."""
+        from loopcal.workflow.calibration_options import describe_wrong_share
+
+        try:
+            share = float(value)
+        except ValueError:
+            allowed = "a share of the poses is a number from 0 to below 1, such as 0.25 for 25 %"
+            self.fail(f"{value!r} is no number; {allowed}.", param, ctx)
+        if fault := describe_wrong_share(share):
+            self.fail(f"it is {fault}.", param, ctx)
+        return share
+
+
+LENGTH = Quantity(Dimension.LENGTH)
+ANGLE = Quantity(Dimension.ANGLE)
+POSITIVE_LENGTH = Quantity(Dimension.LENGTH, is_positive=True)
+POSITIVE_ANGLE = Quantity(Dimension.ANGLE, is_positive=True)
+
+
+def add_options(*options: Decorator) -> Decorator:
+    """Return a decorator that adds options to a command, in the order of its help."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def file_option(*names: str, **kind: Any) -> Decorator:
+    """Return an option that takes the path of a file or folder."""
+    return click.option(*names, type=FILE, **kind)
+
+
+def flag_option(*names: str, help: str) -> Decorator:  # noqa: A002
+    """Return an option without a value."""
+    return click.option(*names, is_flag=True, help=help)
+
+
+SHIPPED_PROFILES = ("faro", "leica", "spatial-analyzer")
+"""Profiles that come with loopcal."""
+
+
+def profile_option(help_text: str, *, required: bool = False) -> Decorator:
+    """Return the option for the profile of an export: a file, or the name of a shipped one."""
+    names = ", ".join(SHIPPED_PROFILES)
+    return click.option(
+        "--profile",
+        metavar="FILE|NAME",
+        required=required,
+        help=f"{help_text} A file (docs/exports.md), or one of {names}.",
+    )
+
+
+decimal_option = click.option(
+    "--decimal",
+    type=click.Choice(("point", "comma")),
+    help="Decimal mark of the export; with comma, semicolons separate columns in place of commas.  "
+    "[default: as the profile states]",
+)
+
+
+def force_option(what: str, more: str = "") -> Decorator:
+    """Return the option that lets a command replace what exists, and `more`."""
+    return flag_option(
+        "--force",
+        help=f"Replace {what} if {'they exist' if what.endswith('files') else 'it exists'}{more}.",
+    )
+
+
+def seed_option(what: str) -> Decorator:
+    """Return the option for the seed of something random."""
+    kind = click.IntRange(min=0)
+    return click.option("--seed", type=kind, default=1, metavar="N", help=f"Seed of {what}.")
+
+
+def format_option(names: Sequence[str], help_text: str) -> Decorator:
+    """Return the option for the format of a file of another program."""
+    return click.option("--format", "format_name", type=click.Choice(names), help=help_text)
+
+
+def frame_option(names: str = "fitted, base, relative, or the frame of an instrument") -> Decorator:
+    """Return the option for the frame in which errors are stated."""
+    return click.option(
+        "--frame",
+        default="fitted",
+        metavar="NAME",
+        show_default=True,
+        help=f"Frame in which errors are stated: {names}. 'fitted' is after the best rigid fit of "
+        "the base and platform frames, as far as the measurements do not determine them.",
+    )
+
+
+def _limit_option(name: str, kind: Quantity, quantity: str, example: str) -> Decorator:
+    text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
+    return click.option(name, type=kind, help=f"{text}; above it the exit code is 2.")
+
+
+limit_options = add_options(
+    _limit_option("--limit-position", POSITIVE_LENGTH, "position", "0.02mm"),
+    _limit_option("--limit-angle", POSITIVE_ANGLE, "orientation", "0.01deg"),
+)
+"""Decorator for limits on the errors."""
+
+DATA_FLAGS = {
+    "allow_still": "Accept a target that does not move from pose to pose.",
+    "allow_outside_stroke": "Accept readings outside the stroke of their actuator.",
+    "allow_implausible": "Accept values that fit far better in another unit, order, sign or "
+    "column.",
+    "allow_duplicates": "Accept rows that repeat another row to the last digit.",
+}
+
+data_options = add_options(
+    *(
+        click.option("--" + name.replace("_", "-"), is_flag=True, help=text)
+        for name, text in DATA_FLAGS.items()
+    )
+)
+"""Decorator for the flags that accept suspicious measurements; `take_flags` takes their values."""
+
+
+def take_flags(options: Mapping[str, Any]) -> dict[str, bool]:
+    """Return the values of `data_options`, for `read_checked_measurements`."""
+    return {name: options[name] for name in DATA_FLAGS}
+
+
+def name_option(name: str) -> str:
+    """Return the option of the running command that has this name in its function."""
+    parameters = click.get_current_context().command.params
+    return next(option.opts[-1] for option in parameters if option.name == name)
+
+
+def is_given(name: str) -> bool:
+    """Return whether the user stated an option on the command line."""
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.COMMANDLINE
+
+
+def refuse_given(names: Iterable[str], reason: str) -> None:
+    """Raise DataError for the first of these options that the user stated.
+
+    Parameters
+    ----------
+    reason : a clause such as "because ..." or "with --profile".
+    """
+    for name in names:
+        if is_given(name):
+            raise DataError(f"{name_option(name)} has no effect {reason}; leave it out")
+
+
+def read_checked_measurements(
+    paths: Sequence[Path],
+    robot: Mechanism,
+    *,
+    allow_still: bool = False,
+    allow_implausible: bool = False,
+    **allowed: bool,
+) -> Measurements:
+    """Read measurement files as `read_measurements`, and check their conventions.
+
+    Raises
+    ------
+    LoopcalError
+        See `loopcal.io.data.measurement_file.load_measurements` and `loopcal.check_conventions`.
+    """
+    from loopcal.diagnose.conventions.convention_check import check_conventions
+
+    data = read_measurements(paths, robot, **allowed)
+    check = check_conventions(
+        robot, data, allow_still=allow_still, allow_implausible=allow_implausible
+    )
+    print_convention_note(check, paths)
+    return data
+
+
+def _refuse_explained_strokes(
+    stated: Finding, paths: Sequence[Path], robot: Mechanism, allowed: Mapping[str, bool]
+) -> None:
+    """Refuse readings outside their strokes, described by `data.outside-stroke`, if another unit,
+    order, sign or zero explains them.
+    """
+    from loopcal.diagnose.conventions.convention_check import explain_outside_strokes
+    from loopcal.io.data.measurement_file import load_measurements
+
+    data = load_measurements(paths, robot, **{**allowed, "allow_outside_stroke": True})
+    explained = explain_outside_strokes(robot, data, stated.data)
+    if explained is not None:
+        text = f"{' and '.join(map(str, paths))}: {explained}"
+        raise DataError(text) from DataError(explained)
+
+
+def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None:
+    """Print a note where a check of these files leaves a doubt."""
+    from loopcal.cli import terminal
+
+    if check.finding is not None:
+        terminal.print_note(f"{' and '.join(map(str, paths))}: {check.finding}")
+
+
+def leave_out_held_out(data: Measurements) -> Measurements:
+    """Return the poses that a fit would use; print a note where others are held out."""
+    from loopcal.cli import terminal
+    from loopcal.findings import report_finding
+
+    if count := int(data.is_held_out.sum()):
+        terminal.print_note(str(report_finding("data.held-out-not-counted", count=count)))
+    return data.fitted
+
+
+def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
+    """Read measurement files as one set.
+
+    Print a note where a file names another robot, or another file by its absolute path, or contains
+    no measured value.
+
+    Raises
+    ------
+    LoopcalError
+        See `loopcal.io.data.measurement_file.load_measurements`.
+    """
+    from loopcal.cli import terminal
+    from loopcal.findings import report_finding
+    from loopcal.io.core.csv_table import read_settings
+    from loopcal.io.core.yaml_file import list_absolute_references
+    from loopcal.io.data.measurement_file import list_unfilled_files, load_measurements
+
+    for path in paths:
+        settings = read_settings(path)
+        for finding in list_absolute_references(settings):
+            terminal.print_note(str(finding))
+        stated = str(settings.content.get("robot") or "").strip()
+        if stated not in ("", robot.name):
+            code = "workflow.robot-of-other-name"
+            note = report_finding(code, file=str(path), stated=stated, used=robot.name)
+            terminal.print_note(str(note))
+    try:
+        with terminal.ProgressBar() as progress:
+            progress(0, 1, "reading the measurements")
+            data = load_measurements(paths, robot, **allowed)
+            unfilled = list_unfilled_files(paths, data)
+    except DataError as error:
+        if error.finding is not None and error.finding.code == "data.outside-stroke":
+            _refuse_explained_strokes(error.finding, paths, robot, allowed)
+        raise
+    for file in unfilled:
+        terminal.print_note(str(report_finding("files.no-measured-value", file=str(file))))
+    return data
+
+
+# --- Options that choose the method, the loss and the noise of a fit.
+
+METHODS = ("auto", "map", "ls", "ridge", "tsvd")
+INFLATIONS = ("auto", "global", "groups", "heavy-tailed", "none")
+LOSSES = ("none", "huber", "tukey")
+
+rank_tolerance_option = click.option(
+    "--rank-tolerance",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    metavar="SHARE",
+    help="Share of the largest singular value below which one counts as zero.  [default: 1e-11]",
+)
+"""Decorator of a command that decides a rank."""
+
+fit_options = add_options(
+    click.option(
+        "--method",
+        type=click.Choice(METHODS),
+        default=METHODS[0],
+        help="map: the tolerances are a prior. auto: map, with tolerances inflated where the "
+        "data contradict them. ls: least squares. ridge, tsvd: regularized least squares.",
+    ),
+    click.option(
+        "--inflation",
+        type=click.Choice(INFLATIONS),
+        default=INFLATIONS[0],
+        help="For auto: which tolerances may be inflated. global: all by one factor. groups: also "
+        "limbs and types of parameters, and what these have in common. heavy-tailed: also single "
+        "parameters. auto: all of these. none: as stated.",
+    ),
+    click.option(
+        "--lam",
+        type=click.FloatRange(min=0),
+        metavar="WEIGHT",
+        help="For ridge: weight of the penalty; by default chosen by cross-validation.",
+    ),
+    click.option(
+        "--keep",
+        type=click.IntRange(min=0),
+        metavar="K",
+        help="For tsvd: number of directions; by default chosen by cross-validation.",
+    ),
+    click.option(
+        "--noise",
+        type=click.Choice(("given", "estimated")),
+        default="given",
+        help="Take the stated sigmas as true, or as true up to one common factor that is "
+        "estimated.",
+    ),
+    click.option(
+        "--sigma-uncertainty",
+        type=click.FloatRange(0, 1),
+        metavar="SHARE",
+        help="Relative standard uncertainty of given sigmas, which the intervals account for; 0 "
+        "takes them as exact.  [default: 0.25]",
+    ),
+    click.option(
+        "--loss",
+        type=click.Choice(LOSSES),
+        default=LOSSES[0],
+        help="Reduce the weight of poses that are far from the fit.",
+    ),
+    rank_tolerance_option,
+    click.option(
+        "--drop",
+        multiple=True,
+        metavar="POSE",
+        help="Exclude this pose from fit and validation. May be given several times.",
+    ),
+)
+"""Decorator of a command that fits; `make_fit_options` takes their values."""
+
+
+def _make_default(inflation: By | Literal["none"]) -> Any:
+    """Return the default method, None, or MAP with another choice of what is inflated."""
+    from loopcal.estimate.penalties import MAP
+    from loopcal.estimate.tolerance_components import InflatedTolerances
+
+    if inflation == "auto":
+        return None
+    return MAP() if inflation == "none" else MAP(InflatedTolerances(inflation))
+
+
+def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
+    """Return the options of the library from those of `fit_options`.
+
+    Raises
+    ------
+    DataError
+        A number that belongs to another method.
+    """
+    from loopcal import estimate
+    from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
+    from loopcal.numerics.decomposition import RANK_TOLERANCE
+
+    stated = options["sigma_uncertainty"]
+    name, lam, keep = options["method"], options["lam"], options["keep"]
+    for option, value, needed in (("--lam", lam, "ridge"), ("--keep", keep, "tsvd")):
+        if value is not None and name != needed:
+            raise DataError(
+                f"{option} belongs to --method {needed}, not to {name}; leave it out, or change "
+                "the method"
+            )
+    inflation = options["inflation"]
+    if inflation != INFLATIONS[0] and name != "auto":
+        raise DataError(
+            f"--inflation belongs to --method auto, not to {name}; leave it out, or change the "
+            "method"
+        )
+    if name == "auto":
+        method = _make_default(inflation)
+    elif name == "ridge":
+        method = estimate.Ridge(estimate.GCV() if lam is None else lam)
+    elif name == "tsvd":
+        method = estimate.TruncatedSVD(estimate.TruncationGCV() if keep is None else keep)
+    else:
+        method = estimate.MAP() if name == "map" else estimate.LeastSquares()
+    loss = None
+    if options["loss"] != "none":
+        loss = estimate.Huber() if options["loss"] == "huber" else estimate.Tukey()
+    return estimate.FitOptions(
+        method=method,
+        loss=loss,
+        noise=options["noise"],
+        sigma_uncertainty=SIGMA_UNCERTAINTY if stated is None else stated,
+        excluded_poses=options["drop"],
+        rank_tolerance=options["rank_tolerance"] or RANK_TOLERANCE,
+    )
+
+
+# --- Options that describe an instrument, its noise and the poses at which it measures.
+
+TILT = {"phi", "theta", "psi"}
+"""Components that are angles of tilt and torsion."""
+
+DESCRIPTION = (
+    "measure",
+    "frames",
+    "targets",
+    "kind",
+    "components",
+    "orientation",
+    "sigma_position",
+    "sigma_angle",
+)
+"""Names of the options that describe an instrument."""
+
+
+instrument_options = add_options(
+    click.option(
+        "--kind",
+        default="pose",
+        help="Kind of measurement: pose, component, position, bearing, ...; or several, such "
+        "as position,inclination.",
+    ),
+    click.option(
+        "--components",
+        metavar="NAMES",
+        help="Coordinates that the kind 'component' measures, such as z or x,y,z.",
+    ),
+    click.option(
+        "--orientation",
+        metavar="FORM",
+        help="Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
+    ),
+    click.option(
+        "--sigma-position",
+        type=POSITIVE_LENGTH,
+        default="0.01mm",
+        help="Standard deviation of each measured length.",
+    ),
+    click.option(
+        "--sigma-angle",
+        type=POSITIVE_ANGLE,
+        default="50urad",
+        help="Standard deviation of each measured angle.",
+    ),
+)
+"""Decorator for the kind of measurement and its noise; `make_instrument` takes their values."""
+
+unknown_options = add_options(
+    click.option(
+        "--measure",
+        metavar="NAMES",
+        help="Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.",
+    ),
+    click.option(
+        "--frames",
+        metavar="NAMES",
+        help="Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
+    ),
+    click.option(
+        "--targets",
+        metavar="NAMES",
+        help="Targets at unknown places on the platform, of a kind such as position: "
+        "SMR1,SMR2,SMR3.",
+    ),
+)
+"""Decorator for the short form of components, and for unknown frames and targets."""
+
+draw_option = click.option(
+    "--draw",
+    type=Count("DRAWN_POSES", 1),
+    default=40,
+    metavar="N",
+    help="Number of poses to draw evenly from the workspace where no poses are given.",
+)
+
+distribution_option = click.option(
+    "--distribution",
+    type=click.Choice(("normal", "uniform")),
+    default="normal",
+    help="Distribution of the noise of measured values. Uniform noise lies within sqrt(3) = 1.732 "
+    "standard deviations; a limit of 1 um is --sigma-position 0.57735um.",
+)
+"""Decorator of a command that simulates noise."""
+
+sigma_reading_option = click.option(
+    "--sigma-reading",
+    metavar="QUANTITY",
+    help="Standard deviation of the recorded actuator readings, for all or each, such as "
+    "q1=5um,q2=20urad.  [default: as in the robot file]",
+)
+
+
+def make_instrument(options: Mapping[str, Any], robot: Mechanism | None = None) -> Instrument:
+    """Return the instrument of `instrument_options`, and of `unknown_options` if there are any.
+
+    `robot` : gives targets of unknown place an assumed one; only needed where there are targets.
+
+    Raises
+    ------
+    DataError
+        Options that contradict each other, or an unknown kind, frame or component.
+    """
+    from loopcal.workflow.simulated_measurements import (
+        InstrumentDescription,
+        build_instrument,
+        place_targets,
+    )
+
+    kind, components = options["kind"], options["components"]
+    orientation, measure = options["orientation"], options.get("measure")
+    if measure is not None:
+        if components is not None or kind != "pose":
+            raise DataError(
+                "--measure is short for --kind component --components; give one or the other"
+            )
+        kind, components = "component", measure
+        if orientation is None and TILT & set(measure.split(",")):
+            orientation = "tilt-torsion"
+    frames, targets = options.get("frames"), options.get("targets")
+    instrument = build_instrument(
+        InstrumentDescription(
+            kinds=tuple(kind.split(",")),
+            components=tuple(components.split(",")) if components else (),
+            orientation=orientation,
+            sigma_position=options["sigma_position"],
+            sigma_angle=options["sigma_angle"],
+            unknown_frames=tuple(frames.split(",")) if frames is not None else (),
+            targets=tuple(targets.split(",")) if targets is not None else (),
+            distribution=options.get("distribution", "normal"),
+        )
+    )
+    return instrument if robot is None else place_targets(instrument, robot)
+
+
+def parse_reading_sigma(text: str | None, robot: Mechanism) -> np.ndarray | None:
+    """Return the standard deviations (a,) [SI] that --sigma-reading states; None without it.
+
+    Raises
+    ------
+    DataError
+        A negative number, a wrong unit, or an actuator that the robot does not have.
+    """
+    import numpy as np
+
+    if text is None:
+        return None
+    sigma = {a.name: a.sigma or 0.0 for a in robot.actuators}
+    dimensions = {a.name: a.dimension for a in robot.actuators}
+    for part in text.split(","):
+        name, equals, number = part.rpartition("=")
+        if equals and name not in sigma:
+            raise DataError(
+                f"--sigma-reading names {name!r}{suggest_names(name, sigma)}; the actuators of "
+                f"{robot.name} are {', '.join(sigma)}"
+            )
+        for actuator in (name,) if equals else tuple(sigma):
+            try:
+                sigma[actuator] = parse_quantity(number, dimensions[actuator])
+            except UnitError as error:
+                raise DataError(f"--sigma-reading {number!r} for {actuator}: {error}") from None
+            if not 0.0 <= sigma[actuator] < np.inf:
+                raise DataError(
+                    f"--sigma-reading for {actuator} is {number}; give a number above zero, or "
+                    "zero for exact readings"
+                )
+    return np.array(list(sigma.values()))
+
+
+# --- Options for an accuracy goal, and for constraints on planned poses.
+
+
+class Goal(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
+    """A length or an angle with its unit: of positions ("position") or of orientations."""
+
+    name = "quantity"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, str]:
+        """Return the SI value and the quantity it limits, or fail with what is allowed."""
+        if isinstance(value, tuple):
+            return value
+        with suppress(UnitError):
+            return parse_quantity(value, Dimension.ANGLE), "orientation"
+        try:
+            return parse_quantity(value, Dimension.LENGTH), "position"
+        except UnitError as error:
+            self.fail(f"{error}; or give an angle, such as 10urad", param, ctx)
+
+
+constraint_options = add_options(
+    click.option(
+        "--min-margin",
+        type=float,
+        default=0.1,
+        help="Smallest distance from a singularity, as a share of the median of the workspace.",
+    ),
+    click.option(
+        "--stroke-margin",
+        type=Goal(),
+        help="Distance of all readings from both ends of their strokes, such as 5mm; 2deg for "
+        "actuators that turn.",
+    ),
+    click.option("--max-tilt", type=ANGLE, help="Largest tilt of the platform, such as 20deg."),
+    click.option(
+        "--seen-from",
+        metavar="X,Y,Z",
+        help="Position of the instrument in the base frame, such as 1.5m,-0.8m,1.1m.",
+    ),
+    click.option(
+        "--facing",
+        default="0,0,1",
+        metavar="X,Y,Z",
+        help="With --seen-from: direction of the target in the axes of the platform.",
+    ),
+    click.option(
+        "--cone",
+        type=ANGLE,
+        default="90deg",
+        help="With --seen-from: half angle of the cone in which the target is visible.",
+    ),
+    click.option(
+        "--nearest",
+        type=LENGTH,
+        default="0mm",
+        help="With --seen-from: smallest distance of the target.",
+    ),
+    click.option(
+        "--farthest", type=LENGTH, help="With --seen-from: largest distance of the target."
+    ),
+)
+"""Decorator of a command that plans; `make_constraints` takes their values."""
+
+
+def make_constraints(options: Mapping[str, Any]) -> Constraints:
+    """Return the constraints of the library from those of `constraint_options`."""
+    from loopcal.planning.constraints import Constraints, LineOfSight
+
+    margin, measured = options["stroke_margin"] or (0.0, "position")
+    margins = {"stroke_margin" if measured == "position" else "stroke_margin_angle": margin}
+    if options["seen_from"] is None:
+        for name in ("facing", "cone", "nearest", "farthest"):
+            if is_given(name):
+                raise DataError(
+                    f"--{name} belongs to a line of sight; state the position of the instrument "
+                    "with --seen-from"
+                )
+        return Constraints(options["min_margin"], options["max_tilt"], None, **margins)
+    sight = LineOfSight(
+        _parse_three(options["seen_from"], "--seen-from", Dimension.LENGTH),
+        _parse_three(options["facing"], "--facing", None),
+        options["cone"],
+        options["nearest"],
+        math.inf if options["farthest"] is None else options["farthest"],
+    )
+    return Constraints(options["min_margin"], options["max_tilt"], sight, **margins)
+
+
+def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatArray:
+    """Return three numbers (3,), with units where they have a dimension."""
+    import numpy as np
+
+    words = text.split(",")
+    reason = ""
+    try:
+        numbers = [
+            float(word) if dimension is None else parse_quantity(word, dimension) for word in words
+        ]
+    except (UnitError, ValueError) as error:
+        numbers, reason = [], f" ({error})"
+    if len(numbers) != 3:
+        example = "0,0,1" if dimension is None else "1.5m,-0.8m,1.1m"
+        raise DataError(f"{option} is {text!r}{reason}; give three numbers, such as {example}")
+    return np.array(numbers)

@@ -1,0 +1,409 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adjust the uncertainty of a fit to what its residuals show about their errors.
+
+An effect of size g, with whitened columns Z, that the model does not have displaces the estimate by
+root G'Z g. As g is not known, only its second moments, root G'Z E[g g'] Z'G root' is added to the
+covariance: an interval then contains the truth at least as often as one without the effect.
+Correlated errors replace the part of the covariance that independent errors cause, where theirs is
+larger. See docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.diagnose.error_frames import (
+    FITTED,
+    MOST_POSES,
+    choose_evenly,
+    linearize_tool_errors,
+    locate_measured_poses,
+)
+from loopcal.diagnose.model_discrepancy import add_slow_errors, find_slow_errors
+from loopcal.diagnose.residual_patterns import (
+    READING,
+    SESSION,
+    TEMPERATURE,
+    TIME,
+    EffectSizes,
+    ResidualPatterns,
+    ResidualRows,
+    collect_residual_rows,
+    find_patterns,
+)
+from loopcal.estimate.added_covariance import add_covariance
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.posterior import NOISE
+from loopcal.estimate.residual_test import choose_severity
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.solutions import Solution
+from loopcal.numerics.statistics import compute_median, find_distinct
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import DISPLAY_UNITS
+
+NOTICEABLE = 1.05
+"""Factor of the uncertainty of the measured poses from which a correlation that no test shows is
+allowed for.
+"""
+
+TOO_SMALL = "noise.residuals-too-small"
+"""Code of the finding that independent errors would mean that sigma is too large."""
+
+
+def adjust_uncertainty(
+    fit: Identification, data: Measurements, linear: FitLinearization | None = None
+) -> Identification:
+    """Return a fit whose covariance allows for what the residuals show, and says why.
+
+    Estimates stay. No variance becomes smaller. A fit that did not converge, has no intervals, or
+    has weights by a loss is returned as it is.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    linear : of both, where the caller has it, see `linearize_fit`.
+
+    Raises
+    ------
+    DataError : another number of poses.
+    """
+    check_fitted_data(fit, data)
+    if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
+        return fit
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    linear = linearize_fit(fit, data) if linear is None else linear
+    rows = collect_residual_rows(fit, data, linear)
+    slow = find_slow_errors(fit, data, linear, _place_measured_poses(fit, data, linear))
+    if rows is not None:
+        fit = _add_patterns(fit, data, rows, is_slow=slow is not None)
+    return fit if slow is None else add_slow_errors(fit, slow)
+
+
+def _place_measured_poses(
+    fit: Identification, data: Measurements, linear: FitLinearization
+) -> FloatArray:
+    """Return the measured poses (n, 4, 4) [m] that the calibrated robot reaches: those of the
+    linearization, where readings are exact and it has kept them.
+    """
+    poses = linear.solution.linearized
+    if poses is None or fit.poses is not None:
+        return locate_measured_poses(fit, data).T
+    return poses.T[0, poses.is_reached[0]]
+
+
+def _add_patterns(
+    fit: Identification, data: Measurements, rows: ResidualRows, *, is_slow: bool
+) -> Identification:
+    """Return a fit whose covariance allows for the patterns of its residuals. A dependence on a
+    reading is a slow error of the poses, and counts once where such errors were found.
+    """
+    patterns = find_patterns(rows, data, fit.robot)
+    effects = [e for e in patterns.effects if not (is_slow and e.effect.source == READING)]
+    is_small = any(finding.code == TOO_SMALL for finding in fit.findings)
+    if not (effects or patterns.is_correlated or is_small):
+        return fit
+    tool = state_tool_uncertainty(fit, locate_measured_poses(fit, data))
+    for effect in effects:
+        root = rows.root @ (rows.gain.T @ effect.effect.columns) @ take_root(effect.moments)
+        finding = _report_effect(effect, tool.measure_growth(root))
+        fit = add_covariance(fit, root, np.inf, finding)
+    if patterns.is_correlated or is_small:
+        fit = _add_correlation(fit, patterns, tool)
+    return _without_doubt_of_sigma(fit) if effects or patterns.is_correlated else fit
+
+
+def _add_correlation(
+    fit: Identification, patterns: ResidualPatterns, tool: ToolUncertainty
+) -> Identification:
+    """Return a fit with what correlated errors add to the covariance by independent ones.
+
+    Where residuals are too small and no test shows a correlation, it is added if it matters: the
+    parameters may have taken up errors that are too slow for the tests.
+    """
+    from loopcal.diagnose.residual_patterns import estimate_correlated_errors
+
+    rows = patterns.rows
+    errors = estimate_correlated_errors(rows, fit.residual_test.sigma_degrees)
+    independent = np.zeros_like(errors.covariance)
+    for part in (part for part in fit.posterior.parts if part.source == NOISE):
+        scaled = part.root / fit.tolerance[:, None]
+        by_noise = np.linalg.lstsq(rows.root / fit.tolerance[:, None], scaled, rcond=None)[0]
+        independent += by_noise @ by_noise.T
+    root = rows.root @ take_larger(errors.covariance, independent)
+    ratio = tool.measure_growth(root)
+    if not patterns.is_correlated and ratio < NOTICEABLE:
+        return fit
+    finding = report_finding(
+        "residuals.correlated" if patterns.is_correlated else "residuals.perhaps-correlated",
+        correlation=errors.correlation,
+        order=patterns.order,
+        ratio=ratio,
+        severity=choose_severity(patterns.p_value) if patterns.is_correlated else None,
+    )
+    return add_covariance(fit, root, errors.degrees, finding)
+
+
+class ToolUncertainty(NamedTuple):
+    """The uncertainty of the measured poses as a fit states it.
+
+    Attributes
+    ----------
+    effects : orientation and position (3 n, p) by deviations of the parameters [per SI].
+    stated : sum of the variances of each [SI].
+    """
+
+    effects: tuple[FloatArray, FloatArray]
+    stated: tuple[float, float]
+
+    def measure_growth(self, root: FloatArray) -> float:
+        """Return the factor by which a covariance of root (p, k) [SI] increases the standard
+        uncertainty, the larger one of position and orientation.
+        """
+        pairs = zip(self.effects, self.stated, strict=True)
+        shares = [_sum_squares(E @ root) / stated for E, stated in pairs if stated > 0.0]
+        return float(np.sqrt(1.0 + max(shares, default=0.0)))
+
+
+def state_tool_uncertainty(fit: Identification, measured: Solution) -> ToolUncertainty:
+    """Return the uncertainty of some evenly chosen measured poses of a fit, frames fitted."""
+    posterior, solution = fit.posterior, measured.take(choose_evenly(len(measured.q), MOST_POSES))
+    D = linearize_tool_errors(posterior, solution, FITTED).by_parameters / posterior.unit
+    p = D.shape[-1]
+    angle, position = D[:, :3].reshape(-1, p), D[:, 3:].reshape(-1, p)
+    stated = (_sum_squares(angle @ posterior.root), _sum_squares(position @ posterior.root))
+    return ToolUncertainty((angle, position), stated)
+
+
+def take_root(moments: FloatArray) -> FloatArray:
+    """Return a square root (c, c) of a positive semidefinite matrix (c, c)."""
+    scale = np.sqrt(np.diag(moments))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    s, v = np.linalg.eigh(moments / scale[:, None] / scale)
+    return np.asarray(scale[:, None] * v * np.sqrt(np.maximum(s, 0.0)))
+
+
+def take_larger(covariance: FloatArray, stated: FloatArray) -> FloatArray:
+    """Return a root (k, c) of what a covariance (k, k) has more than a stated one, in the
+    directions, relative to the sum of both, in which it is larger.
+    """
+    scale = np.sqrt(np.diag(covariance + stated))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    s, v = np.linalg.eigh((covariance - stated) / scale[:, None] / scale)
+    return np.asarray(scale[:, None] * v[:, s > 0.0] * np.sqrt(s[s > 0.0]))
+
+
+def _sum_squares(values: FloatArray) -> float:
+    return float((values**2).sum())
+
+
+def _report_effect(effect: EffectSizes, ratio: float) -> Finding:
+    """Return what the residuals depend on, with the size that exceeds its uncertainty most."""
+    most = int(np.argmax(np.abs(effect.sizes) / effect.errors))
+    label = effect.effect.labels[most]
+    unit = DISPLAY_UNITS[label.dimension]
+    shown = {
+        "component": label.component,
+        "size": Quantity(float(effect.sizes[most]) / unit.factor_to_si, unit.symbol),
+        "error": Quantity(float(effect.errors[most]) / unit.factor_to_si, unit.symbol),
+        "ratio": ratio,
+        "severity": choose_severity(effect.p_value),
+    }
+    source, name = effect.effect.source, effect.effect.name
+    if source == TIME:
+        return report_finding("residuals.drift", **shown)
+    if source == SESSION:
+        return report_finding("residuals.sessions-differ", **shown)
+    if source == TEMPERATURE:
+        return report_finding("residuals.depend-on-temperature", name=name, **shown)
+    if source == READING:
+        return report_finding("residuals.depend-on-reading", name=name, **shown)
+    return report_finding("residuals.trend", **shown)
+
+
+def _without_doubt_of_sigma(fit: Identification) -> Identification:
+    """Return a fit that does not call sigma alone too large: correlated errors make residuals
+    small. Where the dependence is no warning, the small residuals still are.
+    """
+    warned = any(
+        f.code.startswith("residuals.") and f.severity is Severity.WARNING for f in fit.findings
+    )
+    severity = Severity.INFO if warned else Severity.WARNING
+    findings = tuple(
+        report_finding("noise.not-independent", ratio=f.data["ratio"], severity=severity)
+        if f.code == TOO_SMALL
+        else f
+        for f in fit.findings
+    )
+    return replace(fit, findings=findings)
+
+
+# --- Test whether large residuals are more frequent than normal noise makes them.
+
+LEVEL = 0.01
+"""Probability that normal noise is reported; below `SIGNIFICANCE` it is a warning."""
+
+
+DRAWS, BATCH = 10_000, 500
+"""Draws of normal errors at most, and at once."""
+
+DOUBT = 0.05
+"""Probability from which no more draws are needed."""
+
+FEWEST = 5.0
+"""Degrees of freedom of the residuals from which the test is made."""
+
+MOST_ROWS = 1000
+"""Residuals that are tested at most, evenly chosen."""
+
+TESTABLE = 1e-6
+"""Share of its variance that the fit must leave of a row to be tested."""
+
+PATTERNS, NO_PATTERN = "residuals.", "residuals.perhaps-correlated"
+"""Beginning of the codes that say what the residuals of a fit depend on, and the one that does not.
+"""
+
+
+@dataclass(frozen=True)
+class HeavyTails:
+    """The test of the residuals for heavy tails.
+
+    Attributes
+    ----------
+    rows : number of residuals that are tested. p_value : probability of a smaller T for normal
+        noise; NaN where there is no test.
+    median, expected : of the absolute residuals in standard deviations, and that of normal noise.
+    largest : the largest of them.
+    """
+
+    rows: int
+    p_value: float
+    median: float
+    expected: float
+    largest: float
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The finding; none where normal noise explains the residuals, or without a test."""
+        if not self.p_value < LEVEL:
+            return ()
+        finding = report_finding(
+            "residuals.heavy-tailed",
+            severity=choose_severity(self.p_value),
+            p_value=self.p_value,
+            median=self.median,
+            expected=self.expected,
+            largest=self.largest,
+            level=LEVEL,
+        )
+        return (finding,)
+
+
+def check_heavy_tails(
+    fit: Identification,
+    data: Measurements,
+    outliers: Sequence[str] = (),
+    linear: FitLinearization | None = None,
+) -> HeavyTails:
+    """Test whether large residuals are more frequent than normal noise makes them.
+
+    A fit with a loss, without intervals, or with uncertain readings is not tested, nor one whose
+    residuals depend on something: this makes some of them larger, and is reported already.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    outliers : labels of poses that are known to be wrong, such as those of `find_outliers`.
+    linear : of both, where the caller has it, see `linearize_fit`.
+    """
+    nothing = _untested(0)
+    if not (fit.converged and fit.residual_test.intervals) or fit.options.loss is not None:
+        return nothing
+    reported = (f for f in fit.findings if f.severity is Severity.WARNING)
+    if any(f.code.startswith(PATTERNS) and f.code != NO_PATTERN for f in reported):
+        return nothing
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    linear = linearize_fit(fit, data) if linear is None else linear
+    rows = collect_residual_rows(fit, data, linear)
+    if rows is None:
+        return nothing
+    wrong = np.flatnonzero(_belong_to(rows, data, outliers))
+    return assess_tails(rows.without(wrong) if wrong.size else rows)
+
+
+def assess_tails(rows: ResidualRows) -> HeavyTails:
+    """Return the test of residuals."""
+    n = len(rows.residual)
+    kept = np.linspace(0, n - 1, min(n, MOST_ROWS)).astype(int)
+    basis = rows.basis[kept]
+    left = 1.0 - (basis**2).sum(axis=1)
+    testable = left > TESTABLE
+    kept, basis, left = kept[testable], basis[testable], left[testable]
+    if left.sum() < FEWEST:
+        return _untested(len(kept))
+    member = rows.series[kept][:, None] == find_distinct(rows.series[kept])
+    u = _standardize(rows.residual[kept, None], left, member)
+    others = _take_root(np.eye(basis.shape[1]) - basis.T @ basis)
+    rng, done, smaller = np.random.default_rng(0), 0, 0
+    median, observed = 0.0, _compute_statistic(u)[0]
+    while done < DRAWS:
+        errors = rng.standard_normal((len(kept), BATCH))
+        taken = basis.T @ errors + others @ rng.standard_normal((others.shape[1], BATCH))
+        drawn = _standardize(errors - basis @ taken, left, member)
+        smaller += int((_compute_statistic(drawn) <= observed).sum())
+        median += float(_compute_medians(np.abs(drawn)).sum())
+        done += BATCH
+        if (1 + smaller) / (1 + done) > DOUBT:
+            break
+    size = np.abs(u)
+    p_value = (1 + smaller) / (1 + done)
+    return HeavyTails(len(kept), p_value, compute_median(size), median / done, float(size.max()))
+
+
+def _compute_medians(values: FloatArray) -> FloatArray:
+    """Return the median of each column of (n, c), faster than `np.median` for some hundred rows."""
+    ordered, n = np.sort(values, axis=0), len(values)
+    return np.asarray(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
+
+
+def _untested(rows: int) -> HeavyTails:
+    """Return that residuals are not tested."""
+    return HeavyTails(rows, np.nan, np.nan, np.nan, np.nan)
+
+
+def _belong_to(rows: ResidualRows, data: Measurements, labels: Sequence[str]) -> BoolArray:
+    """Return which residuals (R,) belong to poses with these labels."""
+    is_named = np.isin(np.array(data.labels), list(labels))
+    result = np.zeros(len(rows.residual), dtype=bool)
+    for number, o in enumerate(o for o in data.observations if len(o)):
+        own = rows.kind == number
+        is_held = np.asarray(is_named[o.rows].reshape(len(o), -1).any(axis=1))
+        result[own] = is_held[rows.row[own]]
+    return result
+
+
+def _standardize(residual: FloatArray, left: FloatArray, member: BoolArray) -> FloatArray:
+    """Return residuals (k, d) in units of their standard deviation, by the series (k, s)."""
+    expected = member.T @ left
+    scale = np.sqrt((member.T @ residual**2) / expected[:, None])
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return np.asarray(residual / (np.sqrt(left)[:, None] * (member @ scale)))
+
+
+def _compute_statistic(u: FloatArray) -> FloatArray:
+    """Return T (d,) of residuals (k, d)."""
+    return np.asarray(np.log1p(u**2 / 3.0).mean(axis=0))
+
+
+def _take_root(covariance: FloatArray) -> FloatArray:
+    """Return a root (q, k) of the part of the estimate that other rows determine."""
+    square, vectors = np.linalg.eigh(covariance)
+    known = square > TESTABLE
+    return np.asarray(vectors[:, known] * np.sqrt(square[known]))

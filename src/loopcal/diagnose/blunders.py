@@ -1,0 +1,516 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Name held-out poses that do not fit, and try what explains each of them.
+
+Explanations are tried in this order, and the first kind that fits is stated: targets of one row
+interchanged, values interchanged with those of another such pose, values in another unit, one wrong
+column, one wrong target. One fits where the pose, read in this way, agrees with the prediction at
+the level of the search. Where none fits, the finding says which were tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import combinations, permutations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loopcal.diagnose.influence import Influence, compute_block_influence, iterate_blocks
+from loopcal.diagnose.outliers import BlockSearch, PartialFit, search_blocks
+from loopcal.errors import LoopcalError
+from loopcal.estimate.fit_linearization import FitUncertainty
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
+from loopcal.estimate.problem import problem_of
+from loopcal.estimate.robust_descent import estimate_scale_of
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.decomposition import substitute_transposed
+from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
+
+# --- Test held-out blocks against what a fit predicts: noise plus the uncertainty of the fit.
+
+LEVEL = 1e-3
+"""Probability of naming any block where none is wrong. It is small, because a named block changes
+the verdict.
+"""
+
+FOLDED = 10_000
+"""Rows that are factorized at once."""
+
+ANYWHERE = 1e3
+"""Standard deviation of an unknown nuisance parameter, in sizes of the robot or radians."""
+
+
+class HeldOutBlocks(NamedTuple):
+    """Rows of held-out blocks with what predicts them.
+
+    Attributes
+    ----------
+    poses : labels of each of u blocks. member : (n,) block of each pose.
+    groups : blocks of equal size: numbers (b,), H (b, m, k), residuals (b, m), present (b, m).
+    """
+
+    poses: tuple[tuple[str, ...], ...]
+    member: IntArray
+    groups: tuple[tuple[IntArray, FloatArray, FloatArray, BoolArray], ...]
+
+    def fit_without(self, excluded: BoolArray) -> PartialFit:
+        """Return the prediction by all blocks that are not excluded (u,)."""
+        triangle, y = self.combine(excluded)
+        u = len(excluded)
+        values = {
+            name: np.zeros(u)
+            for name in ("leverage", "residuals", "distance", "degrees", "deleted")
+        }
+        for numbers, H, residual, present in self.groups:
+            tested = compare_blocks(H, residual, present, triangle, y, ~excluded[numbers])
+            for name, array in values.items():
+                array[numbers] = getattr(tested, name)
+        influence = Influence(**values)  # type: ignore[arg-type]
+        inside, scale = (influence.degrees > 0) & ~excluded, 1.0
+        if inside.any():
+            distance, degrees = np.sqrt(influence.distance[inside]), influence.degrees[inside]
+            # the lower middle: of two blocks, one may be wrong
+            middle = np.argsort(distance / np.sqrt(degrees), kind="stable")[
+                [(inside.sum() - 1) // 2]
+            ]
+            of_middle = estimate_scale_of(distance[middle], degrees[middle].astype(np.float64))
+            scale = max(1.0, of_middle)
+        return PartialFit(excluded, influence, scale, 0)
+
+    def combine(self, excluded: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return the factor R (k, k) and solution y (k,) of the blocks that are not excluded."""
+        k = self.groups[0][1].shape[2]
+        count = 0
+        stacked: list[FloatArray] = [np.column_stack([np.eye(k), np.zeros(k)])]
+        for numbers, H, residual, _ in self.groups:
+            kept = ~excluded[numbers]
+            rows = np.concatenate([H[kept], residual[kept][..., None]], axis=2)
+            stacked.append(rows.reshape(-1, k + 1))
+            count += len(stacked[-1])
+            if count > FOLDED:
+                stacked, count = [np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))], 0
+        triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
+        R = triangle[:k, :k]
+        return R, -np.linalg.solve(R, triangle[:k, k])
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutCheck:
+    """The search for held-out blocks that do not fit.
+
+    Attributes
+    ----------
+    predictor : makes the rows of other measurements of the same poses. blocks : those of the data.
+    search : its result; `suspects` (b,) are the numbers of the blocks that do not fit.
+    """
+
+    predictor: Predictor
+    blocks: HeldOutBlocks
+    search: BlockSearch
+    suspects: IntArray
+
+    @cached_property
+    def prediction(self) -> tuple[FloatArray, FloatArray]:
+        """Factor and solution of all blocks that do fit."""
+        return self.blocks.combine(self.search.end.excluded)
+
+    def p_values(self, data: Measurements) -> FloatArray:
+        """Return the probability of a larger distance, of each block (b,) of other values of some
+        of these poses: against the prediction by all blocks that do fit.
+        """
+        end = self.search.end
+        triangle, y = self.prediction
+        other = self.predictor.make_blocks(data)
+        p_value = np.ones(len(other.poses))
+        for numbers, H, residual, present in other.groups:
+            outside = np.zeros(len(numbers), dtype=bool)
+            tested = compare_blocks(H, residual, present, triangle, y, outside)
+            statistic = tested.distance / end.scale**2
+            p_value[numbers] = compute_chi_square_tail(tested.degrees, statistic)
+            p_value[numbers[tested.degrees < 1]] = np.nan
+        return p_value
+
+
+class Predictor(NamedTuple):
+    """What predicts held-out rows: a robot, the values of its nuisance parameters, and what is
+    known of both.
+
+    Attributes
+    ----------
+    robot : the calibrated one. values : name -> nuisance parameter [SI].
+    kept : names of those that the fit knows; the others are unknown.
+    uncertainty : of the fit; None where robot and nuisance parameters are taken as exact.
+    """
+
+    robot: Mechanism
+    values: Mapping[str, float]
+    kept: tuple[str, ...]
+    uncertainty: FitUncertainty | None
+    unknown: tuple[str, ...]
+
+    def make_blocks(self, data: Measurements) -> HeldOutBlocks:
+        """Return the rows of measurements with what predicts them."""
+        data = fill_in_reading_sigma(self.robot, data)
+        free = _make_free(self.robot, self.uncertainty)
+        problem = problem_of(free, data)
+        table = data.nuisance_parameters.table
+        z = free.deviation(self.robot.values[None])
+        values = np.array([[self.values[name] for name in table.names]]).reshape(1, -1)
+        member = np.unique(linked_blocks(data), return_inverse=True)[1]
+        poses = list_block_labels(data.labels, member)
+        total = problem.count_leverage_rows(member, len(poses))
+        by_y = self._predict(table.names, table.dimensions)
+        noise = 1.0 if self.uncertainty is None else self.uncertainty.noise_scale
+        groups = []
+        for blocks, columns, r in iterate_blocks(problem.rows_at(z, values), member, total):
+            present = np.any(columns != 0.0, axis=2) | (r != 0.0)
+            groups.append((blocks, columns @ by_y / noise, r / noise, present))
+        return HeldOutBlocks(poses, member, tuple(groups))
+
+    def _predict(self, names: tuple[str, ...], dimensions: tuple[Dimension, ...]) -> FloatArray:
+        """Return the derivative (U + p + m, k) of nuisance parameters, free parameters and the
+        errors of a model discrepancy by y.
+        """
+        fit, U = self.uncertainty, len(names)
+        p, w = (0, 0) if fit is None else (len(fit.posterior.unit), len(fit.names))
+        own = None if fit is None else fit.posterior.discrepancy
+        m = 0 if own is None else own.errors.count
+        by_y = np.zeros((U + p + m, p + w + len(self.unknown) + m))
+        if fit is not None:
+            spread = fit.spread
+            by_y[U : U + p, :p] = spread / fit.posterior.unit[:, None]
+            if own is not None:  # parameters follow the errors, which predictions lack
+                by_y[U : U + p, -m:] = own.root / fit.posterior.unit[:, None]
+                by_y[U + p :, -m:] = -np.eye(m)
+            follow, places = fit.slope @ spread, {name: i for i, name in enumerate(fit.names)}
+            for i, name in enumerate(names):
+                if name in self.kept and name in places:
+                    by_y[i, :p] = follow[places[name]]
+                    by_y[i, p : p + w] = fit.root[places[name]]
+        for i, name in enumerate(names):
+            if name in self.unknown:
+                unit = self.robot.size if dimensions[i] is Dimension.LENGTH else 1.0
+                by_y[i, p + w + self.unknown.index(name)] = ANYWHERE * unit
+        return by_y
+
+
+def check_held_out_rows(
+    robot: Mechanism,
+    data: Measurements,
+    values: Mapping[str, float],
+    kept: tuple[str, ...],
+    uncertainty: FitUncertainty | None = None,
+) -> HeldOutCheck | None:
+    """Search the held-out blocks that neither the fit nor the other blocks explain.
+
+    Parameters
+    ----------
+    robot : the calibrated one. data : held-out rows whose poses are reached.
+    values : name -> nuisance parameter [SI] with which they are compared. kept : names of those
+        that the fit determined; the others were fitted to these rows.
+    uncertainty : of the fit; None where it is not known.
+
+    Returns
+    -------
+    The result; None without any block that can be tested.
+    """
+    table = data.nuisance_parameters.table
+    unknown = tuple(p.name for p in table.entries if p.free and p.name not in kept)
+    predictor = Predictor(robot, values, kept, uncertainty, unknown)
+    blocks = predictor.make_blocks(data)
+    if not blocks.groups:
+        return None
+    nothing = np.zeros(len(blocks.poses), dtype=bool)
+    search = search_blocks(blocks.fit_without, nothing, LEVEL)
+    if search.whole.tested == 1:  # only the fit predicts it
+        tested = search.whole.influence.degrees > 0
+        alone = blocks.fit_without(tested)
+        is_wrong = bool((alone.p_value() < LEVEL).any())
+        search = replace(search, fits=(alone if is_wrong else search.whole,))
+    always = np.all([fit.excluded for fit in search.fits], axis=0)
+    order = np.argsort(-search.end.ratio, kind="stable")
+    suspects = order[always[order]]
+    return HeldOutCheck(predictor, blocks, search, suspects)
+
+
+def compare_blocks(
+    H: FloatArray,
+    residual: FloatArray,
+    present: BoolArray,
+    triangle: FloatArray,
+    y: FloatArray,
+    inside: BoolArray,
+) -> Influence:
+    """Return the influence of blocks H (b, m, k) for the factor and solution of `inside` (b,) and
+    other blocks.
+    """
+    b, m, k = H.shape
+    half = H
+    if H.size:  # one system for all blocks
+        half = substitute_transposed(triangle, H.reshape(b * m, k).T).T.reshape(H.shape)
+    return compute_block_influence(half, residual + H @ y, present, inside.astype(np.float64))
+
+
+def _make_free(robot: Mechanism, uncertainty: FitUncertainty | None) -> FreeParameters:
+    """Return the free parameters of a fit at its estimate; none where it is not known."""
+    if uncertainty is not None:
+        return uncertainty.free
+    nothing = np.zeros(0)
+    return FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
+
+
+MOST_PERMUTED = 4
+"""Targets of which all orders are tried; of more only exchanges of two."""
+
+MOST_EXPLAINED = 10
+"""Poses for which explanations are tried, the farthest first."""
+
+MOST_EXCHANGED = 50
+"""Other poses that do not fit, the farthest first, with which the values of one are exchanged."""
+
+UNUSED: dict[str, Any] = {
+    "pairs": (),
+    "other": "",
+    "dimension": "",
+    "factor": 1.0,
+    "column": "",
+    "left_out": "",
+}
+"""Data of the finding that only some explanations have."""
+
+FACTORS: dict[Dimension, tuple[float, ...]] = {
+    Dimension.LENGTH: (1e3, 1e-3, 10.0, 0.1, 25.4, 1.0 / 25.4),
+    Dimension.ANGLE: (180.0 / np.pi, np.pi / 180.0, 1e3, 1e-3, 60.0, 1.0 / 60.0),
+}
+"""Factors by which values in another unit differ."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A way to read a pose in which it fits, or none.
+
+    Attributes
+    ----------
+    what : "targets", "poses", "unit", "column", "target", or "none". data : its names and numbers.
+    tried : what was tried.
+    """
+
+    what: str
+    data: dict[str, Any] = field(default_factory=dict)
+    tried: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Blunder:
+    """A held-out block that neither the fit nor the other held-out blocks explain.
+
+    Attributes
+    ----------
+    poses : its labels. times : its residuals in units of what noise and uncertainty explain.
+    p_value : probability of a larger distance. explanation : what it may be.
+    """
+
+    poses: tuple[str, ...]
+    times: float
+    p_value: float
+    explanation: Explanation
+
+    def report(self, **error: Any) -> Finding:
+        """Return the finding, with `quantity`, `target` and `error` of its largest error."""
+        explanation = self.explanation
+        return report_finding(
+            "validation.blunder",
+            poses=self.poses,
+            times=self.times,
+            p_value=self.p_value,
+            explanation=explanation.what,
+            tried=explanation.tried,
+            **{**UNUSED, **explanation.data},
+            **error,
+        )
+
+
+def name_blunders(check: HeldOutCheck, data: Measurements) -> tuple[Blunder, ...]:
+    """Return the held-out blocks that do not fit, the farthest first, each with its explanation.
+
+    Parameters
+    ----------
+    check : of these held-out data.
+    """
+    end, p_value = check.search.end, check.search.end.p_value()
+    blunders = []
+    for count, i in enumerate(check.suspects.tolist()):
+        explanation = Explanation("none")
+        if count < MOST_EXPLAINED:
+            explanation = _explain(check, data, i)
+        times, p = float(np.sqrt(end.ratio[i])), float(p_value[i])
+        blunders.append(Blunder(check.blocks.poses[i], times, p, explanation))
+    return tuple(blunders)
+
+
+def _explain(check: HeldOutCheck, data: Measurements, block: int) -> Explanation:
+    """Return the first kind of explanation that fits, in the best of its forms."""
+    poses = np.flatnonzero(check.blocks.member == block)
+    alone = data.take(poses)
+    others = [int(i) for i in check.suspects[:MOST_EXCHANGED] if i != block]
+    tried = []
+    for what, readings in (
+        ("targets", _permute_targets(alone)),
+        ("poses", _exchange_poses(check, data, poses, others)),
+        ("unit", _convert_units(check, alone)),
+        ("column", _leave_out_columns(alone)),
+        ("target", _leave_out_targets(alone)),
+    ):
+        best, fitting = 0.0, None
+        for words, read in readings:
+            tried.append(what)
+            p_value = _worst_p_value(check, read)
+            if p_value >= check.search.limit and p_value > best:
+                best, fitting = p_value, words
+        if fitting is not None:
+            return Explanation(what, fitting, tuple(dict.fromkeys(tried)))
+    return Explanation("none", {}, tuple(dict.fromkeys(tried)))
+
+
+Reading = tuple[dict[str, Any], Measurements]
+"""Names and numbers for the sentence, and the measurements read in another way."""
+
+
+def _worst_p_value(check: HeldOutCheck, data: Measurements) -> float:
+    """Return the smallest p-value of the blocks; 0 where nothing is left to test."""
+    try:
+        p_values = check.p_values(data)
+    except LoopcalError:
+        return 0.0
+    return float(np.nan_to_num(p_values, nan=0.0).min(initial=1.0))
+
+
+def _permute_targets(data: Measurements) -> Iterator[Reading]:
+    """Give the data with the targets of one kind in another order."""
+    for i, rows in enumerate(data.observations):
+        names = tuple(rows.kind.target_columns)
+        columns = [list(places) for places in rows.kind.target_columns.values()]
+        k = len(names)
+        if k < 2 or not len(rows) or len({len(places) for places in columns}) > 1:
+            continue
+        for order in _list_orders(k):
+            measured = np.array(rows.measured)
+            for target, source in enumerate(order):
+                measured[:, columns[target]] = rows.measured[:, columns[source]]
+            moved = [j for j, source in enumerate(order) if j != source]
+            pairs = [{"target": names[j], "holds": names[order[j]]} for j in moved]
+            yield {"pairs": pairs}, _with_measured(data, i, measured)
+
+
+def _list_orders(k: int) -> Iterator[Sequence[int]]:
+    """Give the other orders of k targets: all of a few, else exchanges of two."""
+    if k <= MOST_PERMUTED:
+        yield from (order for order in permutations(range(k)) if list(order) != list(range(k)))
+        return
+    for a, b in combinations(range(k), 2):
+        order = list(range(k))
+        order[a], order[b] = b, a
+        yield order
+
+
+def _exchange_poses(
+    check: HeldOutCheck, data: Measurements, poses: IntArray, others: Sequence[int]
+) -> Iterator[Reading]:
+    """Give the values of a pose exchanged with those of another pose that does not fit."""
+    for other in others if len(poses) == 1 else ():
+        places = np.flatnonzero(check.blocks.member == other)
+        if len(places) != 1:
+            continue
+        both = data.take(np.array([poses[0], places[0]]))
+        exchanged = both
+        for i, rows in enumerate(both.observations):
+            if rows.kind.poses_per_row > 1:
+                continue
+            first, second = (np.flatnonzero(rows.rows == j) for j in (0, 1))
+            if len(first) != len(second):
+                break
+            measured = np.array(rows.measured)
+            measured[first], measured[second] = rows.measured[second], rows.measured[first]
+            exchanged = _with_measured(exchanged, i, measured)
+        else:
+            yield {"other": data.labels[int(places[0])]}, exchanged
+
+
+def _convert_units(check: HeldOutCheck, data: Measurements) -> Iterator[Reading]:
+    """Give the data with the lengths or the angles of one kind in another unit.
+
+    Where zeros fit as well, the expected values are within the noise and say nothing of a unit.
+    """
+    for i, rows in enumerate(data.observations):
+        for dimension, factors in FACTORS.items():
+            columns = [c.dimension is dimension for c in rows.kind.columns]
+            if not any(columns) or not len(rows):
+                continue
+            scaled = {
+                factor: _with_measured(
+                    data, i, np.where(columns, rows.measured * factor, rows.measured)
+                )
+                for factor in (0.0, *factors)
+            }
+            if _worst_p_value(check, scaled.pop(0.0)) >= check.search.limit:
+                continue
+            for factor, read in scaled.items():
+                yield {"dimension": dimension.value, "factor": factor}, read
+
+
+def _leave_out_columns(data: Measurements) -> Iterator[Reading]:
+    """Give the data without one column of one row."""
+    for i, row, place in _list_rows(data):
+        for j, column in enumerate(data.observations[i].kind.columns):
+            yield {"column": f"{column.name}{place}"}, _without(data, i, row, (j,))
+
+
+def _leave_out_targets(data: Measurements) -> Iterator[Reading]:
+    """Give the data without one target of one row."""
+    for i, row, place in _list_rows(data):
+        for name, columns in _list_targets(data.observations[i].kind).items():
+            yield {"left_out": f"{name}{place}"}, _without(data, i, row, columns)
+
+
+def _list_rows(data: Measurements) -> Iterator[tuple[int, int, str]]:
+    """Give number of the kind and number of the row of all rows, and words for the row where the
+    kind has several.
+    """
+    for i, rows in enumerate(data.observations):
+        for row in range(len(rows)):
+            label = "/".join(data.labels[pose] for pose in np.ravel(rows.rows[row]))
+            yield i, row, f" of the row {label}" if len(rows) > 1 else ""
+
+
+def _without(data: Measurements, i: int, row: int, columns: Sequence[int]) -> Measurements:
+    """Return measurements without some values of one row of one kind."""
+    measured = np.array(data.observations[i].measured)
+    measured[row, list(columns)] = np.nan
+    return _with_measured(data, i, measured)
+
+
+def _list_targets(kind: Kind) -> dict[str, tuple[int, ...]]:
+    """Return the targets of a kind with several, or the kind as a whole, with their columns."""
+    targets = dict(kind.target_columns)
+    return targets if len(targets) > 1 else {kind.name: tuple(range(len(kind.columns)))}
+
+
+def _with_measured(data: Measurements, i: int, measured: FloatArray) -> Measurements:
+    """Return measurements with other values of one kind; rows that become invalid are absent."""
+    rows = data.observations[i]
+    invalid = [row for row, _ in rows.kind.find_invalid_rows(measured)]
+    measured = np.array(measured)
+    measured[invalid] = np.nan
+    changed: Observations = replace(rows, measured=measured)
+    observations = (*data.observations[:i], changed, *data.observations[i + 1 :])
+    return replace(data, observations=observations)

@@ -1,0 +1,453 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the covariance of a fit with one that allows common errors within a day, session or pose.
+
+The rows of a cluster g, whitened, nuisance parameters and poses eliminated, are A_g with residuals
+r_g and leverage H_gg. With the bread B = (A'A + P)^-1 (P the penalty) and the covariance C of the
+fit, whose rows have variance sigma^2, the cluster-robust covariance is
+
+    C_robust = C + B sum_g (u_g u_g' - sigma^2 A_g' A_g) B,     u_g = A_g' (I - H_gg)^(-1/2) r_g
+
+The factor (I - H_gg)^(-1/2) is the small-sample correction CR2 of Bell and McCaffrey (2002): for
+independent errors the expectation of C_robust is exactly C, however few clusters there are. Its
+scatter is that of a chi-square whose degrees of freedom have the moments of the quadratic form
+(Satterthwaite; Pustejovsky and Tipton, 2018). B is never formed: all is computed in the directions
+of the decomposition. What the residuals or a prior have added to C (`add_covariance`) belongs to
+the stated covariance with which C_robust is compared. See docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loopcal.diagnose.error_frames import (
+    FITTED,
+    MOST_POSES,
+    linearize_tool_errors,
+    locate_measured_poses,
+)
+from loopcal.diagnose.influence import TESTABLE
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.posterior import Posterior
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.numerics.elimination import find_connected_groups, fold_at
+from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# --- Divide poses into the units that may share an error: days, sessions, blocks or single poses.
+
+FEWEST_CLUSTERS = 5
+"""Clusters that a cluster-robust variance needs. The variance of a mean has one degree of freedom
+less, and with fewer than 4 its distribution is not known well enough (Tipton, 2015).
+"""
+
+NIGHT = 6 * 3600.0
+"""Time without a measurement [s] after which another day begins."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Poses that may share an error, and are independent of the poses of other clusters.
+
+    Attributes
+    ----------
+    unit : "day", "session", "block" or "pose". member : (n,) cluster 0..count-1 of each pose.
+    """
+
+    unit: str
+    member: IntArray
+    count: int
+
+
+def divide_into_clusters(data: Measurements) -> tuple[Clusters, ...]:
+    """Return the possible divisions of n poses with at least `FEWEST_CLUSTERS` clusters, those of
+    the largest units first.
+
+    Days are runs of poses without a break of `NIGHT` in the column `time`, sessions those of the
+    rows. Units that share a pose, a block or a row that compares poses are one cluster.
+    """
+    blocks = linked_blocks(data)
+    count = int(blocks.max()) + 1
+    unit = "pose" if count == data.n_poses else "block"
+    divisions = [Clusters(unit, blocks, count)]
+    for name, pairs in (("session", _pose_sessions(data)), ("day", _pose_days(data))):
+        if len(pairs):
+            links = np.column_stack([blocks[pairs[:, 0]], count + pairs[:, 1]])
+            joined = find_connected_groups(links, int(links.max()) + 1)[blocks]
+            names, member = np.unique(joined, return_inverse=True)
+            divisions.append(Clusters(name, member, len(names)))
+    enough = [clusters for clusters in reversed(divisions) if clusters.count >= FEWEST_CLUSTERS]
+    return tuple(sorted(enough, key=lambda clusters: clusters.count))
+
+
+def _pose_sessions(data: Measurements) -> IntArray:
+    """Return pairs (k, 2) of a pose and a session that measured it; none without named sessions.
+
+    Rows without a session belong to those of the same pose, or else to one session.
+    """
+    poses = [np.zeros(0, dtype=np.int64)]
+    names = [np.zeros(0, dtype=str)]
+    for rows in (rows for rows in data.observations if len(rows)):
+        numbers = rows.rows.reshape(len(rows), -1)
+        poses.append(numbers.ravel())
+        names.append(np.repeat(rows.session.astype(str), numbers.shape[1]))
+    pose, name = np.concatenate(poses), np.concatenate(names)
+    is_named = name != ""
+    if not is_named.any():
+        return np.zeros((0, 2), dtype=np.int64)
+    unnamed = np.setdiff1d(np.arange(data.n_poses), pose[is_named])
+    pose = np.concatenate([pose[is_named], unnamed])
+    name = np.concatenate([name[is_named], np.full(len(unnamed), "")])
+    return np.column_stack([pose, np.unique(name, return_inverse=True)[1]])
+
+
+def _pose_days(data: Measurements) -> IntArray:
+    """Return pairs (n, 2) of a pose and its day; none where a pose has no time."""
+    time = data.context.get("time")
+    if time is None or np.isnan(time).any():
+        return np.zeros((0, 2), dtype=np.int64)
+    order = np.argsort(time, kind="stable")
+    day = np.empty(len(time), dtype=np.int64)
+    day[order] = np.concatenate([[0], np.cumsum(np.diff(time[order]) > NIGHT)])
+    return np.column_stack([np.arange(len(time)), day])
+
+
+LIMIT = 1.5
+"""Ratio of standard uncertainties above which the stated ones are too small."""
+
+SIGNIFICANCE = 0.005
+"""Probability, for independent errors, of a ratio as large as that of position or orientation,
+below which the ratio is reported: 1 % of data sets for the two together.
+"""
+
+JUDGED = 0.5
+"""Share of the variance of poses by noise that residuals must be able to judge. The rest lies in
+directions that one cluster alone determines.
+"""
+
+FEWEST_DEGREES = 4.0
+"""Degrees of freedom below which the distribution of a ratio is not known well (Tipton, 2015), and
+its own standard deviation exceeds 35 %.
+"""
+
+MOST_CLUSTERS = 10_000
+"""Clusters, evenly chosen, whose scores are compared: the degrees of freedom of more of them change
+no conclusion.
+"""
+
+COMMON = 1e-9
+"""Share of its own size below which a variance of poses is zero."""
+
+
+class Ratio(NamedTuple):
+    """Cluster-robust standard uncertainty of poses over the one that the fit states.
+
+    Attributes
+    ----------
+    ratio : of the root mean square over the measured poses; NaN without uncertainty.
+    degrees : degrees of freedom of its square for independent errors.
+    share : of the variance by noise that residuals can judge.
+    p_value : probability of a larger ratio for independent errors.
+    """
+
+    ratio: float
+    degrees: float
+    share: float
+    p_value: float
+
+
+NO_RATIO = Ratio(np.nan, np.nan, np.nan, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterCheck:
+    """The cluster-robust covariance of a fit against the stated one.
+
+    Attributes
+    ----------
+    unit : what is taken as independent: "day", "session", "block" or "pose"; empty where nothing
+        could be compared. clusters : their number.
+    position, orientation : ratios for the measured poses, from the directions that the data
+        determine.
+    parameter : the parameter with the largest ratio, and that ratio; empty and NaN without any.
+    finding : the result.
+    """
+
+    unit: str
+    clusters: int
+    position: Ratio
+    orientation: Ratio
+    parameter: tuple[str, float]
+    finding: Finding
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result by name for JSON."""
+        ratios = {name: getattr(self, name)._asdict() for name in ("position", "orientation")}
+        name, ratio = self.parameter
+        return {
+            "unit": self.unit,
+            "clusters": self.clusters,
+            **ratios,
+            "parameter": {"name": name, "ratio": ratio},
+            "finding": self.finding,
+        }
+
+
+def check_clusters(
+    fit: Identification,
+    data: Measurements,
+    frame: str = FITTED,
+    linear: FitLinearization | None = None,
+) -> ClusterCheck:
+    """Compare the stated uncertainty with one that allows common errors within clusters of poses.
+
+    The clusters are the largest independent units of which there are enough, see
+    `divide_into_clusters`.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    frame : in which errors of poses are stated, see `choose_error_frame`; "relative" means
+        relative to the home pose.
+    linear : of both, where the caller has it, see `linearize_fit`.
+    """
+    check_fitted_data(fit, data)
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    units = divide_into_clusters(data)
+    if not units:
+        return _not_compared("residuals.clusters-too-few", fewest=FEWEST_CLUSTERS)
+    if not fit.residual_test.intervals:
+        return _not_compared("residuals.clusters-without-intervals")
+    linear = linearize_fit(fit, data) if linear is None else linear
+    checks = (_compare(fit, data, clusters, frame, linear) for clusters in units)
+    judged = (check for check in checks if check is not None)
+    return next(judged, _not_compared("residuals.clusters-not-judged"))
+
+
+class RobustSpread(NamedTuple):
+    """The cluster-robust covariance C_robust = L (I + spread) L' of a fit with C = L L'.
+
+    With the scores h_g of the G clusters, spread = sum_g (h_g h_g' - E_g), E_g the expectation for
+    independent errors. Each cluster has h rows, turned into the eigenvectors of its leverage H_gg.
+
+    Attributes
+    ----------
+    root : (p, k) L in tolerances, for the k directions that the fit estimates.
+    scores : (G, k) h_g, the u_g in units of L.
+    scaled_rows : (G, k, h) the rows in units of L; without a prior the sum of their squares is k.
+    correction : (G, h) (1 - g)^(-1/2) for the leverages `leverage` (G, h); 0 where g is 1, so that
+        no residual can judge the row.
+    columns : (G, h, w) rows by everything that is estimated, in standard deviations: their products
+        are the leverages.
+    times : number of all clusters for each of the G.
+    """
+
+    root: FloatArray
+    scores: FloatArray
+    scaled_rows: FloatArray
+    correction: FloatArray
+    leverage: FloatArray
+    columns: FloatArray
+    times: float = 1.0
+
+    @property
+    def is_tested(self) -> BoolArray:
+        """(G, h) rows that a residual can judge."""
+        return self.correction > 0.0
+
+    def compare(self, effect: FloatArray, added: float = 0.0) -> Ratio:
+        """Return the ratio for quantities whose change is effect (m, p) times the deviation in
+        tolerances. `added` : sum of the variances that they have beyond C.
+        """
+        root = effect @ self.root
+        total = float((root**2).sum())
+        if not total > 0.0:
+            return NO_RATIO
+        # Q = sum_g |E' h_g|^2 with E E' = root' root; for independent errors its mean is `mean`
+        _, s, vt = np.linalg.svd(root, full_matrices=False)
+        E = vt[s > COMMON * s[0]].T * s[s > COMMON * s[0]]
+        rows = np.matmul(E.T, self.scaled_rows)
+        tested_rows = rows * self.is_tested[:, None, :]
+        mean, observed = float((tested_rows**2).sum()), float(((self.scores @ E) ** 2).sum())
+        if not mean > 0.0:
+            return NO_RATIO
+        excess = self.times * (observed - mean)
+        ratio = float(np.sqrt(max(total + excess, 0.0) / (total + added)))
+        degrees = self._degrees(tested_rows, mean)
+        p_value = float(compute_chi_square_tail(degrees, degrees * observed / mean))
+        return Ratio(ratio, degrees, mean / float((rows**2).sum()), p_value)
+
+    def parameter_ratios(self, added: FloatArray | float = 0.0) -> FloatArray:
+        """Return the ratio (p,) of each parameter; NaN without a standard deviation. `added` (p,) :
+        variances beyond C.
+        """
+        own = (self.root**2).sum(axis=1)
+        observed = ((self.scores @ self.root.T) ** 2).sum(axis=0)
+        expected = np.zeros(len(own))
+        for tested_rows in self.scaled_rows * self.is_tested[:, None, :]:
+            expected += ((self.root @ tested_rows) ** 2).sum(axis=1)
+        robust = own + self.times * (observed - expected)
+        nothing = np.full(len(own), np.nan)
+        square = np.divide(robust, own + added, out=nothing, where=own > 0.0)
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+
+    def _degrees(self, tested_rows: FloatArray, mean: float) -> float:
+        """Return the degrees of freedom 2 mean^2 / variance of Q for independent normal errors.
+
+        `tested_rows` (G, r, h) are E' scaled_rows. Q = e' K e of all rows e has the variance
+        2 tr (K K). With rows_g those of cluster g, D the corrections, Z the columns and F_g =
+        D_g rows_g' rows_g D_g, the blocks of two clusters give tr (F_g Z_g Z_h' F_h Z_h Z_g'), and
+        those of one |rows_g' rows_g|^2.
+        """
+        products = np.matmul(tested_rows.swapaxes(-1, -2), tested_rows)
+        F = products * self.correction[:, :, None] * self.correction[:, None, :]
+        width = self.columns.shape[-1]
+        joint = self.columns.reshape(-1, width).T @ np.matmul(F, self.columns).reshape(-1, width)
+        single = (np.matmul(F * self.leverage[:, None, :], F) * self.leverage[:, None, :]).trace(
+            axis1=1, axis2=2
+        )
+        trace = float((joint * joint.T).sum() - single.sum() + (products**2).sum())
+        return mean**2 / trace if trace > 0.0 else np.inf
+
+
+def compute_robust_spread(
+    fit: Identification, clusters: Clusters, linear: FitLinearization
+) -> RobustSpread:
+    """Return the cluster-robust covariance of a fit, beside the stated one.
+
+    Parameters
+    ----------
+    fit : with intervals. clusters : the cluster of each pose; of more than `MOST_CLUSTERS`, an
+        even choice stands for all. linear : of the fit and its data, see `linearize_fit`.
+    """
+    clusters, times = choose_clusters(clusters)
+    problem, d, p = linear.problem, linear.decomposition, len(fit.names)
+    used = linear.is_estimated
+    V = d.scale[:, None] * d.directions[0][:, used]
+    total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
+    sd = np.sqrt(linear.variance[used])
+    sigma = fit.residual_test.sigma_scale
+    rows = _fold_clusters(linear, clusters) / np.r_[np.ones(_width(problem)), np.ones(p), sigma]
+    nuisance, A, r = rows[..., : -p - 1], rows[..., -p - 1 : -1], rows[..., -1]
+    half = np.concatenate([nuisance, (A @ V) / np.sqrt(total)], axis=2)
+    P = (A @ V) * (sigma / (total * sd))
+    leverage, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
+    remaining = 1.0 - leverage
+    is_tested = remaining > TESTABLE
+    correction = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
+    scaled_rows = np.matmul(P.swapaxes(-1, -2), vectors)
+    residual = correction * np.matmul(r[:, None, :], vectors)[:, 0]
+    scores = np.matmul(scaled_rows, residual[..., None])[..., 0]
+    columns = np.matmul(vectors.swapaxes(-1, -2), half)
+    return RobustSpread(V * sd, scores, scaled_rows, correction, leverage, columns, times)
+
+
+def choose_clusters(clusters: Clusters) -> tuple[Clusters, float]:
+    """Return at most `MOST_CLUSTERS` clusters, evenly chosen, with member -1 for the poses of the
+    others; and the number of all clusters for each of these.
+    """
+    if clusters.count <= MOST_CLUSTERS:
+        return clusters, 1.0
+    number = np.full(clusters.count, -1)
+    chosen = np.linspace(0, clusters.count - 1, MOST_CLUSTERS).astype(np.int64)
+    number[chosen] = np.arange(MOST_CLUSTERS)
+    times = clusters.count / MOST_CLUSTERS
+    return replace(clusters, member=number[clusters.member], count=MOST_CLUSTERS), times
+
+
+def _width(problem: Problem) -> int:
+    """Return the number of columns of nuisance parameters in `Problem.leverage_rows`."""
+    return 0 if problem.nuisance is None else len(problem.nuisance)
+
+
+def _fold_clusters(linear: FitLinearization, clusters: Clusters) -> FloatArray:
+    """Return the rows (G, h, U + p + 1) of each cluster, folded."""
+    problem = linear.problem
+    width = _width(problem) + problem.parameters + 1
+    factor = np.zeros((1, clusters.count, 0, width))
+    for rows_of_block in problem.leverage_rows(linear.linearization, linear.solution):
+        for part in rows_of_block:
+            member = clusters.member[part.poses]
+            rows, m = part.rows[member >= 0], part.rows.shape[1]
+            if rows.size:
+                places = np.repeat(member[member >= 0], m)
+                factor = fold_at(factor, rows.reshape(1, -1, width), places)
+    return factor[0]
+
+
+def _compare(
+    fit: Identification,
+    data: Measurements,
+    clusters: Clusters,
+    frame: str,
+    linear: FitLinearization,
+) -> ClusterCheck | None:
+    """Return the comparison for clusters; None where residuals cannot judge the poses."""
+    spread = compute_robust_spread(fit, clusters, linear)
+    effects = _list_pose_effects(fit, data, frame)
+    angle, position = (spread.compare(each.by_parameters, each.added) for each in effects)
+    sizes = [ratio for ratio in (position, angle) if np.isfinite(ratio.ratio)]
+    sizes = [r for r in sizes if r.share >= JUDGED and r.degrees >= FEWEST_DEGREES]
+    if not sizes:
+        return None
+    added = _find_added_root(fit.posterior) / fit.tolerance[:, None]
+    ratios = spread.parameter_ratios((added**2).sum(axis=1))
+    largest = int(np.nanargmax(ratios))
+    parameter = (fit.names[largest], float(ratios[largest]))
+    beyond = [r for r in sizes if r.ratio > LIMIT and r.p_value < SIGNIFICANCE]
+    finding = report_finding(
+        "residuals.common-errors" if beyond else "residuals.common-errors-small",
+        unit=clusters.unit,
+        count=clusters.count,
+        ratio=max(r.ratio for r in beyond or sizes),
+        parameter=parameter[0],
+        parameter_ratio=parameter[1],
+    )
+    return ClusterCheck(clusters.unit, clusters.count, position, angle, parameter, finding)
+
+
+class _PoseEffects(NamedTuple):
+    """Changes (3 n, p) of the measured poses by deviations in tolerances, and the sum of the
+    variances that they have beyond those by C.
+    """
+
+    by_parameters: FloatArray
+    added: float
+
+
+def _list_pose_effects(
+    fit: Identification, data: Measurements, frame: str
+) -> tuple[_PoseEffects, _PoseEffects]:
+    """Return the effects on orientation and on the tool's position, in a frame."""
+    posterior = fit.posterior
+    errors = linearize_tool_errors(posterior, locate_measured_poses(fit, data, MOST_POSES), frame)
+    p = len(posterior.unit)
+    by_part = errors.by_parameters @ (
+        _find_added_root(posterior.without_discrepancy) / posterior.unit[:, None]
+    )
+    added = np.concatenate([by_part, errors.by_discrepancy], axis=2) ** 2
+    D = errors.by_parameters * (fit.tolerance / posterior.unit)
+    angle, position = (
+        _PoseEffects(D[:, rows].reshape(-1, p), float(added[:, rows].sum()))
+        for rows in (slice(0, 3), slice(3, 6))
+    )
+    return angle, position
+
+
+def _find_added_root(posterior: Posterior) -> FloatArray:
+    """Return the root (p, k) [SI] of what was added to the covariance of a fit."""
+    roots = [part.root for part in posterior.parts if part.is_added]
+    return np.concatenate([np.zeros((len(posterior.unit), 0)), *roots], axis=1)
+
+
+def _not_compared(code: str, **data: Any) -> ClusterCheck:
+    """Return the reason why there is no comparison."""
+    return ClusterCheck("", 0, NO_RATIO, NO_RATIO, ("", np.nan), report_finding(code, **data))

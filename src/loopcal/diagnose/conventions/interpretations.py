@@ -1,0 +1,470 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Interpretations: other ways to read measurements, as pure functions from data to data.
+
+An interpretation writes the values as the stated convention would write them, so that one
+evaluation judges all interpretations. `value_interpretations` lists those of measured values,
+`reading_interpretations` those of actuator readings; a combination applies two of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, combinations, permutations
+from typing import Any
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.findings import Finding, report_finding
+from loopcal.geometry import OrientationForm, parse_orientation
+from loopcal.measure.kinds.bearing import Bearing
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.poses import Component, Pose
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.assembly import Actuator
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+# --- Changes of tables of numbers: pure functions that scale or permute columns.
+
+Change = Callable[[FloatArray], FloatArray]
+"""From written values (r, c), or readings (n, a), to those that the stated convention would write
+[SI].
+"""
+
+
+def scale_columns(columns: Sequence[int], factor: float, zero: FloatArray | float = 0.0) -> Change:
+    """Return the change that multiplies columns by a factor, counted from `zero` (k,) or ()."""
+    chosen = list(columns)
+
+    def change(values: FloatArray) -> FloatArray:
+        changed = np.array(values)
+        changed[:, chosen] = zero + factor * (values[:, chosen] - zero)
+        return changed
+
+    return change
+
+
+def scale_chosen(chosen: BoolArray, factor: float) -> Change:
+    """Return the change that multiplies chosen values (n, a) by a factor."""
+    return lambda values: np.where(chosen, factor * values, values)
+
+
+def permute_columns(columns: Sequence[int], sources: Sequence[int]) -> Change:
+    """Return the change that takes the values of columns from other columns."""
+    chosen, taken = list(columns), list(sources)
+
+    def change(values: FloatArray) -> FloatArray:
+        changed = np.array(values)
+        changed[:, chosen] = values[:, taken]
+        return changed
+
+    return change
+
+
+Slip = tuple[str, dict[str, Any], Change]
+"""Kind of a slip, what is read differently, and how."""
+
+
+@dataclass(frozen=True, eq=False)
+class Interpretation:
+    """One other way to read measurements.
+
+    Attributes
+    ----------
+    slip : kind of the slip, such as `unit`; its code in the catalog is `conventions.<slip>`.
+    details : what is read differently, such as quantity and factor.
+    source : file or kind that it concerns; empty where it concerns all data.
+    observation : index of the observations; None where the actuator readings are read differently.
+    change : of the measured values, row by row, or of the readings of all poses.
+    """
+
+    slip: str
+    details: Mapping[str, Any]
+    source: str
+    observation: int | None
+    change: Change
+
+    @property
+    def parts(self) -> tuple[Interpretation, ...]:
+        """The single interpretations that it consists of: itself."""
+        return (self,)
+
+    @property
+    def shrinks(self) -> bool:
+        """Whether values become smaller, so that they might no longer carry information."""
+        return bool(self.details.get("factor", 1.0) < 1.0)
+
+    @property
+    def code(self) -> str:
+        """Code of the slip in the catalog."""
+        return f"conventions.{self.slip}"
+
+    @property
+    def finding(self) -> Finding:
+        """The interpretation as a finding."""
+        return report_finding(self.code, source=self.source, **self.details)
+
+    def describe(self) -> dict[str, Any]:
+        """Return code, source and details, for the data of another finding."""
+        return {"code": self.code, "source": self.source, **self.details}
+
+    def __repr__(self) -> str:
+        return f"<Interpretation: {self.finding}>"
+
+    def apply(self, data: Measurements) -> Measurements:
+        """Return the measurements under this interpretation; covariances stay as stated."""
+        if self.observation is None:
+            return replace(data, readings=self.change(data.readings))
+        observations = list(data.observations)
+        rows = observations[self.observation]
+        observations[self.observation] = replace(rows, measured=self.change(rows.measured))
+        return replace(data, observations=tuple(observations))
+
+
+@dataclass(frozen=True, eq=False)
+class Combination(Interpretation):
+    """Two interpretations, the first applied first; its `change` and `observation` are unused.
+
+    Attributes
+    ----------
+    pair : the two.
+    """
+
+    pair: tuple[Interpretation, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Interpretation, ...]:
+        """The two interpretations."""
+        return self.pair
+
+    def apply(self, data: Measurements) -> Measurements:
+        """Return the measurements under both interpretations."""
+        for part in self.pair:
+            data = part.apply(data)
+        return data
+
+
+def combine(first: Interpretation, second: Interpretation) -> Combination:
+    """Return the combination of two interpretations."""
+    details = {"parts": (first.describe(), second.describe())}
+    return Combination("combination", details, "", None, second.change, (first, second))
+
+
+def name_source(i: int, data: Measurements) -> str:
+    """Return the source of an observation, such as a file, different from those of the others."""
+    sources = [rows.source for rows in data.observations]
+    if sources[i] and sources.count(sources[i]) == 1:
+        return sources[i]
+    return f"part {i + 1} of the data"
+
+
+# --- Interpretations of measured values: other units, orders, signs and columns.
+
+DEGREES = 180.0 / np.pi
+
+FACTORS: Mapping[Dimension, tuple[float, ...]] = {
+    Dimension.LENGTH: (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1),
+    Dimension.ANGLE: (
+        *(DEGREES, 1.0 / DEGREES, 1e3, 1e-3, 1e3 / DEGREES, DEGREES / 1e3),
+        *(60.0, 1.0 / 60.0, 0.9, 1.0 / 0.9),
+    ),
+}
+"""Factors by which the true values are larger than the written ones where a unit is wrong: m, mm,
+um, cm, inch; rad, deg, mrad, arcmin, gon.
+"""
+
+SINGLE_COLUMN_FACTORS = (1e3, 1e-3, 25.4, 1.0 / 25.4, DEGREES, 1.0 / DEGREES, 0.9, 1.0 / 0.9)
+"""Those of them that are also tested for single columns."""
+
+
+def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
+    """Yield all other interpretations of measured values, the likelier slip of each family first.
+
+    An interpretation that the kind itself rules out (a negative distance, an impossible tilt), or
+    that changes no number, is omitted.
+    """
+    several = len(data.observations) > 1
+    for i, rows in enumerate(data.observations):
+        if not len(rows):
+            continue
+        kind, measured, source = rows.kind, rows.measured, ""
+        if several:
+            unique = sum(other.kind.name == kind.name for other in data.observations) == 1
+            source = f"kind {kind.name!r}" if unique else name_source(i, data)
+        for slip, details, change in chain.from_iterable(rule(kind) for rule in RULES):
+            values = change(measured)
+            meant = np.isfinite(values) | np.isnan(measured)
+            same = np.allclose(values, measured, rtol=1e-12, atol=0.0, equal_nan=True)
+            if meant.all() and not same and not kind.find_invalid_rows(values):
+                yield Interpretation(slip, details, source, i, change)
+
+
+def describe_unit(quantity: str, dimension: Dimension, factor: float) -> dict[str, Any]:
+    """Return the details of a wrong unit."""
+    return {"quantity": quantity, "dimension": dimension.value, "factor": factor}
+
+
+def _list_units(kind: Kind) -> Iterator[Slip]:
+    if not kind.changes_with_pose and not kind.sensed_joints:
+        return  # gaps to a touched surface are 0 in every unit
+    groups = [
+        (name, d, [i for i, column in enumerate(kind.columns) if column.dimension is d], FACTORS[d])
+        for d, name in ((Dimension.LENGTH, "lengths"), (Dimension.ANGLE, "angles"))
+    ]
+    named = _columns_by_name(kind)
+    dimensions = [kind.columns[columns[0]].dimension for columns in named.values()]
+    for (name, columns), d in zip(named.items(), dimensions, strict=True):
+        if dimensions.count(d) > 1:
+            factors = tuple(f for f in FACTORS.get(d, ()) if f in SINGLE_COLUMN_FACTORS)
+            groups.append((name, d, columns, factors))
+    for name, d, columns, factors in groups:
+        for factor in factors if columns else ():
+            yield "unit", describe_unit(name, d, factor), scale_columns(columns, factor)
+
+
+def _list_rotations(kind: Kind) -> Iterator[Slip]:
+    whole = _orientation_columns(kind)
+    if whole is None:
+        return
+    form, angles, position = whole
+
+    def rewrite(rotation: Change, move: Change | None = None) -> Change:
+        """Return the change to another rotation (r, 3, 3) and another position (r, 3)."""
+
+        def change(values: FloatArray) -> FloatArray:
+            changed = np.array(values)
+            changed[:, angles] = form.from_matrix(rotation(values))
+            if move is not None:
+                changed[:, position] = move(values)
+            return changed
+
+        return change
+
+    def back(values: FloatArray) -> FloatArray:
+        return np.swapaxes(form.to_matrix(values[:, angles]), -1, -2)
+
+    def read_as(name: str) -> Change:
+        return lambda values: parse_orientation(name).to_matrix(values[:, angles])
+
+    def mirror(sign: FloatArray) -> Change:
+        return rewrite(
+            lambda values: sign[:, None] * form.to_matrix(values[:, angles]) * sign,
+            lambda values: sign * values[:, position],
+        )
+
+    if len(angles) == 4:
+        yield "scalar-last", {}, permute_columns(angles, [angles[i] for i in (3, 0, 1, 2)])
+    else:
+        eulers = [f"euler-{order}" for order in geometry.EULER_ORDERS]
+        for name in ("rotation-vector", "tilt-torsion", *eulers):
+            if name != form.name:
+                yield "orientation-form", {"form": name}, rewrite(read_as(name))
+    yield "inverted-rotations", {}, rewrite(back)
+    if position:
+        inverse = rewrite(back, lambda v: -(back(v) @ v[:, position, None])[..., 0])
+        yield "inverted-poses", {}, inverse
+        for k, axis in enumerate("xyz"):
+            sign = np.where(np.arange(3) == k, -1.0, 1.0)
+            yield "left-handed-frame", {"axis": axis}, mirror(sign)
+
+
+def _list_signs(kind: Kind) -> Iterator[Slip]:
+    for name, columns in _columns_by_name(kind).items():
+        yield "sign", {"column": name}, scale_columns(columns, -1.0)
+    angles = [i for i, column in enumerate(kind.columns) if column.dimension is Dimension.ANGLE]
+    if len(angles) > 1:
+        yield "angle-signs", {}, scale_columns(angles, -1.0)
+    if isinstance(kind, Bearing):
+        elevation = np.arange(len(kind.columns)) % 2 == 1
+        yield "zenith-angles", {}, lambda v: np.where(elevation, 0.5 * np.pi - v, v)
+
+
+def _list_swaps(kind: Kind) -> Iterator[Slip]:
+    named = _columns_by_name(kind)
+    dimension = {name: kind.columns[columns[0]].dimension for name, columns in named.items()}
+    for d in dict.fromkeys(dimension.values()):
+        alike = {name: columns for name, columns in named.items() if dimension[name] is d}
+        yield from _list_orders(alike, "columns")
+    yield from _list_orders(dict(kind.target_columns), "targets")
+
+
+def _list_orders(groups: Mapping[str, Sequence[int]], noun: str) -> Iterator[Slip]:
+    """Yield groups of columns in other orders: each two swapped, and the cyclic orders in both
+    directions.
+    """
+    names, n = tuple(groups), len(groups)
+    for a, b in combinations(names, 2):
+        change = permute_columns([*groups[a], *groups[b]], [*groups[b], *groups[a]])
+        yield f"swapped-{noun}", {noun: (a, b)}, change
+    turned = [(names[k:] + names[:k])[::step] for step in (1, -1) for k in range(n)]
+    for order in dict.fromkeys(turned):
+        if sum(a != b for a, b in zip(order, names, strict=True)) > 2:
+            sources = [i for name in order for i in groups[name]]
+            change = permute_columns([i for name in names for i in groups[name]], sources)
+            yield f"permuted-{noun}", {noun: names, "order": order}, change
+
+
+RULES = (_list_units, _list_rotations, _list_signs, _list_swaps)
+"""From a kind to the slips of one family, the likelier families first."""
+
+
+def _columns_by_name(kind: Kind) -> dict[str, list[int]]:
+    """Return columns of the same meaning in all targets, by name: x of every target."""
+    named: dict[str, list[int]] = {}
+    single = len(kind.target_columns) == 1
+    for places in kind.target_columns.values():
+        for place in places:
+            name = kind.columns[place].name
+            named.setdefault(name if single else name.rsplit(".", 1)[-1], []).append(place)
+    return named
+
+
+def _orientation_columns(kind: Kind) -> tuple[OrientationForm, list[int], list[int]] | None:
+    """Return form and columns of a whole orientation, and the columns of the position if there are
+    any; None for a kind without orientation.
+    """
+    if isinstance(kind, Pose):
+        n = len(kind.columns) - 3
+        return kind.form, list(range(n)), [n, n + 1, n + 2]
+    if not isinstance(kind, Component) or kind.form is None:
+        return None
+    names = kind.components
+    if not set(kind.form.columns) <= set(names):
+        return None
+    position = [names.index(n) for n in "xyz"] if {"x", "y", "z"} <= set(names) else []
+    return kind.form, [names.index(n) for n in kind.form.columns], position
+
+
+# --- Interpretations of actuator readings: other units, factors, signs, orders and rows.
+
+GEAR_FACTORS = (2.0, 0.5, 1.5, 1.0 / 1.5)
+"""Factors by which true readings are larger than the written ones where microsteps, a gear or a
+pulley are stated wrongly.
+"""
+
+NEGLIGIBLE = 1e-6
+"""Reading of the home pose [m or rad] that counts as 0."""
+
+MOST_PERMUTED = 4
+"""Number of actuators up to which all orders are tested."""
+
+
+def list_reading_interpretations(
+    data: Measurements, actuators: Sequence[Actuator], home: FloatArray | None = None
+) -> Iterator[Interpretation]:
+    """Yield all other interpretations of the readings of actuators, the likelier slips first.
+
+    Parameters
+    ----------
+    data : the measurements. actuators : of the robot.
+    home : (a,), optional [SI]. Readings of the home pose; wrong gear factors are also counted from
+        there, as for a machine that is homed to a reading other than 0.
+    """
+    for source, poses in _list_sources(data):
+        for dimension in dict.fromkeys(actuator.dimension for actuator in actuators):
+            chosen = poses[:, None] & np.array([a.dimension is dimension for a in actuators])
+            for factor in FACTORS.get(dimension, ()):
+                details = describe_unit("readings", dimension, factor)
+                yield Interpretation("unit", details, source, None, scale_chosen(chosen, factor))
+    for j, actuator in enumerate(actuators if len(actuators) > 1 else ()):
+        for factor in FACTORS.get(actuator.dimension, ()):
+            details = describe_unit(f"readings of {actuator.name}", actuator.dimension, factor)
+            yield Interpretation("unit", details, "", None, scale_columns([j], factor))
+    for rule in (
+        _list_reading_signs(actuators),
+        _list_reading_orders(actuators),
+        _list_gears(actuators, home),
+    ):
+        for slip, details, change in rule:
+            yield Interpretation(slip, details, "", None, change)
+    for shift, neighbor in ((1, "above"), (-1, "below")):
+        change = partial(np.roll, shift=shift, axis=0)
+        yield Interpretation("shifted-readings", {"neighbor": neighbor}, "", None, change)
+
+
+def list_orders(count: int) -> list[tuple[int, ...]]:
+    """Return other orders of `count` actuators.
+
+    All orders of up to `MOST_PERMUTED`. For more: each two swapped, neighbors swapped in all pairs,
+    odd before even numbers and the reverse of that, and the cyclic orders in both directions.
+    """
+    numbers = tuple(range(count))
+    if count <= MOST_PERMUTED:
+        return [order for order in permutations(numbers) if order != numbers]
+    orders = []
+    for a, b in combinations(numbers, 2):
+        order = list(numbers)
+        order[a], order[b] = b, a
+        orders.append(tuple(order))
+    orders += [(numbers[k:] + numbers[:k])[::step] for step in (-1, 1) for k in numbers]
+    if count % 2 == 0:
+        orders.append(tuple(i + 1 - 2 * (i % 2) for i in numbers))
+        half = count // 2
+        orders.append(numbers[::2] + numbers[1::2])
+        orders.append(tuple(half * (i % 2) + i // 2 for i in numbers))
+    return [order for order in dict.fromkeys(orders) if order != numbers]
+
+
+def _list_reading_signs(actuators: Sequence[Actuator]) -> Iterator[Slip]:
+    names, columns = tuple(a.name for a in actuators), range(len(actuators))
+    if len(names) > 1:
+        yield "reading-sign", {"actuators": names}, scale_columns(columns, -1.0)
+    for j in columns:
+        yield "reading-sign", {"actuators": (names[j],)}, scale_columns([j], -1.0)
+
+
+def _list_reading_orders(actuators: Sequence[Actuator]) -> Iterator[Slip]:
+    """Yield permutations of actuators of one dimension."""
+    names, dimensions = [a.name for a in actuators], [a.dimension for a in actuators]
+    columns = tuple(range(len(actuators)))
+    for order in list_orders(len(actuators)):
+        moved = [i for i in columns if order[i] != i]
+        if any(dimensions[i] is not dimensions[order[i]] for i in moved):
+            continue
+        change = permute_columns(columns, order)
+        if len(moved) == 2:
+            yield "swapped-readings", {"actuators": tuple(names[i] for i in moved)}, change
+        elif order == columns[::-1]:
+            yield "reversed-readings", {}, change
+        else:
+            details = {
+                "actuators": tuple(names[i] for i in moved),
+                "order": tuple(names[order[i]] for i in moved),
+            }
+            yield "permuted-readings", details, change
+
+
+def _list_gears(actuators: Sequence[Actuator], home: FloatArray | None) -> Iterator[Slip]:
+    """Yield wrong factors of all actuators and of single ones, counted from 0 and from home."""
+    names = tuple(a.name for a in actuators)
+    groups = [tuple(range(len(names))), *((j,) for j in range(len(names)) if len(names) > 1)]
+    zeros = [("zero", np.zeros(len(names)))]
+    if home is not None:
+        zeros.append(("home", np.asarray(home)))
+    for origin, zero in zeros:
+        for columns in groups:
+            if origin == "home" and not np.any(np.abs(zero[list(columns)]) > NEGLIGIBLE):
+                continue  # the same as from 0
+            for factor in GEAR_FACTORS:
+                details = {
+                    "actuators": tuple(names[j] for j in columns),
+                    "factor": factor,
+                    "origin": origin,
+                }
+                yield "gear-factor", details, scale_columns(columns, factor, zero[list(columns)])
+
+
+def _list_sources(data: Measurements) -> Iterator[tuple[str, BoolArray]]:
+    """Yield source and poses (n,): all of them, and those that only the rows of one source measure,
+    where sources have separate poses.
+    """
+    yield "", np.ones(data.n_poses, dtype=bool)
+    measures = np.zeros((len(data.observations), data.n_poses), dtype=bool)
+    for poses, rows in zip(measures, data.observations, strict=True):
+        poses[rows.rows.ravel()] = True
+    for i, poses in enumerate(measures & (measures.sum(axis=0) == 1)):
+        if poses.any() and np.array_equal(poses, measures[i]) and len(measures) > 1:
+            yield name_source(i, data), poses

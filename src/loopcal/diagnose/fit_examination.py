@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Examine a fit in one call: outliers, heavy tails, lack of fit, common errors, correlations,
+expected gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from loopcal.diagnose.adjusted_uncertainty import HeavyTails, check_heavy_tails
+from loopcal.diagnose.cluster_covariance import ClusterCheck, check_clusters
+from loopcal.diagnose.error_frames import FITTED, linearize_tool_errors, locate_measured_poses
+from loopcal.diagnose.outliers import OutlierCheck, find_outliers
+from loopcal.diagnose.repeated_poses import LackOfFit, check_lack_of_fit
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import linearize_fit
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.transmission import transmit_readings
+from loopcal.numerics.statistics import find_distinct
+from loopcal.presentation import HtmlResult
+from loopcal.typing import FloatArray, Progress, report_no_progress
+from loopcal.units import Dimension
+
+# --- Find parameters whose estimates are strongly correlated.
+
+STRONG = 0.9
+"""Correlation above which the error of one parameter is mostly that of another (81 % of its
+variance).
+"""
+
+
+@dataclass(frozen=True)
+class CorrelatedGroup:
+    """Parameters whose estimates are linked by correlations above STRONG, directly or in a chain.
+
+    Attributes
+    ----------
+    names : in the order of the table. pair, correlation : the two most strongly correlated ones.
+    """
+
+    names: tuple[str, ...]
+    pair: tuple[str, str]
+    correlation: float
+
+    @property
+    def finding(self) -> Finding:
+        """The group as a finding."""
+        return report_finding("residuals.correlated-parameters", **vars(self))
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the attributes and the finding for JSON."""
+        return {**vars(self), "finding": self.finding}
+
+
+def find_correlated_groups(
+    fit: Identification, strong: float = STRONG
+) -> tuple[CorrelatedGroup, ...]:
+    """Return the groups of strongly correlated parameters, the largest correlation first."""
+    sd = fit.standard_deviations
+    finite = np.isfinite(sd) & (sd > 0.0)
+    scale = np.where(finite, 1.0 / np.where(finite, sd, 1.0), np.nan)
+    rho = np.where(finite[:, None] & finite, fit.covariance, np.nan) * scale[:, None] * scale
+    linked = np.where(np.isnan(rho), 0.0, np.abs(rho)) > strong
+    np.fill_diagonal(linked, val=False)
+    group = np.arange(len(rho))
+    for i, j in np.argwhere(linked):
+        group[group == group[j]] = group[i]
+    groups = []
+    for number in find_distinct(group[linked.any(axis=1)]):
+        places = np.flatnonzero(group == number)
+        inner = np.where(linked[np.ix_(places, places)], np.abs(rho[np.ix_(places, places)]), 0.0)
+        a, b = (places[k] for k in np.unravel_index(int(np.argmax(inner)), inner.shape))
+        a, b = min(a, b), max(a, b)
+        names = tuple(fit.names[i] for i in places)
+        groups.append(CorrelatedGroup(names, (fit.names[a], fit.names[b]), float(rho[a, b])))
+    return tuple(sorted(groups, key=lambda g: -abs(g.correlation)))
+
+
+# --- Predict the gain of a calibration: pose errors expected from the tolerances, and after the
+# fit.
+
+GAIN = 1.1
+"""Factor by which an expected error must become smaller to count as an improvement."""
+
+ROUNDING = 1e-12
+"""Expected errors below this share of the robot's size, or this angle [rad], are rounding."""
+
+MOST_POSES = 200
+"""Largest number of poses at which errors are predicted, evenly chosen."""
+
+
+@dataclass(frozen=True)
+class CalibrationGain:
+    """Expected errors of the platform at the measured poses.
+
+    Attributes
+    ----------
+    position_before, position_after : root mean square over poses of the expected position error
+        [m].
+    angle_before, angle_after : the same of the orientation [rad].
+    is_worthwhile : whether either becomes smaller; None where it cannot be predicted.
+    finding : the expected errors, or the reason why there are none.
+    """
+
+    position_before: float
+    position_after: float
+    angle_before: float
+    angle_after: float
+    is_worthwhile: bool | None
+    finding: Finding
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes for JSON; `is_worthwhile` is called `calibrate` there."""
+        content = dict(vars(self))
+        content["calibrate"] = content.pop("is_worthwhile")
+        return content
+
+
+def estimate_calibration_gain(
+    fit: Identification, data: Measurements, frame: str = FITTED
+) -> CalibrationGain:
+    """Compare the errors expected after calibration with those that the tolerances allow.
+
+    Parameters
+    ----------
+    fit : an identification; its tolerances must be stated. data : the measurements it was made
+        from, or other readings.
+    frame : in which the errors are stated, see `choose_error_frame`; "relative"
+        means relative to the home pose.
+
+    Raises
+    ------
+    EstimationError : no such frame.
+    """
+    free = fit.free_parameters
+    if free.assumed.any():
+        return _unpredicted("model.gain-needs-tolerances", missing=int(free.assumed.sum()))
+    if fit.residual_test.failed:
+        return _unpredicted("model.gain-needs-consistent-noise")
+    solution = locate_measured_poses(fit, data, MOST_POSES)
+    # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
+    posterior = fit.posterior.without_discrepancy
+    variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
+    factor = posterior.directions * np.sqrt(variance)
+    if not len(solution.q) or np.isnan(factor).any():
+        return _unpredicted("model.gain-without-intervals")
+    effects = linearize_tool_errors(fit.posterior, solution, frame)
+    D, own = effects.by_parameters, (effects.by_frame, effects.by_discrepancy)
+    size = fit.robot.size
+    angle_before, position_before = _rms_errors(
+        (D * (free.tolerance / posterior.unit)) @ free.correlation_root(), size
+    )
+    angle_after, position_after = _rms_errors(np.concatenate([D @ factor, *own], axis=2), size)
+    pairs = ((position_before, position_after), (angle_before, angle_after))
+    is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)
+    finding = report_finding(
+        "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
+        position=_quantities(fit.robot, Dimension.LENGTH, *pairs[0]),
+        orientation=_quantities(fit.robot, Dimension.ANGLE, *pairs[1]),
+        **effects.reference.data,
+    )
+    return CalibrationGain(
+        position_before, position_after, angle_before, angle_after, is_worthwhile, finding
+    )
+
+
+def _unpredicted(code: str, **data: Any) -> CalibrationGain:
+    """Return the reason why there is no prediction."""
+    nan = float("nan")
+    return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
+
+
+def _rms_errors(factor: FloatArray, size: float) -> tuple[float, float]:
+    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k).
+
+    They are 0 where they are rounding, such as the orientation of a delta of this size [m].
+    """
+    square = (factor**2).sum(axis=2)
+    orientation = float(np.sqrt(square[:, :3].sum(axis=1).mean()))
+    position = float(np.sqrt(square[:, 3:].sum(axis=1).mean()))
+    return orientation * (orientation > ROUNDING), position * (position > ROUNDING * size)
+
+
+def _quantities(
+    robot: Mechanism, dimension: Dimension, before: float, after: float
+) -> tuple[Quantity, Quantity] | None:
+    """Return errors before and after in the unit of the robot's file; None where they are zero."""
+    if not before > 0.0:
+        return None
+    return robot.to_quantity(before, dimension), robot.to_quantity(after, dimension)
+
+
+@dataclass(frozen=True, eq=False)
+class FitExamination(HtmlResult):
+    """The results of all examinations of a fit by its own data.
+
+    Attributes
+    ----------
+    outliers : poses that do not fit the others. lack_of_fit : the test against repeated poses.
+    clusters : the uncertainty that allows for common errors of a day, session or pose.
+    correlated : groups of strongly correlated parameters. gain : expected errors before and after.
+    tails : the test of the other residuals for heavy tails.
+    """
+
+    outliers: OutlierCheck
+    lack_of_fit: LackOfFit
+    clusters: ClusterCheck
+    correlated: tuple[CorrelatedGroup, ...]
+    gain: CalibrationGain
+    tails: HeavyTails
+
+    JSON_FIELDS = {  # noqa: RUF012
+        "outliers": "outliers",
+        "lack_of_fit": "lack_of_fit",
+        "clusters": "clusters",
+        "correlated": "correlated",
+        "worth": "gain",
+        "heavy_tails": "tails",
+        "findings": "findings",
+    }
+
+    def __repr__(self) -> str:
+        names = ", ".join(finding.code for finding in self.findings) or "none"
+        return f"<FitExamination: findings: {names}>"
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All findings, the most important ones first."""
+        findings = [*self.outliers.findings, *self.tails.findings]
+        if self.gain.is_worthwhile is not None:
+            findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
+        if self.lack_of_fit.groups:
+            findings += self.lack_of_fit.findings
+        findings.append(self.clusters.finding)
+        return (*findings, *(group.finding for group in self.correlated))
+
+
+def examine_fit(
+    fit: Identification,
+    data: Measurements,
+    progress: Progress = report_no_progress,
+    frame: str = FITTED,
+) -> FitExamination:
+    """Examine a fit with the data it was made from.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    progress : receives the rounds of the search for outliers, which takes longest, and that the
+        other tests begin.
+    frame : in which expected errors are stated, see `choose_error_frame`.
+    """
+    check_fitted_data(fit, data)
+    outliers = find_outliers(fit, data, progress=progress)
+    progress(0, 1, "testing for common errors and heavy tails")
+    linear = None
+    if fit.converged and fit.residual_test.intervals:
+        filled = fill_in_reading_sigma(fit.robot, data)
+        linear = linearize_fit(fit, exclude_poses(filled, fit.options.excluded_poses))
+    return FitExamination(
+        outliers,
+        check_lack_of_fit(fit, data),
+        check_clusters(fit, data, frame, linear),
+        find_correlated_groups(fit),
+        estimate_calibration_gain(fit, data, frame),
+        check_heavy_tails(fit, data, outliers.suspects, linear),
+    )
+
+
+# --- Compute the errors of recorded actuator readings, per actuator and in terms of the driven
+# joint.
+
+
+@dataclass(frozen=True)
+class ReadingError:
+    """Recorded minus estimated readings of one actuator.
+
+    Attributes
+    ----------
+    name : of the actuator. count : number of readings.
+    reading, joint : root mean square of the reading and of the driven joint [SI], of these
+        dimensions.
+    largest : of the joint, by size, with its sign [SI]. pose : label of its pose.
+    """
+
+    name: str
+    count: int
+    reading: float
+    reading_dimension: Dimension
+    joint: float
+    joint_dimension: Dimension
+    largest: float
+    pose: str
+
+
+def compute_reading_errors(
+    fit: Identification, data: Measurements
+) -> tuple[ReadingError, ...] | None:
+    """Compare recorded readings with the estimated ones; None where the readings are exact.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    """
+    if fit.poses is None:
+        return None
+    robot, estimated, sigma = fit.robot, fit.poses.readings, fit.poses.sigma
+    recorded = exclude_poses(data, fit.options.excluded_poses).readings
+    compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
+    reading = np.where(compared, recorded - estimated, np.nan)
+    joint = np.where(
+        compared, _joint_values(robot, recorded) - _joint_values(robot, estimated), np.nan
+    )
+    limbs = robot.assembly.limbs
+    turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
+    dimensions = [
+        Dimension.LENGTH if turning.isdisjoint(a.driven_joints) else Dimension.ANGLE
+        for a in robot.actuators
+    ]
+    errors = []
+    for i, actuator in enumerate(robot.actuators):
+        if not compared[:, i].any():
+            continue
+        worst = int(np.nanargmax(np.abs(joint[:, i])))
+        errors.append(
+            ReadingError(
+                name=actuator.name,
+                count=int(compared[:, i].sum()),
+                reading=float(np.sqrt(np.nanmean(reading[:, i] ** 2))),
+                reading_dimension=actuator.dimension,
+                joint=float(np.sqrt(np.nanmean(joint[:, i] ** 2))),
+                joint_dimension=dimensions[i],
+                largest=float(joint[worst, i]),
+                pose=fit.poses.labels[worst],
+            )
+        )
+    return tuple(errors) or None
+
+
+def _joint_values(robot: Mechanism, readings: FloatArray) -> FloatArray:
+    """Return the values (n, a) of the driven joints, or their sums, at these readings."""
+    _, tau = robot.slots(robot.values[None])
+    return transmit_readings(readings[None], tau, robot.slots.frequency)[0]

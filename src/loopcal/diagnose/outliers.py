@@ -1,0 +1,610 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detect poses that do not fit the others, at a false-alarm rate for the whole data set.
+
+Rows that belong together form an observation block: a pose, or several poses that share rows. Each
+block is compared with the prediction of all others. It is an outlier where the probability of its
+distance is below 1 - (1 - level)^(1/u), u blocks tested (Sidak), so that data without a wrong block
+raise no alarm in 95 % of cases. Several wrong blocks hide each other: see `outlier_search`. With
+one degree of freedom every block explains the misfit of all, and none is named. Nothing is removed
+from the data: the result names the blocks for whoever decides.
+
+The distance is judged by the noise that the other blocks show (an F ratio), not by the stated one.
+A wrong sigma therefore makes no outliers, and a misfit that is spread over all blocks names none.
+The stated noise counts only where the others leave fewer than five degrees of freedom.
+
+A fit that contradicts the stated noise is no good reference: one wrong row of a meter pulls the
+geometry so far that right poses seem wrong. Blocks are then compared at a robust fit (Tukey).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from loopcal.diagnose.influence import Influence, compute_influence
+from loopcal.errors import LoopcalError
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.identification import identify
+from loopcal.estimate.linearization import Start
+from loopcal.estimate.losses import Tukey
+from loopcal.estimate.observation_rows import linked_blocks, list_block_labels
+from loopcal.estimate.penalties import decompose_for
+from loopcal.estimate.problem import Problem, problem_of
+from loopcal.estimate.residual_test import FEWEST_DEGREES, SIGNIFICANCE
+from loopcal.estimate.result import Identification
+from loopcal.estimate.robust_descent import estimate_scale_of, measure_block_distances
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.numerics.statistics import (
+    compute_chi_square_quantile,
+    compute_chi_square_tail,
+    compute_f_tail,
+    compute_single_level,
+)
+from loopcal.presentation import TableResult
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
+
+# --- Search the observation blocks that a fit to all others does not explain.
+
+MOST_ROUNDS = 20
+"""Largest number of searches with other suspects."""
+
+MOST_EXCLUDED = 0.5
+"""Largest share of excluded blocks; beyond it nothing can be said of the others."""
+
+SMALLEST_NOISE = 1e-12
+"""Variance of the noise, in units of the stated one, below which residuals are rounding."""
+
+MOST_COMPARED = 10
+"""Suspects, farthest first, that are compared with others which would do as well; more suspects are
+a matter of the model.
+"""
+
+
+class JudgingNoise(NamedTuple):
+    """The noise by which each of u blocks is judged: that of the other fitted blocks.
+
+    Attributes
+    ----------
+    variance : (u,) of the whitened rows, in units of the stated one.
+    degrees : (u,) its degrees of freedom; infinite where the stated noise counts, 0 where nothing
+        is known of it.
+    """
+
+    variance: FloatArray
+    degrees: FloatArray
+
+
+class PartialFit(NamedTuple):
+    """A linear fit without some of u blocks, and its influence on every block.
+
+    Attributes
+    ----------
+    excluded : (u,) blocks that are not fitted. influence : of all blocks.
+    scale : factor on sigma; NaN where it is to be estimated and the fitted blocks do not show it.
+    directions : number of directions that the fit determines.
+    noise : by which noise each block is judged; by default that of `scale`, as if it were known.
+    left : degrees of freedom of `scale`; 0 where the stated noise counts.
+    """
+
+    excluded: BoolArray
+    influence: Influence
+    scale: float
+    directions: int
+    noise: JudgingNoise | None = None
+    left: float = 0.0
+
+    @property
+    def tested(self) -> int:
+        """Number of blocks that have a degree of freedom."""
+        return int((self.influence.degrees > 0).sum())
+
+    @property
+    def ratio(self) -> FloatArray:
+        """(u,) distance per degree of freedom in units of the noise; zero without a test."""
+        degrees = self.influence.degrees
+        ratio = self.influence.distance / np.maximum(degrees, 1)
+        variance = self.scale**2 if self.noise is None else self.noise.variance
+        return np.where(degrees > 0, ratio, 0.0) / variance
+
+    def p_value(self) -> FloatArray:
+        """Return (u,) the probability of a larger distance; 1 where there is no test."""
+        left = np.inf if self.noise is None else self.noise.degrees
+        p_value = compute_f_tail(self.influence.degrees, left, self.ratio)
+        return np.where(np.isnan(p_value), 1.0, p_value)
+
+    @property
+    def contradicts_noise(self) -> bool:
+        """Whether the fitted blocks exceed the stated noise beyond doubt."""
+        square = self.left * self.scale**2
+        return self.left > 0.0 and bool(compute_chi_square_tail(self.left, square) < SIGNIFICANCE)
+
+    def determines_as_much(self, whole: PartialFit) -> bool:
+        """Return whether the fitted blocks determine as many directions as all blocks do, and the
+        noise where it is estimated.
+        """
+        return self.directions >= whole.directions and bool(np.isfinite(self.scale))
+
+
+class Refit(Protocol):
+    """From the excluded blocks (u,) to the linear fit without them."""
+
+    def __call__(self, excluded: BoolArray) -> PartialFit:
+        """Fit without these blocks."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSearch:
+    """A search for blocks that do not fit.
+
+    Attributes
+    ----------
+    refit : see `Refit`. whole : the fit to all blocks. limit : p-value below which a block is a
+        suspect. fits : the fit without the suspects, or all fits of a cycle.
+    """
+
+    refit: Refit
+    whole: PartialFit
+    limit: float
+    fits: tuple[PartialFit, ...]
+
+    @property
+    def end(self) -> PartialFit:
+        """The last fit."""
+        return self.fits[-1]
+
+    @property
+    def is_converged(self) -> bool:
+        """Whether the same blocks were suspected twice."""
+        return len(self.fits) == 1
+
+
+def search_blocks(
+    refit: Refit, low_weight: BoolArray, level: float, progress: Progress = report_no_progress
+) -> BlockSearch:
+    """Search the blocks that the others do not explain.
+
+    Parameters
+    ----------
+    low_weight : (u,) blocks with a small weight in a robust fit; the search begins without them.
+    level : probability of any suspect where all blocks are right.
+    """
+    whole = first = refit(np.zeros_like(low_weight))
+    if low_weight.any() and (without := refit(low_weight)).determines_as_much(whole):
+        first = without
+    limit = compute_single_level(level, whole.tested)
+    most = int(MOST_EXCLUDED * whole.tested)
+    fits = search_suspects(refit, whole, first, limit, most, progress)
+    return BlockSearch(refit, whole, limit, fits)
+
+
+def fit_without(
+    fit: Identification,
+    problem: Problem,
+    member: IntArray,
+    excluded: BoolArray,
+    deviation: FloatArray,
+    start: Start,
+    noise: str,
+) -> PartialFit:
+    """Fit linearly without the excluded blocks (u,), and compute the influence of every block.
+
+    Parameters
+    ----------
+    fit : its method and rank tolerance are used. problem : of its data, unweighted.
+    member : (n,) block of each pose. deviation, start : (1, p) to linearize at, and a warm start.
+    noise : "given", or "estimated" from the fitted blocks.
+    """
+    weight = (~excluded).astype(np.float64)
+    weighted = problem.weighted(weight[member])
+    solution = weighted.solve(deviation, start, derivatives=True)
+    kept = weighted.linearize_at(deviation, start, solution)
+    d = decompose_for(fit.method, kept.factor, kept.equations, deviation, fit.spectrum.tolerance)
+    penalty = np.array(fit.method.penalty(d), dtype=np.float64)
+    fits = [(q, d.deviation(d.solution(q))) for q in (penalty, np.where(d.used, 0.0, np.inf))]
+    # poses that are estimated depend on the excluded rows, which the influence needs
+    shared = None if problem.is_uncertain else solution
+    influence, plain = compute_influence(problem, kept, member, d, fits, weight, shared)
+    left, is_given = float(d.rows[0] - d.rank[0]), noise == "given"
+    judging = judge_noise(float(d.unexplained[0]), left, plain, excluded, is_given)
+    scale, directions = 1.0 if is_given else np.nan, int(np.isfinite(penalty).sum())
+    if left < (FEWEST_DEGREES if is_given else 1):
+        return PartialFit(excluded, influence, scale, directions, judging)
+    scale = float(np.sqrt(max(d.unexplained[0] / left, SMALLEST_NOISE)))
+    return PartialFit(excluded, influence, scale, directions, judging, left)
+
+
+def judge_noise(
+    unexplained: float, degrees: float, plain: Influence, excluded: BoolArray, is_given: bool
+) -> JudgingNoise:
+    """Return the noise that the fitted blocks show to each block: without its own residuals, so
+    that a wrong block cannot hide in it. No prior contributes.
+
+    The sum of squares that no parameter explains is lower by d_j^2 without block j, and its
+    degrees of freedom by those of d_j^2 (least squares). Where fewer than five are left, stated
+    noise counts as it is.
+
+    Parameters
+    ----------
+    unexplained, degrees : sum of squares of all fitted blocks that no parameter explains.
+    plain : influence (u,) on the fit by least squares. excluded : (u,) blocks that are not fitted.
+    is_given : whether the noise is stated.
+    """
+    left = degrees - np.where(excluded, 0, plain.degrees)
+    square = unexplained - np.where(excluded, 0.0, plain.distance)
+    is_shown = left >= (FEWEST_DEGREES if is_given else 1)
+    variance = np.maximum(square / np.where(is_shown, left, 1.0), SMALLEST_NOISE)
+    otherwise = np.inf if is_given else 0.0
+    return JudgingNoise(np.where(is_shown, variance, 1.0), np.where(is_shown, left, otherwise))
+
+
+def search_suspects(
+    refit: Refit,
+    whole: PartialFit,
+    first: PartialFit,
+    limit: float,
+    most: int,
+    progress: Progress = report_no_progress,
+) -> tuple[PartialFit, ...]:
+    """Exclude suspects until the same ones are suspected twice.
+
+    Parameters
+    ----------
+    refit : see `Refit`. whole : the fit to all blocks. first : where the search begins.
+    limit : p-value below which a block is a suspect. most : largest number of excluded blocks.
+
+    Returns
+    -------
+    The fit without the suspects, or all fits of a cycle.
+    """
+    fits = [first]
+    while len(fits) <= MOST_ROUNDS:
+        progress(len(fits) - 1, MOST_ROUNDS, "searching for outliers")
+        last = fits[-1]
+        beyond = np.flatnonzero(last.p_value() < limit)
+        order = beyond[np.argsort(-last.ratio[beyond], kind="stable")][:most]
+        after = _exclude_farthest(refit, order, whole)
+        if (after.excluded == last.excluded).all():
+            return (last,)
+        repeated = [i for i, old in enumerate(fits) if (old.excluded == after.excluded).all()]
+        if repeated:
+            return tuple(fits[repeated[0] :])
+        fits.append(after)
+    return tuple(fits)
+
+
+def find_rivals(search: BlockSearch, progress: Progress = report_no_progress) -> list[BoolArray]:
+    """Return groups (u,) of blocks of which excluding one does as well as excluding another.
+
+    With i back in the fit, excluding block j lowers chi-square by d_j^2, and excluding i after that
+    by at least d_i^2 - d_j^2; so only a j whose d_j^2 comes near d_i^2 can replace i.
+    """
+    refit, whole, end, limit = search.refit, search.whole, search.end, search.limit
+    groups: list[BoolArray] = []
+    suspects = np.flatnonzero(end.excluded)
+    suspects = suspects[np.argsort(-end.ratio[suspects], kind="stable")][:MOST_COMPARED]
+    for done, i in enumerate(suspects):
+        progress(done, len(suspects), "comparing suspected poses with others")
+        far = float(compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit))
+        if not _may_have_rivals(end, i, far):
+            continue
+        excluded = end.excluded.copy()
+        excluded[i] = False
+        back = refit(excluded)
+        square = back.influence.distance / end.scale**2
+        group = np.zeros_like(excluded)
+        near = ~end.excluded & (back.p_value() < limit) & (square > square[i] - far)
+        for j in np.flatnonzero(near):
+            excluded[j] = True
+            instead = refit(excluded)
+            excluded[j] = False
+            group[j] = instead.determines_as_much(whole) and instead.p_value()[i] >= limit
+        if group.any():
+            group[i] = True
+            groups.append(group)
+    return _join_groups(groups)
+
+
+def _may_have_rivals(end: PartialFit, i: int, far: float) -> bool:
+    """Return whether any d_j^2 may come within `far` of d_i^2 with block i back in the fit.
+
+    Block i then moves the fit by at most d_i in the norm of the information, and d_j by at most
+    sqrt(g / (1 - g)) d_i, where the largest eigenvalue g of G_j is at most the leverage of j. Both
+    d_i^2 and the information of the others are as before. Where one of very many blocks is far off,
+    this takes the place of a fit.
+    """
+    leverage, distance = end.influence.leverage, np.sqrt(end.influence.distance) / end.scale
+    inside = np.where(leverage < 1.0, leverage, 0.0)
+    moved = np.where(leverage < 1.0, np.sqrt(inside / (1.0 - inside)), np.inf)
+    largest = np.where(end.excluded, 0.0, distance + moved * distance[i])
+    return bool((largest**2 > distance[i] ** 2 - far).any())
+
+
+def list_suspected_in_turn(fits: tuple[PartialFit, ...]) -> list[BoolArray]:
+    """Return the one group (u,) of the blocks that only some of the fits exclude."""
+    excluded = np.array([fit.excluded for fit in fits])
+    group: BoolArray = np.any(excluded, axis=0) & ~np.all(excluded, axis=0)
+    return [group]
+
+
+def _exclude_farthest(refit: Refit, order: IntArray, whole: PartialFit) -> PartialFit:
+    """Exclude as many blocks of the order as possible without losing a direction, by bisection."""
+    possible, impossible, best = 0, len(order) + 1, whole
+    count = len(order)
+    while impossible - possible > 1:
+        excluded = np.zeros_like(whole.excluded)
+        excluded[order[:count]] = True
+        fit = refit(excluded)
+        if fit.determines_as_much(whole):
+            possible, best = count, fit
+        else:
+            impossible = count
+        count = (possible + impossible) // 2
+    return best
+
+
+def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
+    """Join groups that share a block."""
+    joined: list[BoolArray] = []
+    for group in groups:
+        apart = [other for other in joined if not (other & group).any()]
+        shared = [other for other in joined if (other & group).any()]
+        joined = [*apart, np.any([group, *shared], axis=0)]
+    return joined
+
+
+MOST_ROBUST = 20_000
+"""Blocks that a robust fit is made from: it is where the others are compared, not a result."""
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A block that does not fit the others.
+
+    Attributes
+    ----------
+    poses : its labels. distance : squared Mahalanobis norm of its residual against a fit of the
+        others. degrees : degrees of freedom of the distance. p_value : probability of a larger one,
+        for this block alone.
+    """
+
+    poses: tuple[str, ...]
+    distance: float
+    degrees: int
+    p_value: float
+
+    @property
+    def finding(self) -> Finding:
+        """The outlier as a finding."""
+        return report_finding(
+            "outliers.pose",
+            poses=self.poses,
+            factor=float(np.sqrt(self.distance / self.degrees)),
+            residuals=self.degrees,
+            p_value=self.p_value,
+        )
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Blocks that contradict each other, any one of which may be wrong.
+
+    Attributes
+    ----------
+    poses : labels of each block. times : largest distance from a fit to all, in units of the
+        expected noise.
+    """
+
+    poses: tuple[tuple[str, ...], ...]
+    times: float
+
+    @property
+    def finding(self) -> Finding:
+        """The conflict as a finding."""
+        return report_finding("outliers.conflict", poses=self.poses, factor=self.times)
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierCheck(TableResult):
+    """The result for all blocks.
+
+    Attributes
+    ----------
+    outliers : blocks that do not fit, farthest first. ambiguous : groups of blocks of which at
+        least one does not fit.
+    is_converged : whether the same blocks were suspected twice; otherwise those suspected in turn
+        are ambiguous.
+    level : probability of any outlier where all blocks are right.
+    blocks : number of tested blocks. poses : labels of each of the u blocks.
+    influence : of all blocks, with the suspects excluded. scale : factor on sigma used.
+    summary : the finding on all blocks.
+    """
+
+    outliers: tuple[Outlier, ...]
+    ambiguous: tuple[Conflict, ...]
+    is_converged: bool
+    level: float
+    blocks: int
+    poses: tuple[tuple[str, ...], ...]
+    influence: Influence
+    scale: float
+    summary: tuple[Finding, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels of all poses of the outliers."""
+        return tuple(label for outlier in self.outliers for label in outlier.poses)
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Labels of all poses of the outliers, and of the blocks of which one does not fit."""
+        blocks = (poses for conflict in self.ambiguous for poses in conflict.poses)
+        return (*self.names, *(label for poses in blocks for label in poses))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The summary, then every outlier and every conflict.
+
+        With one degree of freedom all blocks contradict each other by the same number, which the
+        test of the residuals reports.
+        """
+        if [finding.code for finding in self.summary] == ["outliers.one-degree"]:
+            return self.summary
+        details = [result.finding for result in (*self.outliers, *self.ambiguous)]
+        return (*self.summary, *details)
+
+    def __repr__(self) -> str:
+        return f"<OutlierCheck: {len(self.outliers)} of {self.blocks} blocks are outliers>"
+
+    def __str__(self) -> str:
+        return "\n".join(str(finding) for finding in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result by name for JSON."""
+        mean = self.influence.leverage.sum() / max(int(self.influence.residuals.sum()), 1)
+        return {
+            "outliers": self.outliers,
+            "undecided": self.ambiguous,
+            "settled": self.is_converged,
+            "level": self.level,
+            "blocks": self.blocks,
+            "scale": self.scale,
+            "mean_leverage": float(mean),
+            "findings": self.findings,
+        }
+
+
+def find_outliers(
+    fit: Identification,
+    data: Measurements,
+    level: float = 0.05,
+    progress: Progress = report_no_progress,
+) -> OutlierCheck:
+    """Find the observation blocks that do not fit what all others predict.
+
+    Parameters
+    ----------
+    fit : the identification, with or without a loss. data : the measurements it was made from.
+    level : probability of naming any block where none is wrong.
+    progress : receives the rounds of the search.
+    """
+    check_fitted_data(fit, data)
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    problem = problem_of(fit.free_parameters, data, fit.options.nuisance)
+    member = np.unique(linked_blocks(data), return_inverse=True)[1]
+    labels = list_block_labels(data.labels, member)
+    reference = _refit_robustly(fit, data, member, progress) if fit.residual_test.failed else fit
+    z = fit.free_parameters.deviation(reference.robot.values[None])
+    start = problem.linearize(z, problem.start(z)).next_start
+    low_weight = np.zeros(len(labels), dtype=bool)
+    if len(reference.pose_weights) == len(member):
+        low_weight[member] = reference.pose_weights < 0.5
+    else:
+        low_weight = _weigh_blocks(problem, z, start, member) < 0.5
+
+    noise = fit.residual_test.noise
+    refit = partial(fit_without, fit, problem, member, deviation=z, start=start, noise=noise)
+    search = search_blocks(refit, low_weight, level, progress)
+    if search.is_converged:
+        groups = find_rivals(search, progress)
+    else:
+        groups = list_suspected_in_turn(search.fits)
+    fits, end, tested = search.fits, search.end, search.whole.tested
+    always = np.all([each.excluded for each in fits], axis=0)
+    ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
+    outliers = _list_outliers(end, labels, always & ~ambiguous)
+    ratio = np.sqrt(search.whole.ratio)
+    conflicts = tuple(
+        Conflict(tuple(labels[i] for i in np.flatnonzero(group)), float(ratio[group].max()))
+        for group in groups
+    )
+    counts = {"outliers": len(outliers), "ambiguous": int(ambiguous.sum()), "blocks": tested}
+    single = all(len(poses) == 1 for poses in labels)
+    shared = {"blocks": tested, "single_poses": single}
+    summary = _summarize(fit, counts, level, shared, is_converged=search.is_converged)
+    if noise == "given" and outliers and end.contradicts_noise:
+        times = report_finding("outliers.larger-noise", times=end.scale, **shared)
+        summary = (times, *summary)
+    return OutlierCheck(
+        outliers,
+        conflicts,
+        search.is_converged,
+        level,
+        tested,
+        labels,
+        end.influence,
+        end.scale,
+        summary,
+    )
+
+
+def _refit_robustly(
+    fit: Identification, data: Measurements, member: IntArray, progress: Progress
+) -> Identification:
+    """Return a robust fit; the fit itself where it does not converge.
+
+    `member` (n,) is the block of each pose. Of many blocks, an even choice is fitted.
+    """
+    count = int(member.max()) + 1
+    if count > MOST_ROBUST:
+        chosen = np.linspace(0, count - 1, MOST_ROBUST).astype(np.int64)
+        data = data.take(np.isin(member, chosen))
+    options = replace(fit.options, loss=Tukey(), noise="estimated")
+    try:
+        robust = identify(fit.initial, data, options=options, progress=progress)
+    except LoopcalError:
+        return fit
+    return robust if robust.converged else fit
+
+
+def _list_outliers(
+    end: PartialFit, labels: tuple[tuple[str, ...], ...], is_outlier: BoolArray
+) -> tuple[Outlier, ...]:
+    """Return the outliers among the blocks (u,) of a fit without them, the least probable first."""
+    p_value, degrees = end.p_value(), end.influence.degrees
+    return tuple(
+        Outlier(labels[i], float(end.ratio[i] * degrees[i]), int(degrees[i]), float(p_value[i]))
+        for i in np.argsort(p_value, kind="stable")
+        if is_outlier[i]
+    )
+
+
+def _weigh_blocks(problem: Problem, z: FloatArray, start: Start, member: IntArray) -> FloatArray:
+    """Return the weights (u,) of blocks in a robust fit at z (1, p), which others determined."""
+    distance, degrees = measure_block_distances(problem, z, start, member, problem)
+    return Tukey().weight(distance / estimate_scale_of(distance, degrees), degrees)
+
+
+def _summarize(
+    fit: Identification,
+    counts: dict[str, int],
+    level: float,
+    shared: dict[str, Any],
+    *,
+    is_converged: bool,
+) -> tuple[Finding, ...]:
+    """Return the findings on all blocks together."""
+    blocks, ambiguous = counts["blocks"], counts["ambiguous"]
+    if blocks == 0:
+        return (report_finding("outliers.not-testable"),)
+    if blocks == 1:
+        return (report_finding("outliers.single-block"),)
+    if round(fit.residual_test.dof) <= 1:
+        is_given = fit.residual_test.noise == "given"
+        return (report_finding("outliers.one-degree" if is_given else "outliers.unknown-noise"),)
+    findings = []
+    if count := counts["outliers"]:
+        findings.append(report_finding("outliers.some", count=count, level=level, **shared))
+    if ambiguous or not is_converged:
+        code = "outliers.ambiguous" if is_converged else "outliers.search-not-converged"
+        findings.append(report_finding(code, count=ambiguous, **shared))
+    if findings:
+        return tuple(findings)
+    if fit.residual_test.failed:
+        return (report_finding("outliers.none-but-misfit", **shared),)
+    return (report_finding("outliers.none", level=level, **shared),)

@@ -1,0 +1,636 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Test whether residuals depend on order, time, temperature, session or actuator readings.
+
+With r the residuals that no parameter explains, of nu degrees of freedom (`ResidualRows`), and Q
+the basis of the part of an effect's columns that nothing estimated explains, of rank q,
+
+    F = |Q'r|^2 / q  /  ((|r|^2 - |Q'r|^2) / (nu - q))
+
+has an F distribution for independent normal errors of any size. The correlation of neighbors in the
+order of measurement is r'L r / |r|^2, L the mean of the shifts by one row in both directions within
+every series. Its mean and variance for independent errors follow from the traces of M L and
+(M L)^2, M = I - U U'; it is compared with the beta distribution on (-1, 1) of these moments.
+Source: Durbin and Watson, Testing for serial correlation in least squares regression, Biometrika
+37 (1950) and 58 (1971).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.estimate.fit_linearization import FitLinearization
+from loopcal.estimate.result import Identification
+from loopcal.measure.kinds.kind import list_error_groups
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.statistics import compute_any_probability, compute_f_tail, find_distinct
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
+
+# --- The residuals of a fit that no parameter explains, in the order of measurement.
+
+EXPLAINED = 1e-6
+"""Share of its length below which a column counts as explained by other columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualRows:
+    """R whitened rows of a fit, those of one series (a kind and its column) in order.
+
+    Attributes
+    ----------
+    basis : (R, q) orthonormal, what is estimated. residual : (R,) of the least-squares fit.
+    gain : (R, k) change of the k directions of the fit by an error of each row.
+    root : (p, k) these directions [SI]: an error e of the rows changes the estimate by
+        root gain' e, up to its sign.
+    kind, row, column : (R,) number of the kind, of its row, and of its residual.
+    series : (R,) number of the series, in ascending order.
+    """
+
+    basis: FloatArray
+    residual: FloatArray
+    gain: FloatArray
+    root: FloatArray
+    kind: IntArray
+    row: IntArray
+    column: IntArray
+    series: IntArray
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom of the residuals."""
+        return self.basis.shape[0] - self.basis.shape[1]
+
+    @cached_property
+    def square(self) -> float:
+        """Sum of squares of the residuals."""
+        return float((self.residual**2).sum())
+
+    def project(self, columns: FloatArray) -> FloatArray:
+        """Return the part of columns (R, c) that nothing estimated explains; zero where that is
+        rounding.
+        """
+        left = columns - self.basis @ (self.basis.T @ columns)
+        left -= self.basis @ (self.basis.T @ left)  # the first projection leaves rounding
+        size = np.linalg.norm(columns, axis=0)
+        return np.where(np.linalg.norm(left, axis=0) > EXPLAINED * size, left, 0.0)
+
+    def with_effects(self, columns: FloatArray) -> ResidualRows:
+        """Return the rows as if the fit had also estimated effects with these columns (R, c)."""
+        new = span_columns(self.project(columns))
+        left = self.residual - new @ (new.T @ self.residual)
+        return replace(self, basis=np.concatenate([self.basis, new], axis=1), residual=left)
+
+    def without(self, rows: IntArray) -> ResidualRows:
+        """Return the rows as if the fit had not used some of them (w,)."""
+        kept = np.ones(len(self.residual), dtype=bool)
+        kept[rows] = False
+        basis = span_columns(self.basis[kept])
+        left = self.residual[kept] - basis @ (basis.T @ self.residual[kept])
+        return replace(
+            self,
+            basis=basis,
+            residual=left,
+            gain=self.gain[kept],
+            kind=self.kind[kept],
+            row=self.row[kept],
+            column=self.column[kept],
+            series=self.series[kept],
+        )
+
+
+def span_columns(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (R, q) of columns (R, c), each scaled to length one."""
+    length = np.linalg.norm(columns, axis=0)
+    scaled = columns[:, length > 0.0] / length[length > 0.0]
+    if not scaled.size:
+        return scaled
+    Q, R = np.linalg.qr(scaled)  # the triangle first: LAPACK divides and conquers many rows
+    try:
+        inner, s, _ = np.linalg.svd(R, full_matrices=False)
+    except np.linalg.LinAlgError:  # divide and conquer may fail; the slower driver does not
+        from scipy.linalg import svd
+
+        inner, s, _ = svd(R, full_matrices=False, lapack_driver="gesvd")
+    u = Q @ inner
+    return np.asarray(u[:, s > EXPLAINED])
+
+
+def collect_residual_rows(
+    fit: Identification, data: Measurements, linear: FitLinearization
+) -> ResidualRows | None:
+    """Return the residuals of a fit in the order of measurement; None where rows cannot be told
+    apart, because their readings are uncertain, or where there are none.
+
+    Parameters
+    ----------
+    fit : with intervals. data : its measurements, with the sigma of their readings, without
+        excluded poses. linear : of both, see `linearize_fit`.
+    """
+    if linear.problem.is_uncertain:
+        return None
+    observations = [rows for rows in data.observations if len(rows)]
+    row_groups = list(_iterate_rows(linear, observations))
+    if not row_groups:
+        return None
+    rows, kind, row, column = (np.concatenate(arrays) for arrays in zip(*row_groups, strict=True))
+    first = np.cumsum([0, *(o.present.shape[1] for o in observations)])
+    series = first[kind] + column
+    place = np.concatenate([order_rows(o) for o in observations])
+    start = np.cumsum([0, *(len(o) for o in observations)])
+    order = np.lexsort((place[start[kind] + row], series))
+    rows, kind, row, column = rows[order], kind[order], row[order], column[order]
+    d, p = linear.decomposition, len(fit.names)
+    used = linear.is_estimated
+    V = d.scale[:, None] * d.directions[0][:, used]
+    by_direction = rows[:, -p - 1 : -1] @ V
+    total = (d.singular_values[0] ** 2 + linear.penalty[0])[used]
+    determined = d.scale[:, None] * d.directions[0][:, d.used[0]]
+    machine = rows[:, -p - 1 : -1] @ (determined / d.singular_values[0][d.used[0]])
+    basis = span_columns(np.concatenate([rows[:, : -p - 1], machine], axis=1))
+    residual = rows[:, -1] - basis @ (basis.T @ rows[:, -1])
+    return ResidualRows(
+        basis=basis,
+        residual=residual,
+        gain=by_direction / total,
+        root=fit.tolerance[:, None] * V,
+        kind=kind,
+        row=row,
+        column=column,
+        series=np.unique(series[order], return_inverse=True)[1],
+    )
+
+
+def order_rows(rows: Observations) -> IntArray:
+    """Return the place (r,) of each row in the order of measurement: by time where all rows state
+    it, else as in the file.
+    """
+    place = np.arange(len(rows))
+    time = rows.context.get("time")
+    if time is not None and np.isfinite(time).all():
+        place[np.argsort(time, kind="stable")] = np.arange(len(rows))
+    return place
+
+
+def _iterate_rows(
+    linear: FitLinearization, observations: list[Observations]
+) -> Iterator[tuple[FloatArray, IntArray, IntArray, IntArray]]:
+    """Give rows (k, U + p + 1) that are present, with their kind, row and column (k,)."""
+    for node_rows in linear.problem.leverage_rows(linear.linearization, linear.solution):
+        for part in node_rows:
+            present = np.diagonal(observations[part.kind].whitener, axis1=1, axis2=2) != 0.0
+            i, column = np.nonzero(present[part.numbers])
+            kind = np.full(len(i), part.kind)
+            yield part.rows[i, column], kind, part.numbers[i], column
+
+
+# --- Effects that the residuals of a fit may depend on: time, temperature, session, actuator
+# reading.
+
+ORDER, TIME, TEMPERATURE, SESSION, READING = "order", "time", "temperature", "session", "reading"
+"""What residuals may depend on."""
+
+
+class EffectColumn(NamedTuple):
+    """One function of the quantity, for one measured component.
+
+    Attributes
+    ----------
+    component : its name, such as "z". dimension : of its size.
+    """
+
+    component: str
+    dimension: Dimension
+
+
+class Effect(NamedTuple):
+    """A dependence of the measured values on one quantity.
+
+    Attributes
+    ----------
+    source : what it depends on, such as "time". name : of the temperature or actuator, else empty.
+    columns : (R, c) whitened rows by the sizes. labels : what the c columns are.
+    """
+
+    source: str
+    name: str
+    columns: FloatArray
+    labels: tuple[EffectColumn, ...]
+
+
+def list_effects(rows: ResidualRows, data: Measurements, robot: Mechanism) -> tuple[Effect, ...]:
+    """Return the effects that measurements can have.
+
+    Linear in time, or in the order of measurement where the rows state no time, linear in each
+    temperature, a difference between sessions, and quadratic in each actuator reading.
+
+    Parameters
+    ----------
+    rows : of a fit. data : its measurements, without excluded poses. robot : names the actuators.
+    """
+    observations = [o for o in data.observations if len(o)]
+    total, shifts = len(rows.residual), _shift_components(rows, observations)
+    trend, has_time = _list_trends(observations)
+    effects = [_build(total, shifts, trend, TIME if has_time else ORDER)]
+    names = dict.fromkeys(name for o in observations for name in o.context if name != TIME)
+    for name in names:
+        functions = [
+            [scale_to_range(o.context[name])] if name in o.context else [] for o in observations
+        ]
+        effects.append(_build(total, shifts, functions, TEMPERATURE, name))
+    functions = [
+        [(o.session == name).astype(float) for name in find_distinct(o.session)]
+        for o in observations
+    ]
+    effects.append(_build(total, shifts, functions, SESSION))
+    for i, actuator in enumerate(robot.actuators):
+        functions = []
+        for o in observations:
+            x = scale_to_range(data.readings[o.rows.reshape(len(o), -1)[:, 0], i])
+            functions.append([x, 4.0 * x**2])
+        effects.append(_build(total, shifts, functions, READING, actuator.name))
+    return tuple(effects)
+
+
+def scale_to_range(values: FloatArray) -> FloatArray:
+    """Return values (r,) moved and scaled to the range -0.5 to 0.5; 0 where they are missing, or
+    all equal.
+    """
+    known = np.isfinite(values)
+    if not known.any() or not np.ptp(values[known]) > 0.0:
+        return np.zeros(len(values))
+    low, high = values[known].min(), values[known].max()
+    return np.where(known, (values - 0.5 * (low + high)) / (high - low), 0.0)
+
+
+def _list_trends(observations: Sequence[Observations]) -> tuple[list[list[FloatArray]], bool]:
+    """Return the time of the rows of each kind, or their order, and whether it is the time."""
+    has_time = all(TIME in o.context and np.isfinite(o.context[TIME]).all() for o in observations)
+    functions = []
+    for o in observations:
+        values = o.context[TIME] if has_time else order_rows(o).astype(float)
+        functions.append([scale_to_range(values)])
+    return functions, has_time
+
+
+class _ShiftedRows(NamedTuple):
+    """How an offset of each measured component shifts the whitened rows of a kind.
+
+    places : (k,) of these rows among all. row : (k,) number of the row of the kind. shifts : for
+    each component, the change (k,) by a unit of it.
+    """
+
+    places: IntArray
+    row: IntArray
+    shifts: tuple[tuple[EffectColumn, FloatArray], ...]
+
+
+def _shift_components(
+    rows: ResidualRows, observations: Sequence[Observations]
+) -> tuple[_ShiftedRows, ...]:
+    """Return the shifts of the rows of each kind."""
+    kinds = []
+    for number, o in enumerate(observations):
+        chosen = np.flatnonzero(rows.kind == number)
+        whitener = o.whitener[rows.row[chosen], rows.column[chosen]]
+        shifts = (
+            (label, whitener[:, members].sum(axis=1)) for label, members in list_components(o)
+        )
+        kinds.append(_ShiftedRows(chosen, rows.row[chosen], tuple(shifts)))
+    return tuple(kinds)
+
+
+def _build(
+    count: int,
+    kinds: Sequence[_ShiftedRows],
+    functions: Sequence[Sequence[FloatArray]],
+    source: str,
+    name: str = "",
+) -> Effect:
+    """Return an effect on `count` rows from functions (r,) of the rows of each kind, less their
+    means: an offset of all rows is no such effect.
+    """
+    columns, labels = [np.zeros((count, 0))], []
+    for kind, of_kind in zip(kinds, functions, strict=True):
+        centered = [(function - function.mean())[kind.row] for function in of_kind]
+        for label, shift in kind.shifts:
+            for function in centered:
+                column = np.zeros(count)
+                column[kind.places] = -shift * function
+                if column.any():
+                    columns.append(column[:, None])
+                    labels.append(label)
+    return Effect(source, name, np.concatenate(columns, axis=1), tuple(labels))
+
+
+def list_components(rows: Observations) -> Iterator[tuple[EffectColumn, list[int]]]:
+    """Give the measured components of a kind, with their columns: x of all targets is one."""
+    members: dict[EffectColumn, list[int]] = {}
+    for group in list_error_groups(rows.kind):
+        for name, column in zip(group.components, group.columns, strict=True):
+            members.setdefault(EffectColumn(name, group.dimension), []).append(column)
+    yield from members.items()
+
+
+LEVEL = 0.05
+"""Probability that independent errors show any pattern, over all tests of a fit (Sidak); and the
+same for slow errors of the poses (`model_discrepancy`).
+"""
+
+FALSE_ALARMS = compute_any_probability(LEVEL, 2)
+"""Probability that independent errors change the uncertainty of a fit: patterns or slow errors."""
+
+FEWEST_LEFT = 3.0
+"""Degrees of freedom of the residuals for each size of an effect that is tested, at least."""
+
+
+class EffectSizes(NamedTuple):
+    """The sizes of a significant effect, and how they act on the residuals.
+
+    Attributes
+    ----------
+    effect : what the residuals depend on. p_value : probability that independent errors show an
+        effect as large, in any of the tests of a fit (Sidak).
+    sizes, errors : (c,) [SI] estimates and standard deviations.
+    moments : (c, c) [SI] expected products of the sizes.
+    """
+
+    effect: Effect
+    p_value: float
+    sizes: FloatArray
+    errors: FloatArray
+    moments: FloatArray
+
+
+class ResidualPatterns(NamedTuple):
+    """What the residuals of a fit show.
+
+    Attributes
+    ----------
+    tests : number of tests. effects : that are significant, the first found first.
+    correlation : of neighboring residuals, less what a fit causes. p_value : probability of a
+        larger one for independent errors, in any of the tests (Sidak).
+    is_correlated : whether it is significant. order : "time" or "order", that of the rows.
+    rows : the residuals, as if the fit had estimated the effects.
+    """
+
+    tests: int
+    effects: tuple[EffectSizes, ...]
+    correlation: float
+    p_value: float
+    is_correlated: bool
+    order: str
+    rows: ResidualRows
+
+
+def find_patterns(rows: ResidualRows, data: Measurements, robot: Mechanism) -> ResidualPatterns:
+    """Test the residuals against every effect, then against correlation in the order of rows.
+
+    The most significant effect is estimated, and the others are tested again without it, until none
+    is significant.
+    """
+    listed = list_effects(rows, data, robot)
+    order = TIME if any(effect.source == TIME for effect in listed) else ORDER
+    effects = _list_testable(rows, listed)
+    correlation, p_value = test_correlation(rows)
+    tests = len(effects) + int(np.isfinite(p_value))
+    significant: list[EffectSizes] = []
+    while effects:
+        p_values = [_compute_tail(rows, basis) for _, basis in effects]
+        best = int(np.argmin(p_values))
+        p_any = compute_any_probability(p_values[best], tests)
+        if not p_any < LEVEL:
+            break
+        effect, _ = effects.pop(best)
+        significant.append(estimate_sizes(rows, effect, p_any))
+        rows = rows.with_effects(effect.columns)
+        effects = _list_testable(rows, [other for other, _ in effects])
+    if significant:
+        correlation, p_value = test_correlation(rows)
+    p_any = compute_any_probability(p_value, tests)
+    is_correlated = p_any < LEVEL
+    return ResidualPatterns(
+        tests, tuple(significant), correlation, p_any, is_correlated, order, rows
+    )
+
+
+def test_effect(rows: ResidualRows, effect: Effect) -> float:
+    """Return the probability of a larger F for independent errors."""
+    return _compute_tail(rows, span_columns(rows.project(effect.columns)))
+
+
+def _compute_tail(rows: ResidualRows, basis: FloatArray) -> float:
+    """Return the same for an effect with the basis (R, q) of what nothing estimated explains."""
+    q, explained = basis.shape[1], float(((basis.T @ rows.residual) ** 2).sum())
+    left = rows.degrees - q
+    statistic = explained / q / ((rows.square - explained) / left)
+    return float(compute_f_tail(q, left, statistic))
+
+
+def estimate_sizes(rows: ResidualRows, effect: Effect, p_value: float) -> EffectSizes:
+    """Return the sizes of an effect, by least squares where residuals show them.
+
+    Sizes that the residuals hardly show, because they are like a parameter of the machine, get the
+    variance that the others have: g ~ N(0, tau^2) in units of the noise, tau^2 by its moments.
+    Combinations that change no row, such as an equal offset of all sessions, count as zero.
+    """
+    length = np.linalg.norm(effect.columns, axis=0) / np.sqrt(len(rows.residual))
+    scaled = effect.columns / length
+    left = rows.project(scaled)
+    noise = rows.square / rows.degrees
+    u, s, vt = np.linalg.svd(left, full_matrices=False)
+    is_observable = s > 1e-6 * np.linalg.norm(scaled)
+    c = np.where(is_observable, u.T @ rows.residual, 0.0)
+    excess = float((c**2).sum()) - noise * int(is_observable.sum())
+    tau2 = max(excess, noise) / float((s[is_observable] ** 2).sum())
+    variance = 1.0 / (s**2 / noise + 1.0 / tau2)
+    mean = vt.T @ (variance * s * c / noise)
+    spread = _span_rows(scaled) @ (vt.T * np.sqrt(variance))
+    back = 1.0 / length
+    return EffectSizes(
+        effect,
+        p_value,
+        back * mean,
+        back * np.linalg.norm(spread, axis=1),
+        back[:, None] * (np.outer(mean, mean) + spread @ spread.T) * back,
+    )
+
+
+def _span_rows(columns: FloatArray) -> FloatArray:
+    """Return the projection (c, c) on the combinations of columns (R, c) that change a row."""
+    _, s, vt = np.linalg.svd(columns, full_matrices=False)
+    kept = vt[s > 1e-10 * s.max(initial=0.0)]
+    return kept.T @ kept
+
+
+def test_correlation(rows: ResidualRows) -> tuple[float, float]:
+    """Return the correlation of neighboring residuals less its mean for independent errors, and the
+    probability of a larger one; NaN without neighbors or degrees of freedom.
+    """
+    pairs = np.flatnonzero(rows.series[1:] == rows.series[:-1])
+    nu = rows.degrees
+    if len(pairs) == 0 or nu < FEWEST_LEFT:
+        return np.nan, np.nan
+    r, U = rows.residual, rows.basis
+    observed = float(r[pairs] @ r[pairs + 1]) / rows.square
+    LU = _shift(U, pairs)
+    inner = U.T @ LU
+    # traces of B = M L M, from tr L = 0 and tr L^2 = pairs / 2
+    first = -float(np.trace(inner))
+    second = 0.5 * len(pairs) - 2.0 * float((LU**2).sum()) + float((inner**2).sum())
+    mean = first / nu
+    variance = 2.0 * (second - first**2 / nu) / (nu * (nu + 2.0))
+    if not variance > 0.0:
+        return np.nan, np.nan
+    return observed - mean, _compute_beta_tail(observed, mean, variance)
+
+
+def _shift(columns: FloatArray, pairs: np.ndarray) -> FloatArray:
+    """Return L columns, L the symmetric matrix with 1/2 for each pair of neighbors."""
+    moved = np.zeros_like(columns)
+    moved[pairs] += 0.5 * columns[pairs + 1]
+    moved[pairs + 1] += 0.5 * columns[pairs]
+    return moved
+
+
+def _compute_beta_tail(observed: float, mean: float, variance: float) -> float:
+    """Return the probability of a larger value of a beta variable on (-1, 1)."""
+    from loopcal.numerics.special_functions import betainc
+
+    center, spread = 0.5 * (1.0 + mean), 0.25 * variance
+    total = center * (1.0 - center) / spread - 1.0
+    if not total > 0.0:
+        return float("nan")
+    place = float(np.clip(0.5 * (1.0 - observed), 0.0, 1.0))
+    return float(betainc((1.0 - center) * total, center * total, place))
+
+
+def _list_testable(
+    rows: ResidualRows, effects: Iterable[Effect]
+) -> list[tuple[Effect, FloatArray]]:
+    """Return the effects that residuals can show, with enough degrees of freedom left, each with
+    the basis (R, q) of what nothing estimated explains of it.
+    """
+    testable = []
+    for effect in effects:
+        if effect.columns.shape[1]:
+            basis = span_columns(rows.project(effect.columns))
+            if basis.shape[1] > 0 and rows.degrees >= (1.0 + FEWEST_LEFT) * basis.shape[1]:
+                testable.append((effect, basis))
+    return testable
+
+
+# --- The covariance of a fit whose errors are correlated in the order of measurement.
+
+RHO = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.92, 0.96, 0.98, 0.99)
+"""Correlations of neighbors between which the average is taken."""
+
+SHARE = (1.0, 0.75, 0.5, 0.3, 0.15)
+"""Shares a of the correlated noise."""
+
+LEAST_SCATTER = 1e-9
+"""Relative variance of the size of the covariance below which it counts as known."""
+
+LONGEST = 400
+"""Rows of a series whose correlation is considered at once; longer series are cut."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelatedErrors:
+    """The covariance of a fit by correlated errors.
+
+    Attributes
+    ----------
+    covariance : (k, k) of the directions of the rows' gain. degrees : degrees of freedom of its
+        size.
+    correlation : of neighboring errors, mean. sigma : their size over the stated sigma, mean.
+    """
+
+    covariance: FloatArray
+    degrees: float
+    correlation: float
+    sigma: float
+
+
+class _Segments(NamedTuple):
+    """Segments of equal length n: (S, n) numbers of their rows."""
+
+    rows: IntArray
+
+
+def estimate_correlated_errors(rows: ResidualRows, sigma_degrees: float) -> CorrelatedErrors:
+    """Return the covariance by errors that are correlated within each series.
+
+    Parameters
+    ----------
+    rows : of a fit. sigma_degrees : degrees of freedom nu0 that the stated sigmas count for,
+        infinite where they are exact.
+    """
+    segments = _cut_series(rows.series)
+    nu = rows.degrees + sigma_degrees
+    logs, scales, covariances, neighbors = [], [], [], []
+    for rho in RHO:
+        for share in SHARE if rho > 0.0 else (1.0,):
+            log_det, square, explained = _evaluate(rows, segments, rho, share)
+            by_size, scale = square, 1.0
+            if np.isfinite(nu):
+                scale = (sigma_degrees + square) / nu
+                by_size = nu * np.log(scale)
+            logs.append(-0.5 * (log_det + by_size))
+            scales.append(scale)
+            covariances.append(scale * explained)
+            neighbors.append(share * rho)
+    weight = np.exp(np.array(logs) - max(logs))
+    weight /= weight.sum()
+    covariance = np.einsum("i,ijk->jk", weight, np.array(covariances))
+    sizes = np.array([np.trace(c) for c in covariances])
+    mean = float(weight @ sizes)
+    # without a direction that the data determine there is no covariance, hence no scatter of it
+    scatter = float(weight @ (sizes - mean) ** 2) / mean**2 if mean > 0.0 else 0.0
+    return CorrelatedErrors(
+        covariance,
+        2.0 / max(scatter + 2.0 / nu, LEAST_SCATTER),
+        float(weight @ np.array(neighbors)),
+        float(np.sqrt(weight @ np.array(scales))),
+    )
+
+
+def _cut_series(series: IntArray) -> list[IntArray]:
+    """Return the rows (S, n) of the segments of each length."""
+    starts = np.flatnonzero(np.r_[True, np.diff(series) != 0])
+    by_length: dict[int, list[IntArray]] = {}
+    for first, last in zip(starts, np.r_[starts[1:], len(series)], strict=True):
+        for part in np.array_split(np.arange(first, last), -(-(last - first) // LONGEST)):
+            by_length.setdefault(len(part), []).append(part)
+    return [np.array(segments) for segments in by_length.values()]
+
+
+def _evaluate(
+    rows: ResidualRows, segments: list[IntArray], rho: float, share: float
+) -> tuple[float, float, FloatArray]:
+    """Return log |K| + log |X'K^-1 X|, the sum of squares S, and G'K G (k, k)."""
+    from scipy.linalg import solve_triangular
+
+    q, k = rows.basis.shape[1], rows.gain.shape[1]
+    columns = np.column_stack([rows.basis, rows.residual])
+    log_det, white, spread = 0.0, [], np.zeros((k, k))
+    for members in segments:
+        count, n = members.shape
+        K = share * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        K[np.diag_indices(n)] = 1.0
+        L = np.linalg.cholesky(K)
+        log_det += 2.0 * count * float(np.log(np.diag(L)).sum())
+        # one system for all segments: the triangle is the same for each
+        stacked = columns[members.T].reshape(n, count * (q + 1))
+        white.append(solve_triangular(L, stacked, lower=True).reshape(n * count, q + 1))
+        part = (L.T @ rows.gain[members.T].reshape(n, count * k)).reshape(n * count, k)
+        spread += part.T @ part
+    R = np.asarray(np.linalg.qr(np.concatenate(white), mode="r"))
+    log_det += 2.0 * float(np.log(np.abs(np.diag(R)[:q])).sum())
+    return log_det, float(R[-1, -1] ** 2), spread

@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the report of a calibration: `NAME.html` to read, and `NAME.json` with the same content."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import webbrowser
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from loopcal.apply.run_comparison import RunComparison
+from loopcal.errors import FileError, LoopcalError
+from loopcal.findings import report_finding
+from loopcal.io.core.json_text import to_json
+from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+from loopcal.io.core.text_file import as_path, write_bytes, write_text
+from loopcal.io.formats import FORMATS
+from loopcal.io.formats.import_export import build_source, export_robot
+from loopcal.io.formats.program_format import ExportSource
+from loopcal.io.runs.result_files import save_comparison
+from loopcal.io.runs.run_folder import Run, build_document, refuse_changed_run
+from loopcal.mechanism.model import Mechanism
+from loopcal.plain_text import quote
+from loopcal.report.document.calibration_document import build_calibration_document
+from loopcal.report.document.elements import (
+    CalibrationRecord,
+    ControllerValues,
+    build_record,
+    render_html,
+)
+from loopcal.report.document.other_documents import (
+    build_calibration_view,
+    build_comparison_document,
+    build_robot_view,
+)
+from loopcal.report.validation_view import tabulate_comparison
+from loopcal.workflow.calibration_report import CalibrationReport
+
+# --- Records of calibrations from reports in memory and from run folders, with controllers'
+# values.
+
+GENERAL = ("json", "csv")
+"""Formats that take every robot, and belong to no controller."""
+
+
+def load_record(source: CalibrationReport | Run) -> CalibrationRecord:
+    """Return what a report shows, of a calibration in memory or a run folder.
+
+    Raises
+    ------
+    FileError : a file of the run folder is not the one that the calibration wrote.
+    """
+    if isinstance(source, Run):
+        refuse_changed_run(source)
+        robot, initial, arrays = source.identified_robot, source.initial_robot, source.arrays
+        result, name, exported = source.result, str(source.path), build_source(source)
+    else:
+        fit = source.identification
+        robot, initial, arrays = fit.robot, fit.initial, source.arrays()
+        result, name = json.loads(to_json(build_document(source))), ""
+        intervals = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}
+        exported = ExportSource(robot, intervals)
+    exported = replace(exported, is_for_people=True)
+    return build_record(result, arrays, robot, initial, name, list_controllers(exported))
+
+
+def list_controllers(source: ExportSource) -> tuple[ControllerValues, ...]:
+    """Return the values as text of every controller's format that can express the robot."""
+    controllers = []
+    for target in FORMATS.values():
+        if target.write is None or target.name in GENERAL:
+            continue
+        try:
+            exported = export_robot(source, target, None)
+        except LoopcalError:  # of another family, or a format that only corrects a file
+            continue
+        notes = tuple(str(finding) for finding in exported.findings)
+        controllers.append(ControllerValues(target.name, target.what, exported.text, notes))
+    return tuple(controllers)
+
+
+SHORT_HTML = ".htm"
+HTML = (".html", SHORT_HTML)
+"""Endings of a page's name."""
+
+
+def write_report(path: str | Path, report: CalibrationReport | Run) -> Path:
+    """Write the report of a calibration as one HTML file for people, and as JSON beside it.
+
+    The HTML file loads nothing and can be printed, sent and archived. It contains one script, the
+    3-D view, in place of which a browser without WebGL or JavaScript shows a picture. An older
+    report of this name is replaced. Commands: see `loopcal report`.
+
+    Parameters
+    ----------
+    path : of the HTML file, whose name ends in .html; the JSON file has the same name otherwise.
+    report : of `loopcal.calibrate`, or a run from `loopcal.load_run`.
+
+    Returns
+    -------
+    path of the HTML file.
+
+    Raises
+    ------
+    FileError : the name has another ending, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> robot = lc.load_robot("hexapod-42")
+    >>> data = lc.load_measurements("examples/hexapod-42/measurements.csv", robot)
+    >>> report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
+    >>> lc.write_report("report.html", report)  # doctest: +SKIP
+    """
+    path = as_path(path, "report")
+    _, data = name_files(path)
+    refuse_outputs((path, data), (), force=True)
+    document = build_calibration_document(load_record(report))
+    html, json_text = render_html(document), to_json({"format": 1, **document.to_dict()})
+    with restore_on_failure((path, data)):
+        write_text(path, html)
+        write_text(data, json_text)
+    return path
+
+
+def name_files(path: Path) -> tuple[Path, Path]:
+    """Return the HTML and the JSON file of a report.
+
+    Raises
+    ------
+    FileError : the name does not end in .html.
+    """
+    check_ending(path, "report")
+    return path, path.with_suffix(".json")
+
+
+def check_ending(path: Path, what: str, endings: tuple[str, ...] = HTML) -> str:
+    """Return the ending of a file's name; FileError where it is none of `endings`.
+
+    `what` is in the file, such as "report".
+    """
+    ending = path.suffix.lower()
+    if ending not in endings:
+        allowed = tuple(name for name in endings if name != SHORT_HTML)
+        shown = quote(path.suffix) if path.suffix else ""
+        finding = report_finding("files.document-ending", what=what, allowed=allowed, ending=shown)
+        raise FileError(finding, path)
+    return ending
+
+
+# --- Write a comparison of calibrations: HTML for people, JSON and CSV for programs.
+
+ENDINGS = (*HTML, ".json", ".csv")
+"""Endings of the files of a comparison."""
+
+
+def write_comparison(path: str | Path, comparison: RunComparison) -> Path:
+    """Write a comparison of calibrations to a file; the ending of its name is the format.
+
+    `.html` is a page for people, which loads nothing and runs no program. `.json` has all numbers
+    (SI). `.csv` has one row for each run and parameter. Command: see `loopcal compare`.
+
+    Parameters
+    ----------
+    path : of the file; an older one is replaced. comparison : of `loopcal.compare_runs`.
+
+    Returns
+    -------
+    path of the file.
+
+    Raises
+    ------
+    FileError : the name has another ending, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> runs = [lc.load_run("may"), lc.load_run("june")]  # doctest: +SKIP
+    >>> lc.write_comparison("sessions.html", lc.compare_runs(runs))  # doctest: +SKIP
+    """
+    path = as_path(path, "comparison")
+    ending = check_ending(path, "comparison", ENDINGS)
+    if ending in HTML:
+        document = build_comparison_document(comparison, f"loopcal {version('loopcal')}")
+        write_text(path, render_html(document))
+    elif ending == ".json":
+        write_text(path, to_json(comparison.to_dict()))
+    else:
+        table = tabulate_comparison(comparison)
+        save_comparison(path, [column.title for column in table.columns], table.rows)
+    return path
+
+
+# --- Print an HTML file to PDF with an installed Chromium.
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+"""Names of programs that print, in the order in which they are tried."""
+
+OPTIONS = ("headless", "disable-gpu", "no-pdf-header-footer", "no-first-run")
+OPTIONS += ("disable-background-networking", "disable-extensions")
+SANDBOX = ("no-sandbox",)
+"""Options of the browser; the last for root, for whom it has no sandbox."""
+
+SECONDS = 120
+"""Time that a browser gets to print a report."""
+
+_END = re.compile(rb"%%EOF\s*\Z")
+
+
+def find_browser() -> str | None:
+    """Return the path of an installed Chromium; None without one."""
+    return next((path for name in BROWSERS if (path := shutil.which(name))), None)
+
+
+def is_root() -> bool:
+    """Return whether the program runs as root, for whom Chromium has no sandbox."""
+    return getattr(os, "geteuid", lambda: 1)() == 0
+
+
+def check_browser(output: Path) -> str:
+    """Return the path of an installed Chromium; FileError on `output` without one."""
+    browser = find_browser()
+    if browser is None:
+        raise FileError(
+            "a PDF file needs Chromium or Google Chrome, and neither is installed; install one, or "
+            "open the HTML file in a browser and print it",
+            output,
+        )
+    return browser
+
+
+def print_pdf(page: Path, output: Path) -> None:
+    """Print an HTML file to a PDF file, on A4 as its style sheet says.
+
+    Raises
+    ------
+    FileError : no browser is installed, it fails, or the file cannot be written.
+    """
+    browser = check_browser(output)
+    with TemporaryDirectory(prefix="loopcal-") as folder:
+        printed = Path(folder) / "report.pdf"
+        values = {"user-data-dir": f"{folder}/profile", "print-to-pdf": str(printed)}
+        options = [f"--{name}" for name in (*OPTIONS, *SANDBOX * is_root())]
+        options += [f"--{name}={value}" for name, value in values.items()]
+        try:
+            ended = subprocess.run(
+                [browser, *options, page.resolve().as_uri()],
+                capture_output=True,
+                timeout=SECONDS,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise FileError(
+                f"{browser} did not print within {SECONDS} s; open the HTML file and print it",
+                output,
+            ) from None
+        if ended.returncode or not printed.is_file():
+            raise FileError(
+                f"{browser} could not print (exit code {ended.returncode}); open the HTML file in "
+                "a browser and print it",
+                output,
+            )
+        _check_pdf(printed)
+        write_bytes(output, printed.read_bytes())
+
+
+def _check_pdf(file: Path) -> None:
+    """Raise FileError where a file is not a complete PDF file."""
+    content = file.read_bytes()
+    if not content.startswith(b"%PDF-") or _END.search(content) is None:
+        raise FileError("this is not a complete PDF file", file)
+
+
+# --- Write the 3-D view of a robot or of a calibration as one HTML file, and open it.
+
+
+def write_view(path: str | Path, source: Mechanism | CalibrationReport | Run) -> Path:
+    """Write the interactive 3-D view of a robot or of a calibration as one HTML file.
+
+    The page shows the robot at home. Of a calibration it also shows the robot at the measured
+    poses, the position errors of the geometry before calibration, and the uncertainty over the
+    workspace. It loads nothing; without WebGL or JavaScript it shows a picture. An older file of
+    this name is replaced. Commands: see `loopcal view`.
+
+    Parameters
+    ----------
+    path : of the HTML file, whose name ends in .html.
+    source : a robot, the result of `loopcal.calibrate`, or a run from `loopcal.load_run`.
+
+    Returns
+    -------
+    path of the HTML file.
+
+    Raises
+    ------
+    FileError : the name has another ending, a file of the run was changed, or the file cannot be
+        written.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> lc.write_view("view.html", lc.load_robot("hexapod-42"))  # doctest: +SKIP
+    """
+    path = as_path(path, "page")
+    check_ending(path, "view")
+    refuse_outputs((path,), (), force=True)
+    is_robot = isinstance(source, Mechanism)
+    document = build_robot_view(source) if is_robot else build_calibration_view(load_record(source))
+    write_text(path, render_html(document))
+    return path
+
+
+def open_page(address: str) -> bool:
+    """Open an address in the user's browser; return whether a browser was started.
+
+    Without a display none is: a browser for terminals would take the terminal of the command.
+    """
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if sys.platform not in ("win32", "darwin") and not has_display:
+        return False
+    try:
+        return webbrowser.open(address)
+    except webbrowser.Error:
+        return False

@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nuisance parameters: frames, targets, surfaces and offsets that measurements bring with them.
+
+At every point of the descent they have the values that fit the rows best at the machine's present
+poses, so that the sum of squares is a function of the machine alone (variable projection). The
+rows [F | A | r], nuisance columns first, are folded into the factors of an elimination tree, and
+what the elimination leaves is the factor of the rows projected onto the complement of F. Rank,
+filters and covariance of the machine are read from it as if the frames were known. A tolerance of a
+nuisance parameter is one more row. See docs/theory/identification.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal import engine, measure
+from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.estimate.pose_linearization import KindRows
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.measure.observations import Observations
+from loopcal.numerics.elimination import (
+    EliminationTree,
+    NodeFactors,
+    TreeElimination,
+    build_tree,
+    eliminate_tree,
+)
+from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.trial_batch import TrialBatch
+from loopcal.parameters import ParameterTable
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+class NodeMembers(NamedTuple):
+    """Rows of one kind that belong to nodes of one structure.
+
+    Attributes
+    ----------
+    structure : of the nodes, -1 for rows that use no free nuisance parameter.
+    rows : (k,) numbers of the rows. nodes : (k,) their nodes.
+    columns : (k, u) columns of their nuisance parameters in the node's path; fixed ones have the
+        column after the last.
+    """
+
+    structure: int
+    rows: IntArray
+    nodes: IntArray
+    columns: IntArray
+
+
+class NodeRows(NamedTuple):
+    """Whitened rows of nodes of one structure.
+
+    Attributes
+    ----------
+    structure : -1 for rows of the machine alone. nodes : (k,). numbers : (k,) what each of the k
+        sets of rows belongs to: the row of a kind, or the component of poses.
+    rows : (a, k, m, w + p + 1). kind : number of the kind; -1 where they are of several.
+    """
+
+    structure: int
+    nodes: IntArray
+    numbers: IntArray
+    rows: FloatArray
+    kind: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class EliminatedNuisance(TrialBatch):
+    """Nuisance parameters of t trials at the point of a linearization.
+
+    Attributes
+    ----------
+    values : (t, U) at which the rows are linearized.
+    elimination : step to the best values, their change with the machine, and their variances.
+    """
+
+    values: FloatArray
+    elimination: TreeElimination
+
+    @property
+    def best(self) -> FloatArray:
+        """(t, U) best values."""
+        return self.values + self.elimination.shift
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceElimination:
+    """The U nuisance parameters of a problem and their elimination tree.
+
+    Attributes
+    ----------
+    local : their table, and which rows use them. tree : in which order they are eliminated.
+    is_free : (U,). has_prior : (U,) free with a tolerance.
+    prior_mean : (T | 1, U) [SI] means of the priors of T trials.
+    """
+
+    local: NuisanceParameters
+    tree: EliminationTree
+    is_free: BoolArray
+    has_prior: BoolArray
+    prior_mean: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.local)
+
+    @property
+    def prior_count(self) -> int:
+        """Number of parameters with a prior: rows that are added to those of the data."""
+        return int(self.has_prior.sum())
+
+    @property
+    def unpenalized_count(self) -> int:
+        """Number of free parameters without a prior."""
+        return int((self.is_free & ~self.has_prior).sum())
+
+    def take(self, trials: IntArray) -> NuisanceElimination:
+        """Return this value with the means of the priors of some trials (a,)."""
+        if len(self.prior_mean) == 1:
+            return self
+        return replace(self, prior_mean=self.prior_mean[trials])
+
+    def members(self, rows: ObservationRows) -> tuple[NodeMembers, ...]:
+        """Return the rows of a kind by the structure of the node that each belongs to."""
+        numbers = np.arange(len(rows.poses))
+        if not rows.nuisance.shape[1]:
+            return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
+        tree, node = self.tree, self.tree.node[rows.nuisance].max(axis=1)
+        structure = np.full(len(node), -1)
+        structure[node >= 0] = tree.structure[node[node >= 0]]
+        groups = []
+        for s in find_distinct(structure):
+            chosen = np.flatnonzero(structure == s)
+            nodes, used = node[chosen], rows.nuisance[chosen]
+            columns = np.zeros_like(used) if s < 0 else tree.columns(nodes, used)
+            groups.append(NodeMembers(int(s), chosen, nodes, columns))
+        return tuple(groups)
+
+    def start_values(
+        self, data: Measurements, T: FloatArray, joints: Mapping[str, FloatArray]
+    ) -> FloatArray:
+        """Return values (U,) that fit measurements at poses T (n, 4, 4), cluster by cluster.
+
+        `joints` : name -> (1, n) [SI].
+        """
+        values = self.local.values()
+        kinds = [
+            (o, i, self.tree.cluster[places].max(axis=1, initial=-1))
+            for i, (o, places) in enumerate(
+                zip(data.all_observations, self.local.indices, strict=True)
+            )
+            if len(o) and places.shape[1]
+        ]
+        for c in range(int(self.tree.cluster.max(initial=-1)) + 1):
+            chosen = [
+                (o.take(cluster == c), i, cluster == c)
+                for o, i, cluster in kinds
+                if (cluster == c).any()
+            ]
+            self._seek(values, data, chosen, T, joints)
+        return values
+
+    def _seek(
+        self,
+        values: FloatArray,
+        data: Measurements,
+        chosen: list[tuple[Observations, int, BoolArray]],
+        T: FloatArray,
+        joints: Mapping[str, FloatArray],
+    ) -> None:
+        """Write the start values of one cluster into values (U,): chosen are its rows, the number
+        of their kind, and which of its rows (r,) they are.
+        """
+        places_by_kind = [self.local.indices[i][members] for _, i, members in chosen]
+        factors = [(self.local.factor(i), members) for _, i, members in chosen]
+        used = find_distinct(np.concatenate([places.ravel() for places in places_by_kind]))
+        setup = NuisanceParameters(
+            ParameterTable(tuple(self.local.table.entries[i] for i in used)),
+            tuple(np.searchsorted(used, places) for places in places_by_kind),
+            tuple(None if factor is None else factor[members] for factor, members in factors),
+        )
+        part = replace(
+            data,
+            observations=tuple(rows for rows, _, _ in chosen if not rows.kind.is_of_base),
+            base_observations=tuple(rows for rows, _, _ in chosen if rows.kind.is_of_base),
+        )
+        values[used] = measure.guess_nuisance_values(part, T, setup, joints)
+
+    def keep_apart(
+        self, parameters: int, nodes: IntArray
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return paths (k, w) of nodes (k,), with roots and slopes of parameters that are not
+        eliminated: 1 and 0. See `TreeElimination.at_nodes`.
+        """
+        structure = self.tree.structures[int(self.tree.structure[nodes[0]])]
+        w = structure.width
+        return structure.path[self.tree.place[nodes]], np.eye(w), np.zeros((1, w, parameters))
+
+    def prior_cost(self, values: FloatArray) -> FloatArray:
+        """Return the sum of squares (a,) of the priors at values (a, U)."""
+        known = self.has_prior
+        off = (values - self.prior_mean)[:, known] / self.local.table.tolerance[known]
+        return (off**2).sum(axis=1)
+
+    def fold_priors(self, factors: NodeFactors, values: FloatArray) -> None:
+        """Fold the priors at values (a, U) into the factors of their nodes."""
+        off = values - self.prior_mean
+        for i, structure in enumerate(self.tree.structures):
+            place, column = np.nonzero(self.has_prior[structure.unknowns])
+            if not len(place):
+                continue
+            unknown = structure.unknowns[place, column]
+            tolerance = self.local.table.tolerance[unknown]
+            rows = np.zeros((len(values), len(place), structure.width + factors.parameters + 1))
+            rows[:, np.arange(len(place)), column] = 1.0 / tolerance
+            rows[:, :, -1] = off[:, unknown] / tolerance
+            factors.add(i, rows, place)
+
+    def eliminate(
+        self, factors: NodeFactors, values: FloatArray
+    ) -> tuple[EliminatedNuisance, FloatArray]:
+        """Eliminate all parameters from rows at values (a, U), to which the priors are added.
+
+        Returns
+        -------
+        estimate : of the nuisance parameters.
+        factor : (a, p + 1, p + 1) of the machine's rows that are left.
+        """
+        self.fold_priors(factors, values)
+        elimination, rest = eliminate_tree(factors)
+        return EliminatedNuisance(values, elimination), rest
+
+
+def plan_elimination(
+    local: NuisanceParameters, rows: Sequence[ObservationRows], member: IntArray | None = None
+) -> NuisanceElimination | None:
+    """Return the nuisance parameters of observed rows; None where there are none.
+
+    `member` (n,) is the component of each pose, whose rows are eliminated together.
+    """
+    if not len(local):
+        return None
+    is_free = np.asarray(local.table.free, dtype=bool)
+    tree = build_tree(is_free, [p.scope for p in local.table.entries], _sets(rows, member))
+    has_prior = is_free & ~np.isnan(local.table.tolerance)
+    return NuisanceElimination(local, tree, is_free, has_prior, local.table.nominal[None])
+
+
+def list_members(
+    nuisance: NuisanceElimination | None, rows: ObservationRows
+) -> tuple[NodeMembers, ...]:
+    """Return the rows of a kind by nodes; all are of the machine without nuisance parameters."""
+    if nuisance is not None:
+        return nuisance.members(rows)
+    numbers = np.arange(len(rows.poses))
+    return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
+
+
+def divide_among_nodes(
+    kind: KindRows, members: Iterable[NodeMembers], tree: EliminationTree | None
+) -> list[NodeRows]:
+    """Return the rows of a kind by nodes, [nuisance | machine | residual]."""
+    rows = kind.machine
+    divided = []
+    for structure, numbers, nodes, columns in members:
+        chosen = rows if len(numbers) == rows.shape[1] else rows[:, numbers]
+        if structure >= 0 and kind.by_nuisance is not None and tree is not None:
+            width = tree.structures[structure].width
+            by_path = spread_columns(kind.by_nuisance[:, numbers], columns, width)
+            chosen = np.concatenate([by_path, chosen], axis=-1)
+        divided.append(NodeRows(structure, nodes, numbers, chosen))
+    return divided
+
+
+def spread_columns(derivatives: FloatArray, columns: IntArray, width: int) -> FloatArray:
+    """Return derivatives (a, k, m, width) by a path from those (a, k, m, u) at columns (k, u)."""
+    wide = np.zeros((*derivatives.shape[:3], width + 1))
+    np.put_along_axis(
+        wide, np.broadcast_to(columns[:, None, :], derivatives.shape), derivatives, axis=-1
+    )
+    return wide[..., :width]
+
+
+def fold_node_rows(
+    factor: FloatArray, factors: NodeFactors | None, node_rows: Sequence[NodeRows]
+) -> FloatArray:
+    """Fold rows into the factors of their nodes; return the machine's factor with its own rows."""
+    plain = [_flat(part) for part in node_rows if part.structure < 0]
+    if plain:
+        factor = engine.fold(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
+    if factors is None:
+        return factor
+    for structure in sorted({part.structure for part in node_rows if part.structure >= 0}):
+        chosen = [part for part in node_rows if part.structure == structure]
+        places = [np.repeat(factors.tree.place[part.nodes], part.rows.shape[2]) for part in chosen]
+        rows = [_flat(part) for part in chosen]
+        factors.add(structure, np.concatenate(rows, axis=1), np.concatenate(places))
+    return factor
+
+
+class _NuisancePoint(NamedTuple):
+    """Values (a, U), the factors of rows [F | r] there, and their sums of squares (a,)."""
+
+    values: FloatArray
+    factors: NodeFactors
+    cost: FloatArray
+
+
+class _NuisanceStep(NamedTuple):
+    """A step (a, U), the squared change (a,) of the rows, and the share (a, 1) tried first."""
+
+    step: FloatArray
+    change: FloatArray
+    share: FloatArray
+
+
+def solve_for_nuisance(
+    nuisance: NuisanceElimination,
+    values: FloatArray,
+    fold_at: Callable[[FloatArray], NodeFactors],
+    control: Halving,
+) -> FloatArray:
+    """Return the values (a, U) next to given ones that fit rows at fixed poses best.
+
+    `fold_at` returns the factors of the rows [F | r] at values (a, U), without priors.
+    """
+
+    def evaluate(tried: FloatArray) -> _NuisancePoint:
+        factors = fold_at(tried)
+        nuisance.fold_priors(factors, tried)
+        return _NuisancePoint(tried, factors, factors.sum_of_squares())
+
+    def propose(point: _NuisancePoint) -> _NuisanceStep:
+        step = eliminate_tree(point.factors)[0].shift
+        change = point.factors.squared_change(step)
+        return _NuisanceStep(step, change, np.ones((len(step), 1)))
+
+    def move(point: _NuisancePoint, step: _NuisanceStep, share: FloatArray) -> _NuisancePoint:
+        return evaluate(point.values + share * step.step)
+
+    point, _ = minimize_by_halving(evaluate(values), propose, move, control)
+    return point.values
+
+
+def _flat(part: NodeRows) -> FloatArray:
+    """Return rows (a, k m, ..) of a part."""
+    a, k, m, w = part.rows.shape
+    return part.rows.reshape(a, k * m, w)
+
+
+def _sets(rows: Sequence[ObservationRows], member: IntArray | None) -> IntArray:
+    """Return pairs (set, unknown): one set for each row and, with `member`, for each component."""
+    sets, count = [np.zeros((0, 2), dtype=np.int64)], 0
+    using = [r for r in rows if r.nuisance.shape[1]]
+    for r in using:
+        used = np.unique(r.nuisance, axis=0)
+        number = np.repeat(count + np.arange(len(used)), used.shape[1])
+        sets.append(np.column_stack([number, used.ravel()]))
+        count += len(used)
+    if member is not None:
+        for r in using:
+            number = np.repeat(count + member[r.first_poses], r.nuisance.shape[1])
+            sets.append(np.column_stack([number, r.nuisance.ravel()]))
+    return np.concatenate(sets)

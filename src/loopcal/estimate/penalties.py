@@ -1,0 +1,653 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimation methods: each says how much it penalizes every direction of the decomposition.
+
+With singular values s_i of the whitened, tolerance-scaled matrix and projections c_i = u_i'b of the
+total deviation, the estimate is z = sum_i f_i (c_i / s_i) v_i with the filter factors f_i = s_i^2 /
+(s_i^2 + penalty_i):
+
+    LeastSquares               0 up to the numerical rank, infinite beyond it
+    TruncatedSVD(k)            0 up to k, infinite beyond it
+    Ridge(lam)                 lam everywhere, or one lam per parameter (0: unpenalized)
+    MAP()                      1: tolerances are standard deviations of a Gaussian prior
+    MAP(InflatedTolerances())  the default: the same, with inflated tolerances where the data
+                               contradict them
+
+The penalty acts on the total deviation from nominal in units of tolerance, never on the step, so
+the answer does not depend on the number of iterations. A new method is one more class here. See
+docs/theory/estimation.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.residual_test import FEWEST_DEGREES
+from loopcal.estimate.tolerance_components import (
+    InflatedTolerances,
+    ToleranceComponent,
+    compute_prior_covariance,
+    compute_symmetric_root,
+)
+from loopcal.findings import Finding, report_finding
+from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+Rule = Callable[[Decomposition], FloatArray | IntArray]
+"""Choose one number per trial, (t,), from a decomposition; see
+`loopcal.estimate.penalties`.
+"""
+
+
+class Method(Protocol):
+    """The interface of a method, with what most methods do."""
+
+    def required_equations(self, parameters: int) -> int:
+        """Return how many equations the method needs for this many parameters."""
+        ...
+
+    def unpenalized(self, parameters: int) -> BoolArray | None:
+        """Return which parameters (p,) are never penalized; None where all are treated alike."""
+        return None
+
+    def scale(self, parameters: int) -> FloatArray | None:
+        """Return factors (p,) for the tolerance-scaled columns; None for ones."""
+        return None
+
+    def root(self, parameters: int) -> FloatArray | None:
+        """Return the root (p, p) of the correlation of the scaled columns; None where the method
+        takes them as independent.
+        """
+        return None
+
+    def penalty(self, decomposition: Decomposition) -> FloatArray:
+        """Return the penalty (t, p) of each direction; infinite where it is not used."""
+        ...
+
+    def prior_variance(
+        self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
+    ) -> FloatArray | None:
+        """Return the variance (t, p) of the true coordinates about nominal, from which the bias of
+        the penalty is expected; NaN where it is not known. None stands for 1 / penalty.
+        """
+        return None
+
+
+@dataclass(frozen=True)
+class LeastSquares(Method):
+    """Least squares with rank detection.
+
+    Null directions get the smallest total deviation, in tolerances.
+
+    Examples
+    --------
+    >>> LeastSquares()
+    LeastSquares()
+    """
+
+    def required_equations(self, parameters: int) -> int:
+        """Return the number of parameters."""
+        return parameters
+
+    def penalty(self, decomposition: Decomposition) -> FloatArray:
+        """Return 0 for singular values within the numerical rank, infinity for the others."""
+        return np.where(decomposition.used, 0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class TruncatedSVD(Method):
+    """Least squares over the k strongest directions; the others keep their nominal value.
+
+    Parameters
+    ----------
+    k : number of directions, or a rule that chooses it. Directions beyond the numerical rank are
+        never used.
+
+    Raises
+    ------
+    EstimationError : k is negative or no integer.
+    """
+
+    k: int | Rule
+
+    def __post_init__(self) -> None:
+        if not callable(self.k) and (not isinstance(self.k, int | np.integer) or self.k < 0):
+            raise EstimationError(
+                f"truncation at k = {self.k}: k is a number of directions; give an integer >= 0, "
+                "or a rule such as TruncationGCV()"
+            )
+
+    def required_equations(self, parameters: int) -> int:
+        """Return 0: directions without data keep their nominal value."""
+        return 0
+
+    def penalty(self, decomposition: Decomposition) -> FloatArray:
+        """Return 0 for the first k directions within the rank, infinity for the others."""
+        k = _apply_rule(self.k, decomposition) if callable(self.k) else np.atleast_1d(self.k)
+        first = np.arange(decomposition.singular_values.shape[1]) < k[:, None]
+        return np.where(first & decomposition.used, 0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class Ridge(Method):
+    """Tikhonov regularization: the sum of squares plus lam |z|^2.
+
+    z is the total deviation from nominal in tolerances.
+
+    Parameters
+    ----------
+    lam : a number, one number per free parameter in the order of the parameter table (0 for an
+        unpenalized one), or a rule that chooses one number.
+
+    Raises
+    ------
+    EstimationError : lam is negative or not finite.
+    """
+
+    lam: float | tuple[float, ...] | Rule
+
+    def __post_init__(self) -> None:
+        if callable(self.lam):
+            return
+        values = np.asarray(self.lam, dtype=np.float64)
+        if values.ndim > 1 or not np.all(np.isfinite(values)) or np.any(values < 0.0):
+            raise EstimationError(
+                f"ridge with lam = {self.lam}: give a finite number >= 0, one per parameter, or a "
+                "rule such as GCV()"
+            )
+        if values.ndim == 1:
+            object.__setattr__(self, "lam", tuple(float(v) for v in values))
+
+    def required_equations(self, parameters: int) -> int:
+        """Return the number of unpenalized parameters."""
+        if isinstance(self.lam, tuple):
+            return sum(value == 0.0 for value in self.lam)
+        return parameters if self.lam == 0.0 else 0
+
+    def unpenalized(self, parameters: int) -> BoolArray | None:
+        """Return which parameters have lam = 0, where there is one lam per parameter."""
+        if isinstance(self.lam, tuple) and 0.0 in self.lam:
+            return np.array(self.lam) == 0.0
+        return None
+
+    def scale(self, parameters: int) -> FloatArray | None:
+        """Return 1 / sqrt(lam) for one lam per parameter.
+
+        Penalty 1 on the rescaled deviation is lam on the original one.
+        """
+        if not isinstance(self.lam, tuple):
+            return None
+        if len(self.lam) != parameters:
+            raise EstimationError(
+                f"ridge with {len(self.lam)} values of lam for {parameters} free parameters: give "
+                "one value per parameter"
+            )
+        lam = np.asarray(self.lam)
+        return 1.0 / np.sqrt(np.where(lam > 0.0, lam, 1.0))
+
+    def penalty(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam for every direction; with lam = 0 directions beyond the rank are not used."""
+        lam = 1.0 if isinstance(self.lam, tuple) else self.lam
+        values = _apply_rule(lam, decomposition) if callable(lam) else np.atleast_1d(lam)
+        return _penalize(decomposition, values)
+
+    def prior_variance(
+        self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
+    ) -> FloatArray | None:
+        """Return the variance of the true coordinates if the stated tolerances are right: 1 in
+        tolerances, whatever lam is.
+
+        It is NaN where a penalized parameter has no stated tolerance, where the tolerances are
+        correlated, or where different parameters have different lam: then the coordinates are
+        correlated.
+        """
+        lam = np.array(self.lam if isinstance(self.lam, tuple) else [1.0])
+        penalized = lam[lam > 0.0]
+        is_known = (
+            free.correlation is None
+            and not self.lacks_tolerances(free).any()
+            and (penalized == penalized[:1]).all()
+        )
+        return np.full(penalty.shape, penalized.max(initial=0.0) if is_known else np.nan)
+
+    def lacks_tolerances(self, free: FreeParameters) -> BoolArray:
+        """Return which parameters (p,) are penalized without a stated tolerance."""
+        lam = 1.0 if callable(self.lam) else np.asarray(self.lam)
+        return np.asarray(free.assumed & np.broadcast_to(lam > 0.0, free.assumed.shape))
+
+
+@dataclass(frozen=True)
+class MAP(Method):
+    """Maximum a posteriori: each tolerance is the standard deviation of a Gaussian prior.
+
+    This is ridge with lam = 1. Directions that the data do not determine keep their prior. A
+    parameter without a stated tolerance is not penalized.
+
+    Parameters
+    ----------
+    inflation : factor on all tolerances, or a rule that chooses it, such as `InflatedTolerances()`.
+    free : (p,) parameters that are not penalized; `identify` enters those without a stated
+        tolerance.
+    noise : "given": the rows are divided by their true sigma. "estimated": by their true sigma up
+        to one common factor. The factor is estimated from the part of the data that no parameters
+        can explain, so that data and prior get their right weights.
+    correlation : (p, p) of the deviations from nominal; `identify` enters the one of the common
+        errors that the robot states. None takes the tolerances as independent.
+    components : parts of the tolerances that are wider than stated; `identify` enters those that
+        `InflatedTolerances` chose.
+
+    Raises
+    ------
+    EstimationError : inflation is not positive and finite.
+    """
+
+    inflation: float | Rule = 1.0
+    free: tuple[bool, ...] = ()
+    noise: Literal["given", "estimated"] = "given"
+    correlation: FloatArray | None = field(default=None, repr=False, compare=False)
+    components: tuple[ToleranceComponent, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not callable(self.inflation) and not 0.0 < self.inflation < np.inf:
+            raise EstimationError(
+                f"tolerances times {self.inflation}: give a finite factor above 0, or a rule such "
+                "as InflatedTolerances()"
+            )
+
+    def required_equations(self, parameters: int) -> int:
+        """Return the number of unpenalized parameters."""
+        return sum(self.free)
+
+    def unpenalized(self, parameters: int) -> BoolArray | None:
+        """Return which parameters are not penalized."""
+        return np.array(self.free) if any(self.free) else None
+
+    def root(self, parameters: int) -> FloatArray | None:
+        """Return the symmetric root of the covariance of the deviations, in tolerances."""
+        if self.correlation is None and not self.components:
+            return None
+        covariance = compute_prior_covariance(parameters, self.correlation, self.components)
+        return compute_symmetric_root(covariance)
+
+    def penalty(self, decomposition: Decomposition) -> FloatArray:
+        """Return sigma^2 / inflation^2, with sigma = 1 where the noise is given."""
+        factor = self.sigma(decomposition) / self.compute_inflation(decomposition)
+        return _penalize(decomposition, factor**2)
+
+    def compute_inflation(self, decomposition: Decomposition) -> FloatArray:
+        """Return the factor (t,) on all tolerances."""
+        rule = self.inflation
+        if not callable(rule):
+            return np.full(len(decomposition.rows), rule)
+        return _apply_rule(rule, decomposition.divided(self.sigma(decomposition)))
+
+    def read_inflation(self, decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
+        """Return the factor (t,) on all tolerances that the penalty (t, p) of a fit contains; 1
+        where no direction is penalized.
+        """
+        is_penalized = np.isfinite(penalty) & (penalty > 0.0)
+        largest = np.where(is_penalized, penalty, 0.0).max(axis=1, initial=0.0)
+        root = np.sqrt(np.where(largest > 0.0, largest, 1.0))
+        return np.where(largest > 0.0, self.sigma(decomposition) / root, 1.0)
+
+    def prior_variance(
+        self, decomposition: Decomposition, penalty: FloatArray, free: FreeParameters
+    ) -> FloatArray | None:
+        """Return inflation^2, which an estimated noise does not change."""
+        if self.noise == "given":
+            return None
+        square = self.sigma(decomposition)[:, None] ** 2
+        return np.divide(square, penalty, out=np.zeros_like(penalty), where=penalty > 0.0)
+
+    def sigma(self, decomposition: Decomposition) -> FloatArray:
+        """Return the factor (t,) on the stated sigmas.
+
+        It is 1 where fewer than FEWEST_DEGREES degrees of freedom are left to estimate it.
+        """
+        if self.noise == "given":
+            return np.ones_like(decomposition.outside)
+        left = decomposition.rows - decomposition.rank
+        enough = (left >= FEWEST_DEGREES) & (decomposition.unexplained > 0.0)
+        return np.sqrt(np.where(enough, decomposition.unexplained / np.maximum(left, 1), 1.0))
+
+
+def _apply_rule(rule: Rule, decomposition: Decomposition) -> FloatArray:
+    """Return what a rule chooses, (t,) or (1,); EstimationError where it is no number of that."""
+    value = np.atleast_1d(np.asarray(rule(decomposition), dtype=np.float64))
+    trials = len(decomposition.singular_values)
+    if value.shape not in {(1,), (trials,)} or not np.all(np.isfinite(value) & (value >= 0.0)):
+        name = getattr(rule, "__name__", type(rule).__name__)
+        raise EstimationError(
+            f"the rule {name} returned {np.array2string(value, threshold=6)} for {trials} fits; "
+            "return one finite number of at least 0 for each fit, as an array (t,)"
+        )
+    return value
+
+
+def _penalize(decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+    """Return the penalty (t, p): lam (t,) or (1,) for all directions but unpenalized ones.
+
+    Unpenalized directions get 0 within the numerical rank and infinity beyond it.
+    """
+    free = np.where(decomposition.used, 0.0, np.inf)
+    penalty = np.where(lam[:, None] > 0.0, lam[:, None], free)
+    if decomposition.unpenalized is None:
+        return penalty
+    return np.where(decomposition.unpenalized, free, penalty)
+
+
+def decompose_for(
+    method: Method,
+    factor: FloatArray,
+    equations: IntArray,
+    deviation: FloatArray,
+    tolerance: float = RANK_TOLERANCE,
+) -> Decomposition:
+    """Decompose the factor of linearized rows in the coordinates that a method penalizes.
+
+    Parameters
+    ----------
+    factor : (t, p + 1, p + 1), columns scaled by tolerance. equations : (t,) that were folded.
+    deviation : (t, p) where the rows were linearized. tolerance : relative rank tolerance.
+    """
+    p = deviation.shape[1]
+    return decompose(
+        factor,
+        equations,
+        deviation,
+        method.scale(p),
+        tolerance,
+        method.unpenalized(p),
+        method.root(p),
+    )
+
+
+def adapt_method(
+    method: Method | None,
+    assumed: BoolArray,
+    noise: Literal["given", "estimated"],
+    correlation: FloatArray | None = None,
+) -> Method:
+    """Return the method of a fit: the default where it is None; MAP with what it must know.
+
+    Parameters
+    ----------
+    assumed : (p,) free parameters whose tolerance is not stated. noise : see `FitOptions`.
+    correlation : (p, p) of the deviations, where the robot states common errors.
+    """
+    method = MAP(InflatedTolerances()) if method is None else method
+    if not isinstance(method, MAP):
+        return method
+    free = method.free or (tuple(assumed.tolist()) if assumed.any() else ())
+    correlation = correlation if method.correlation is None else method.correlation
+    return replace(method, free=free, noise=noise, correlation=correlation)
+
+
+# --- The regularization that a fit used: its parameter, how it was chosen, and how much it leaves.
+
+FIXED = "fixed"
+"""Rule of a parameter that was given."""
+
+
+@dataclass(frozen=True)
+class Regularization:
+    """Ridge parameter or truncation of a fit.
+
+    Attributes
+    ----------
+    parameter : "lam", the ridge parameter in squared standard deviations of the noise per squared
+        tolerance, or "k", the number of directions of a truncated SVD.
+    value : of the parameter; the largest one where each parameter has its own `lam`.
+    rule : name of the rule that chose it, such as "GCV"; "fixed" where it was given.
+    score : what the rule minimizes, at `value`; None where it was given or the rule has no score.
+    effective : sum of the filter factors, the number of directions that the data determine after
+        regularization. parameters, rank : p, and the number of directions without regularization.
+    is_at_limit : whether a rule chose an end of its range, so that its minimum may lie beyond.
+    """
+
+    parameter: str
+    value: float
+    rule: str
+    score: float | None
+    effective: float
+    parameters: int
+    rank: int
+    is_at_limit: bool
+
+    @property
+    def finding(self) -> Finding:
+        """The parameter with rule and score."""
+        code = "fit.regularization-at-limit" if self.is_at_limit else "fit.regularization"
+        return report_finding(code, **vars(self))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes by name for JSON."""
+        return dict(vars(self))
+
+
+def describe_regularization(
+    method: Method, decomposition: Decomposition, penalty: FloatArray
+) -> Regularization | None:
+    """Return the regularization of trial 0; None for methods without a parameter to choose.
+
+    Parameters
+    ----------
+    decomposition, penalty : of the fit.
+    """
+    if isinstance(method, Ridge):
+        name, stated = "lam", method.lam
+    elif isinstance(method, TruncatedSVD):
+        name, stated = "k", method.k
+    else:
+        return None
+    score, is_at_limit, rule = None, False, FIXED
+    if callable(stated):
+        value = float(np.atleast_1d(np.asarray(stated(decomposition)))[0])
+        rule = getattr(stated, "__name__", type(stated).__name__)
+        if callable(measure := getattr(stated, "score", None)):
+            score = float(np.asarray(measure(decomposition, np.full(1, value)))[0])
+        if callable(is_limit := getattr(stated, "is_limit", None)):
+            is_at_limit = bool(np.asarray(is_limit(decomposition, np.full(1, value)))[0])
+    else:
+        value = float(np.max(stated))
+    return Regularization(
+        parameter=name,
+        value=value,
+        rule=rule,
+        score=score,
+        effective=float(decomposition.filter_factors(penalty)[0].sum()),
+        parameters=penalty.shape[1],
+        rank=int(decomposition.rank[0]),
+        is_at_limit=is_at_limit,
+    )
+
+
+# --- Rules that choose the ridge parameter or the truncation from the decomposition itself.
+
+PER_DECADE = 16
+"""Grid points per factor of ten; around their minimum the criteria are flat over much more."""
+
+LOWEST, HIGHEST = 1e-12, 1e4
+"""Range of lam in units of the largest squared singular value: no effect to hardly any data."""
+
+
+@dataclass(frozen=True)
+class GCV:
+    """Choose the ridge parameter that minimizes generalized cross-validation."""
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,)."""
+        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
+
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return RSS / (m - sum f)^2 (t,) at lam (t,)."""
+        penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
+        return _gcv(decomposition, penalty)
+
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are ends of the range."""
+        return _is_end_of_range(decomposition, lam)
+
+
+@dataclass(frozen=True)
+class MarginalLikelihood:
+    """Choose the ridge parameter under which the whitened data are most probable."""
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,)."""
+        return _minimize(lambda lam: self.score(decomposition, lam), decomposition)
+
+    def is_limit(self, decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+        """Return which lam (t,) are ends of the range."""
+        return _is_end_of_range(decomposition, lam)
+
+    def score(self, decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+        """Return minus twice the log density of the data at lam (t,), up to a constant."""
+        # directions of unpenalized parameters contain no information on lam
+        unpenalized = decomposition.unpenalized
+        counted = np.ones(1) if unpenalized is None else ~unpenalized
+        square = decomposition.singular_values**2 * counted
+        projected = decomposition.projections**2 * counted
+        variance = 1.0 + square / lam[:, None]
+        return (np.log(variance) + projected / variance).sum(axis=1)
+
+
+@dataclass(frozen=True)
+class TruncationGCV:
+    """Choose the truncation k that minimizes generalized cross-validation."""
+
+    def __call__(self, decomposition: Decomposition) -> IntArray:
+        """Return k (t,)."""
+        count = decomposition.singular_values.shape[1] + 1
+        trials = np.ones(len(decomposition.singular_values))
+        return np.argmin(
+            np.stack([self.score(decomposition, k * trials) for k in range(count)]), axis=0
+        )
+
+    def score(self, decomposition: Decomposition, k: FloatArray) -> FloatArray:
+        """Return RSS / (m - k)^2 (t,) at k (t,)."""
+        order = np.arange(decomposition.singular_values.shape[1])
+        kept = (order < k[:, None]) & decomposition.used
+        return _gcv(decomposition, np.where(kept, 0.0, np.inf))
+
+
+def _is_end_of_range(decomposition: Decomposition, lam: FloatArray) -> BoolArray:
+    """Return which lam (t,) are within one grid point of an end of the grid."""
+    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
+    point = 10.0 ** (1.0 / PER_DECADE)
+    return (lam <= LOWEST * reference * point) | (lam >= HIGHEST * reference / point)
+
+
+def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
+    """Return generalized cross-validation (t,); infinite where no equation is left over."""
+    left = decomposition.rows - decomposition.filter_factors(penalty).sum(axis=1)
+    spare = left > 1e-6
+    return np.where(
+        spare, decomposition.remaining(penalty) / np.where(spare, left, 1.0) ** 2, np.inf
+    )
+
+
+def _minimize(
+    criterion: Callable[[FloatArray], FloatArray], decomposition: Decomposition
+) -> FloatArray:
+    """Minimize a criterion of lam (t,) over the grid.
+
+    The parabola through the best grid point and its neighbors refines the minimum.
+    """
+    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
+    decades = np.log10(HIGHEST / LOWEST)
+    grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)
+    values = np.stack([criterion(reference * 10.0**g) for g in grid])
+    best = np.clip(np.argmin(values, axis=0), 1, len(grid) - 2)
+    trial = np.arange(values.shape[1])
+    low, middle, high = (values[best + shift, trial] for shift in (-1, 0, 1))
+    curvature = low - 2.0 * middle + high
+    with np.errstate(invalid="ignore"):
+        shift = np.where(
+            curvature > 0.0, 0.5 * (low - high) / np.where(curvature > 0.0, curvature, 1.0), 0.0
+        )
+    shift = np.clip(np.nan_to_num(shift), -1.0, 1.0)
+    return reference * 10.0 ** (grid[best] + shift * (grid[1] - grid[0]))
+
+
+# --- The penalty of a method as rows beside the measured ones, where it does not depend on these.
+
+
+class FixedPenalty(NamedTuple):
+    """The penalty of a method that does not depend on the rows: |P z|^2 is added to their sum of
+    squares.
+
+    Attributes
+    ----------
+    unit : (p, p) S with z = S u, where the method filters the coordinates u; (p,) if S is diagonal,
+        None if it is 1.
+    rows : (k, p) P S, one row for each penalized coordinate; k = 0 where nothing is penalized.
+    matrix : (k, p) P.
+    """
+
+    unit: FloatArray | None
+    rows: FloatArray
+    matrix: FloatArray
+
+    @property
+    def is_triangular(self) -> bool:
+        """Whether R S is triangular for every triangular R."""
+        return self.unit is None or self.unit.ndim == 1
+
+    def scale_columns(self, triangle: FloatArray) -> FloatArray:
+        """Return R S for R (t, p, p)."""
+        if self.unit is None:
+            return triangle
+        return triangle * self.unit if self.unit.ndim == 1 else triangle @ self.unit
+
+    def to_deviation(self, coordinates: FloatArray) -> FloatArray:
+        """Return S u, (t, p), of u (t, p)."""
+        if self.unit is None:
+            return coordinates
+        if self.unit.ndim == 1:
+            return coordinates * self.unit
+        return np.matmul(self.unit, coordinates[:, :, None])[:, :, 0]
+
+    def evaluate(self, deviation: FloatArray) -> FloatArray:
+        """Return P z (t, k) of deviations z (t, p)."""
+        return np.matmul(self.matrix, deviation[:, :, None])[:, :, 0]
+
+
+def fix_penalty(method: Method, parameters: int) -> FixedPenalty | None:
+    """Return the penalty of a method for p parameters where it does not depend on the rows."""
+    value = _find_fixed_penalty(method)
+    if value is None:
+        return None
+    scale, root = method.scale(parameters), method.root(parameters)
+    unpenalized = method.unpenalized(parameters)
+    is_penalized = np.full(parameters, value > 0.0)
+    if unpenalized is not None:
+        is_penalized &= ~unpenalized
+    rows = np.sqrt(value) * np.eye(parameters)[is_penalized]
+    matrix, unit = rows, scale
+    if root is not None:
+        matrix = np.linalg.solve(root.T, rows.T).T
+        unit = root if scale is None else scale[:, None] * root
+    if scale is not None:
+        matrix = matrix / scale
+    return FixedPenalty(unit, rows, matrix)
+
+
+def _find_fixed_penalty(method: Method) -> float | None:
+    """Return the penalty of all penalized directions where the method states it, which is 0 for
+    least squares; None where the method chooses it from the decomposition.
+
+    Of another class, which may inherit from these, only its penalties of decompositions are known.
+    """
+    if type(method) is LeastSquares:
+        return 0.0
+    if type(method) is Ridge and not callable(method.lam):
+        return 1.0 if isinstance(method.lam, tuple) else float(method.lam)
+    if type(method) is MAP and not callable(method.inflation) and method.noise == "given":
+        return 1.0 / method.inflation**2
+    return None

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimated poses and true readings after a fit of uncertain readings, and doubts about them.
+
+Rows at the platform do not distinguish the ways in which a limb bends to one pose, and they do not
+know end stops. A reading that was not taken is therefore reported where its estimate lies outside
+the stroke or on another branch than home's, so that nobody takes it for a measured one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.pose_linearization import PoseEstimates
+from loopcal.estimate.problem import Problem, problem_of
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.geometry import wrap_angle
+from loopcal.measure.data_checks import find_outside_strokes
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import NuisanceParameters
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
+from loopcal.parameters import ParameterTable
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
+
+SAME_READING = 1e-6
+"""Difference of readings, as a share of the robot's size or in radians, up to which they are the
+same solution: above rounding."""
+
+UNEVEN = 1e9
+"""Ratio of standard deviations beyond which the rows of larger sigma drown in the rounding of the
+others."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedPoses:
+    """Poses where the machine stood, by all that was measured there and the identified machine.
+
+    Attributes
+    ----------
+    labels : (n,). poses : (n, 4, 4) T_base_platform [m], NaN where not reached or excluded.
+    readings : (n, actuators) [SI], the true ones, NaN where excluded.
+    sigma : (n, actuators) [SI] of the recorded ones: 0 exact, infinite not taken or not believed.
+    kept : (n,) poses that were not excluded.
+    is_undetermined : (n,) poses of these that the data do not determine in some direction; they
+        stand where the search began.
+    is_converged : whether the search for the poses converged.
+    """
+
+    labels: tuple[str, ...]
+    poses: FloatArray
+    readings: FloatArray
+    sigma: FloatArray
+    kept: BoolArray
+    is_undetermined: BoolArray
+    is_converged: bool
+
+    def report(self) -> tuple[Finding, ...]:
+        """Return what is not known of the poses."""
+        findings = []
+        if self.is_undetermined.any():
+            names = _labels_of(self.labels, self.is_undetermined)
+            findings.append(report_finding("poses.undetermined", poses=names, n=len(names)))
+        if not self.is_converged:
+            findings.append(report_finding("poses.not-converged"))
+        return tuple(findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return numbers of readings by how they were believed, for JSON.
+
+        Excluded poses are not counted. The arrays are in `arrays`.
+        """
+        sigma = self.sigma[self.kept]
+        return {
+            "exact": int((sigma == 0.0).sum()),
+            "uncertain": int(((sigma > 0.0) & np.isfinite(sigma)).sum()),
+            "not_taken": int(np.isinf(sigma).sum()),
+            "open": _labels_of(self.labels, self.is_undetermined),
+            "calm": self.is_converged,
+        }
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return the arrays by name [SI], for the run folder."""
+        return {"pose_estimate": self.poses, "reading_estimate": self.readings}
+
+
+def estimate_poses(
+    estimates: PoseEstimates, data: Measurements, drop: Sequence[str] = ()
+) -> EstimatedPoses:
+    """Return the estimated poses of measurements (one trial).
+
+    `drop` are labels of poses that were excluded: nothing is reported of them.
+    """
+    kept = ~np.isin(data.labels, drop)
+    known = estimates.is_reached[0] & kept
+    T = np.where(known[:, None, None], estimates.states.state.T[0], np.nan)
+    readings = np.where(kept[:, None], estimates.states.q[0], np.nan)
+    sigma = np.zeros(data.readings.shape) if data.reading_sigma is None else data.reading_sigma
+    return EstimatedPoses(
+        labels=data.labels,
+        poses=T,
+        readings=readings,
+        sigma=sigma,
+        kept=kept,
+        is_undetermined=estimates.is_undetermined[0] & known,
+        is_converged=bool(estimates.is_converged[0]),
+    )
+
+
+def report_doubtful_readings(robot: Mechanism, poses: EstimatedPoses) -> tuple[Finding, ...]:
+    """Return estimated readings outside their stroke, or on another branch than home's.
+
+    `robot` is the identified one.
+    """
+    known = np.asarray(np.isfinite(poses.poses).all(axis=(1, 2)) & ~poses.is_undetermined)
+    estimated = np.isinf(poses.sigma) & known[:, None]
+    outside = estimated & (find_outside_strokes(poses.readings, robot) > 0.0)
+    beside = estimated & _is_on_other_branch(robot, poses, np.asarray(estimated.any(axis=1)))
+    codes = (("poses.outside-stroke", outside), ("poses.other-branch", beside))
+    return tuple(
+        report_finding(code, readings=_describe_readings(robot, poses, chosen))
+        for code, chosen in codes
+        if chosen.any()
+    )
+
+
+def report_uneven_sigmas(problem: Problem) -> tuple[Finding, ...]:
+    """Return whether the sigmas of all rows differ by more than rounding bears.
+
+    They are compared in sizes of the robot and in radians.
+    """
+    robot = problem.free.robot
+    least, most, name = np.inf, 0.0, ""
+    for rows in problem.rows:
+        weight = np.einsum("trii->tri", rows.whitener)
+        for i, column in enumerate(rows.kind.noise_columns):
+            present = weight[..., i][weight[..., i] > 0.0]
+            if len(present) and column.dimension in (Dimension.LENGTH, Dimension.ANGLE):
+                scale = robot.size if column.dimension is Dimension.LENGTH else 1.0
+                most = max(most, 1.0 / (present.min() * scale))
+                if 1.0 / (present.max() * scale) < least:
+                    least = 1.0 / (present.max() * scale)
+                    name = f"{rows.kind.name} {column.name}"
+    if most <= UNEVEN * least:
+        return ()
+    return (report_finding("poses.uneven-sigmas", ratio=most / least, smallest=name),)
+
+
+def _is_on_other_branch(robot: Mechanism, poses: EstimatedPoses, chosen: BoolArray) -> BoolArray:
+    """Return readings (n, actuators) that differ from those of home's branch at the same pose."""
+    other = np.zeros(poses.readings.shape, dtype=bool)
+    if chosen.any():
+        home = inverse(robot, poses.poses[chosen])
+        gap = poses.readings[chosen] - home.q
+        turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+        size = np.where(turning, 1.0, robot.size)
+        gap = np.abs(np.where(turning, wrap_angle(gap), gap)) / size
+        other[chosen] = home.closed[:, None] & (gap > SAME_READING)
+    return other
+
+
+def _describe_readings(
+    robot: Mechanism, poses: EstimatedPoses, chosen: BoolArray
+) -> list[dict[str, Any]]:
+    """Return actuator, pose and value of chosen readings (n, actuators)."""
+    described = []
+    for pose, column in np.argwhere(chosen):
+        actuator = robot.actuators[column]
+        value = robot.to_quantity(float(poses.readings[pose, column]), actuator.dimension)
+        described.append({"actuator": actuator.name, "pose": poses.labels[pose], "value": value})
+    return described
+
+
+def _labels_of(labels: Sequence[str], chosen: BoolArray) -> list[str]:
+    """Return the labels of chosen poses."""
+    return [label for label, is_chosen in zip(labels, chosen, strict=True) if is_chosen]
+
+
+# --- Poses that a geometry predicts from readings, as far as each reading is believed.
+
+SAME_RATIO = 1e-9
+"""Relative difference of sigma ratios below which a pose's readings are weighted as the robot
+states."""
+
+
+def predict_from_readings(robot: Mechanism, data: Measurements) -> tuple[Solution, BoolArray]:
+    """Return the poses of all readings.
+
+    Returns
+    -------
+    solution : of n poses.
+    is_determined : (n,) poses that the readings determine which were taken and are believed.
+
+    Raises
+    ------
+    DataError
+        A redundant reading is stated to be exact.
+    """
+    if robot.program.sigma is not None:
+        data = fill_in_reading_sigma(robot, data)
+    sigma = data.reading_sigma
+    if robot.program.sigma is None or sigma is None:
+        known = np.ones(data.n_poses, dtype=bool)
+        if sigma is not None:
+            known = np.asarray(np.isfinite(sigma).all(axis=1))
+        return forward(robot, data.readings), known
+    ratio = sigma / np.array(robot.program.sigma)
+    if np.isfinite(ratio).all() and np.ptp(ratio, axis=1).max() <= SAME_RATIO * ratio.min():
+        solution = forward(robot, data.readings)
+        if solution.converged.all():
+            return solution, np.ones(data.n_poses, dtype=bool)
+    # also readings that contradict each other by more than forward kinematics accept
+    located = fit_poses(robot, data)
+    return located.solution, located.is_determined
+
+
+class PoseFit(NamedTuple):
+    """Poses of a robot where readings and rows fit best.
+
+    Attributes
+    ----------
+    solution : of n poses. is_determined : (n,) poses that the data determine.
+    absorbed : (n,) number of residuals of rows that each pose takes up, which are its unknowns less
+        its recorded uncertain readings; poses that rows link are counted at the first of them.
+    left : (n,) number of residuals of its linked poses that are left.
+    reading_residuals : (n, actuators) true minus recorded readings in units of their sigma, zero
+        where exact or not taken.
+    """
+
+    solution: Solution
+    is_determined: BoolArray
+    absorbed: IntArray
+    left: IntArray
+    reading_residuals: FloatArray
+
+
+def fit_poses(
+    robot: Mechanism, data: Measurements, nuisance: NuisanceParameters | None = None
+) -> PoseFit:
+    """Return the poses where uncertain readings and all rows fit best at this geometry.
+
+    Parameters
+    ----------
+    data : with at least one uncertain reading. nuisance : with fixed values; those without are
+        fitted as well. None leaves the rows out: readings alone locate the poses.
+
+    Raises
+    ------
+    DataError
+        A redundant reading is stated to be exact.
+    """
+    data, nothing = fill_in_reading_sigma(robot, data), np.zeros(0)
+    if nuisance is None:
+        data = replace(data, observations=())
+        nuisance = NuisanceParameters(ParameterTable(()), ())
+    free = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
+    problem, z = problem_of(free, data, nuisance), np.zeros((1, 0))
+    fitted = problem.solve(z, problem.start(z))
+    estimates = fitted.estimates
+    assert estimates is not None
+    assert problem.member is not None
+    states, member = estimates.states, problem.member
+    assert data.reading_sigma is not None
+    uncertain = (np.isfinite(data.reading_sigma) & (data.reading_sigma > 0.0)).sum(axis=1)
+    first = np.unique(member, return_index=True)[1]
+    absorbed = np.zeros(data.n_poses, dtype=np.int64)
+    absorbed[first] = np.maximum(estimates.rank[0] - np.bincount(member, uncertain), 0)
+    return PoseFit(
+        make_solution(robot, states.state, states.q[0]),
+        ~estimates.is_undetermined[0],
+        absorbed,
+        (problem.component_count[0] - estimates.rank[0])[member],
+        problem.residuals(z, fitted)[-1].whitened[0],
+    )
+
+
+# --- Poses that do not close at a robot's values: which, and by how much.
+
+MOST = 0.5
+"""Share of open poses above which a geometry is not one to begin with."""
+
+MM = 1e3
+
+
+class OpenPoses(NamedTuple):
+    """Poses at which the loops do not close with their readings.
+
+    Attributes
+    ----------
+    poses : their labels, the widest open first. gaps : (k,) [m] what is left open in the loops.
+    total : number of poses with all readings.
+    """
+
+    poses: tuple[str, ...]
+    gaps: FloatArray
+    total: int
+
+    @property
+    def are_most(self) -> bool:
+        """Whether more than a share `MOST` of the poses is open."""
+        return len(self.poses) > MOST * self.total
+
+    def report(self, code: str) -> Finding:
+        """Return the finding or error of this code, with poses and gaps."""
+        return report_finding(
+            code,
+            count=len(self.poses),
+            total=self.total,
+            poses=self.poses,
+            gaps=tuple(Quantity(float(gap) * MM, "mm") for gap in self.gaps),
+        )
+
+
+def find_open_poses(robot: Mechanism, data: Measurements) -> OpenPoses:
+    """Return the poses of measurements whose redundant readings do not close the loops of a robot.
+
+    Poses with a missing reading are not tested, and robots with as many actuators as freedoms have
+    none: a pose that they do not reach is refused by `check_start`.
+    """
+    if robot.program.sigma is None:
+        return OpenPoses((), np.zeros(0), data.n_poses)
+    used = np.flatnonzero(np.isfinite(data.readings).all(axis=1))
+    if not len(used):
+        return OpenPoses((), np.zeros(0), 0)
+    solution = forward(robot, data.readings[used])
+    is_open = np.flatnonzero(~solution.converged)
+    gaps = solution.residual[is_open]
+    order = np.argsort(-np.where(np.isfinite(gaps), gaps, np.inf), kind="stable")
+    labels = tuple(data.labels[i] for i in used[is_open[order]])
+    return OpenPoses(labels, gaps[order], len(used))

@@ -1,0 +1,604 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The posterior of a fit, direction by direction, also where a covariance would be infinite.
+
+The deviation from the estimate is e - estimate = diag(unit) V y, with independent coordinates y_i
+of variance `variance_i`. The variance is infinite for directions of which nothing is known. See
+docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.penalties import Method
+from loopcal.estimate.residual_test import FEWEST_DEGREES, ResidualTest
+from loopcal.estimate.smooth_errors import DISCREPANCY_PREFIX, SmoothErrors
+from loopcal.findings import report_finding
+from loopcal.findings.wording import round_to_digits
+from loopcal.measure.fitted_rows import FittedRows, fitted_rows_from_arrays
+from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.decomposition import Decomposition
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# --- Parts of a covariance whose size was estimated from data, each with its degrees of freedom.
+
+PREFIX = "posterior_"
+"""Beginning of the names of the arrays of a run folder."""
+
+NOISE = "noise"
+"""Source of the part of the covariance that the noise of the rows causes."""
+
+TOLERANCES = "tolerances"
+"""Source of the part that the deviations from nominal cause, where their size was estimated."""
+
+PARTS = ("source", "degrees", "root", "part")
+"""Arrays of a run folder (after `PREFIX`) with the parts of the covariance: the source and the
+degrees of freedom of each, the roots beside each other, and the number of the part of each column.
+"""
+
+
+class CovariancePart(NamedTuple):
+    """A part of the covariance of the parameters whose size was estimated from data.
+
+    Attributes
+    ----------
+    source : what causes it: "noise", "tolerances", or the code of the finding with which it was
+        added.
+    root : (p, k) [SI], the part is root root'.
+    degrees : degrees of freedom of its estimated size; infinite where it is known.
+    """
+
+    source: str
+    root: FloatArray
+    degrees: float
+
+    @property
+    def is_added(self) -> bool:
+        """Whether it is beside what noise and tolerances cause."""
+        return self.source not in (NOISE, TOLERANCES)
+
+
+def combine_degrees(total: FloatArray, squares: Iterable[tuple[FloatArray, float]]) -> FloatArray:
+    """Return the effective degrees of freedom (..,) of variances.
+
+    With parts u_i^2 of nu_i degrees of freedom (Welch-Satterthwaite, JCGM 100, G.4):
+
+        degrees = u^4 / sum(u_i^4 / nu_i)
+
+    Parameters
+    ----------
+    total : (..,) variance u^2 of all parts, also those that are known. squares : variance (..,) and
+        degrees of freedom of each part that was estimated.
+
+    Returns
+    -------
+    At least the smallest nu_i; infinite where nothing was estimated, or the variance is infinite.
+    """
+    spread = sum((square**2 / nu for square, nu in squares), np.zeros_like(total))
+    is_estimated = np.isfinite(total) & (spread > 0.0)
+    square = np.where(is_estimated, total, 1.0) ** 2
+    return np.divide(square, spread, out=np.full_like(total, np.inf), where=is_estimated)
+
+
+def store_parts(parts: Sequence[CovariancePart], parameters: int) -> dict[str, np.ndarray]:
+    """Return the arrays of a run folder, which `parts_from_arrays` reads, for p parameters."""
+    roots = [part.root for part in parts]
+    content = (
+        np.array([part.source for part in parts], dtype=np.str_),
+        np.array([part.degrees for part in parts]),
+        np.concatenate([np.zeros((parameters, 0)), *roots], axis=1),
+        np.repeat(np.arange(len(parts)), [root.shape[1] for root in roots]),
+    )
+    return {PREFIX + name: array for name, array in zip(PARTS, content, strict=True)}
+
+
+def parts_from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[CovariancePart, ...]:
+    """Return the parts of a covariance in a run folder; none in those of earlier versions."""
+    if any(PREFIX + name not in arrays for name in PARTS):
+        return ()
+    sources, degrees, roots, number = (arrays[PREFIX + name] for name in PARTS)
+    return tuple(
+        CovariancePart(str(source), roots[:, number == i], float(degrees[i]))
+        for i, source in enumerate(sources.tolist())
+    )
+
+
+# --- The noise that residuals alone show, without the stated sigma.
+
+NAME = "posterior_shown_noise"
+"""Name of the stored array."""
+
+
+@dataclass(frozen=True)
+class ShownNoise:
+    """The variance of whitened rows, in units of the stated one.
+
+    Attributes
+    ----------
+    variance : that of the residuals that no parameter explains. degrees : its degrees of freedom.
+    used : the variance that the covariance of the fit contains.
+    """
+
+    variance: float
+    degrees: float
+    used: float
+
+    @property
+    def is_known(self) -> bool:
+        """Whether at least five degrees of freedom determine it."""
+        return self.degrees >= FEWEST_DEGREES and self.variance > 0.0
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the numbers by name, to be stored."""
+        return {NAME: np.array([self.variance, self.degrees, self.used])}
+
+
+def find_shown_noise(decomposition: Decomposition, test: ResidualTest) -> ShownNoise | None:
+    """Return the noise that the residuals of a fit show (t = 1); None without intervals, or where
+    a loss chose the weights by the residuals.
+    """
+    if not test.intervals or test.weighted:
+        return None
+    degrees = float((decomposition.rows - decomposition.rank)[0])
+    variance = float(decomposition.unexplained[0]) / degrees if degrees > 0.0 else np.nan
+    return ShownNoise(variance, degrees, test.sigma_scale**2)
+
+
+def shown_noise_from_arrays(arrays: Mapping[str, np.ndarray]) -> ShownNoise | None:
+    """Return the noise in the arrays of a run folder; None where it is not known."""
+    return ShownNoise(*arrays[NAME].tolist()) if NAME in arrays else None
+
+
+# --- What the data of a fit say of its parameters, without any tolerance or penalty.
+
+ROWS, DEVIATIONS, NOISE_SOURCE = "information_rows", "information_deviations", "information_noise"
+"""Names of the stored arrays."""
+
+
+@dataclass(frozen=True, eq=False)
+class DataInformation:
+    """Rows B (e - nominal) = deviations + noise; what lies outside their range says nothing of e.
+
+    Attributes
+    ----------
+    rows : (r, p) B [1 / SI]. deviations : (r,) right-hand sides [1].
+    variance : of the noise of a row, in units of the stated one: what the residuals show, or else
+        what the fit uses; NaN without intervals. degrees : its degrees of freedom.
+    """
+
+    rows: FloatArray
+    deviations: FloatArray
+    variance: float
+    degrees: float
+
+    def __repr__(self) -> str:
+        """Return the numbers of rows and parameters."""
+        return f"<DataInformation: {len(self.rows)} rows on {self.rows.shape[1]} parameters>"
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return the arrays of a run folder."""
+        noise = np.array([self.variance, self.degrees])
+        return {ROWS: self.rows, DEVIATIONS: self.deviations, NOISE_SOURCE: noise}
+
+
+def collect_information(
+    free: FreeParameters, decomposition: Decomposition, test: ResidualTest
+) -> DataInformation:
+    """Return what the rows of a fit (t = 1), which follow no penalty, say of the parameters."""
+    shown = find_shown_noise(decomposition, test)
+    variance = test.sigma_scale**2 if test.intervals else np.nan
+    degrees = test.noise_degrees
+    if shown is not None and shown.is_known:
+        variance, degrees = shown.variance, shown.degrees
+    return fold_information(free, decomposition, variance, float(degrees))
+
+
+def fold_information(
+    free: FreeParameters, decomposition: Decomposition, variance: float, degrees: float
+) -> DataInformation:
+    """Return what the rows of trial 0 of a decomposition say, for this noise of a row."""
+    d = decomposition.plain()
+    is_used = d.used[0]
+    unit = free.tolerance * d.scale
+    rows = d.singular_values[0][is_used, None] * d.inverse[0][is_used] / unit
+    return DataInformation(rows, d.projections[0][is_used], variance, degrees)
+
+
+def information_from_arrays(arrays: Mapping[str, np.ndarray]) -> DataInformation | None:
+    """Return the information in the arrays of a run folder; None where an older version wrote
+    it.
+    """
+    if ROWS not in arrays:
+        return None
+    variance, degrees = arrays[NOISE_SOURCE].tolist()
+    return DataInformation(arrays[ROWS], arrays[DEVIATIONS], variance, degrees)
+
+
+# --- The model discrepancy of a fit: slow errors of the poses that no geometry explains.
+
+DISCREPANCY = "residuals.model-discrepancy"
+"""Source of the part of the covariance that the discrepancy causes, and code of its finding."""
+
+STORED_DISCREPANCY = ("root", "degrees", "directions", "variance")
+"""Arrays of a run folder (after `PREFIX`), beside those of the errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelDiscrepancy:
+    """Slow errors of the poses of a calibrated machine.
+
+    Attributes
+    ----------
+    errors : phi. root : (p, m) L [SI].
+    degrees : (2,) degrees of freedom of the amplitudes of rotation and place; infinite where the
+        amplitude is zero.
+    directions, variance : (p, p), (p,) of the posterior without the discrepancy.
+    """
+
+    errors: SmoothErrors
+    root: FloatArray
+    degrees: FloatArray
+    directions: FloatArray
+    variance: FloatArray
+
+    def __repr__(self) -> str:
+        """Return the amplitudes."""
+        rotation, place = 1e3 * self.errors.amplitude[[0, 3]]
+        return (
+            f"<ModelDiscrepancy: {round_to_digits(place)} mm and {round_to_digits(rotation)} mrad>"
+        )
+
+    def twists(self, T: FloatArray, by_parameters: FloatArray) -> FloatArray:
+        """Return twists (n, 6, m) of the platform at poses T (n, 4, 4) by independent errors of
+        variance 1: first those by the rotations, then those by the places of `errors`.
+
+        `by_parameters` (n, 6, p) are the twists by the parameters [per SI].
+        """
+        return by_parameters @ self.root - self.errors.twists(T)
+
+    def split_squares(self, twists: FloatArray) -> list[tuple[FloatArray, float]]:
+        """Return the variances (n, 6) that the errors of rotation and those of place cause, from
+        columns (n, 6, m) such as `twists`, and the degrees of freedom of each.
+        """
+        halves = np.split(twists, 2, axis=2)
+        return [
+            ((half**2).sum(axis=2), float(degrees))
+            for half, degrees in zip(halves, self.degrees, strict=True)
+        ]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of the run folder, which `discrepancy_from_arrays` reads."""
+        own = {
+            DISCREPANCY_PREFIX + name: np.asarray(getattr(self, name))
+            for name in STORED_DISCREPANCY
+        }
+        return {**own, **self.errors.arrays()}
+
+
+def discrepancy_from_arrays(arrays: Mapping[str, np.ndarray]) -> ModelDiscrepancy | None:
+    """Return the discrepancy in the arrays of a run folder; None where it holds none."""
+    if DISCREPANCY_PREFIX + STORED_DISCREPANCY[0] not in arrays:
+        return None
+    own = (arrays[DISCREPANCY_PREFIX + name] for name in STORED_DISCREPANCY)
+    return ModelDiscrepancy(SmoothErrors.from_arrays(arrays), *own)
+
+
+# --- Which frames the measurements of a fit determine, and where the instruments stand.
+
+FRAME_PREFIX = "frames_"
+"""Beginning of the names of the arrays of a run folder."""
+
+COMMON = 1.0 - 1e-9
+"""Cosine of the angle above which motions of two sets are the same motion."""
+
+
+class InstrumentFrame(NamedTuple):
+    """The frame of an instrument after a fit.
+
+    Its error is a twist (rotation about base axes [rad], displacement of its origin [m]):
+    `by_parameters` times the error of the parameters, plus `own` times independent errors of unit
+    variance, which the noise causes at a known machine.
+
+    Attributes
+    ----------
+    T : (4, 4) T_base_frame [m]. by_parameters : (6, p) [per SI]. own : (6, 6); both are zero for a
+        frame that is stated.
+    """
+
+    T: FloatArray
+    by_parameters: FloatArray
+    own: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFrames:
+    """How the measurements of a fit determine the frames of the base and the platform.
+
+    Attributes
+    ----------
+    unfixed : (12, k) orthonormal motions of both frames that change no measured value, see
+        `loopcal.estimate.frame_freedoms`; k = 0 where the measurements determine both frames.
+    readings : (m, a) of measured poses, at most some hundred [m, rad].
+    instruments : name, such as "tracker" or "monday.tracker" -> its frame.
+    """
+
+    unfixed: FloatArray
+    readings: FloatArray
+    instruments: Mapping[str, InstrumentFrame] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return the number of motions and the names of the frames."""
+        names = ", ".join(self.instruments) or "none"
+        return f"<MeasuredFrames: {self.unfixed.shape[1]} unfixed motions; instruments: {names}>"
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of the run folder, which `frames_from_arrays` reads."""
+        p = next((f.by_parameters.shape[1] for f in self.instruments.values()), 0)
+        of_frames = {"T": (4, 4), "by_parameters": (6, p), "own": (6, 6)}
+        count = len(self.instruments)
+        stacked = {
+            name: np.reshape([getattr(f, name) for f in self.instruments.values()], (count, *size))
+            for name, size in of_frames.items()
+        }
+        content = {"unfixed": self.unfixed, "readings": self.readings, **stacked}
+        content["names"] = np.array(tuple(self.instruments), dtype=np.str_)
+        return {FRAME_PREFIX + name: array for name, array in content.items()}
+
+
+def frames_from_arrays(arrays: Mapping[str, np.ndarray]) -> MeasuredFrames | None:
+    """Return the frames in the arrays of a run folder; None where it does not hold them."""
+    names = ("unfixed", "readings", "names", "T", "by_parameters", "own")
+    if any(FRAME_PREFIX + name not in arrays for name in names):
+        return None
+    unfixed, readings, labels, *stacked = (arrays[FRAME_PREFIX + name] for name in names)
+    frames = {
+        str(name): InstrumentFrame(*fields)
+        for name, *fields in zip(labels.tolist(), *stacked, strict=True)
+    }
+    return MeasuredFrames(unfixed, readings, frames)
+
+
+def intersect_motions(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (12, k) of the motions that two bases (12, ..) have in common."""
+    u, cosine, _ = np.linalg.svd(first.T @ second, full_matrices=False)
+    return first @ u[:, cosine > COMMON]
+
+
+STORED = {"unit": "unit", "directions": "directions", "variance": "variance", "seen": "determined"}
+"""Arrays of a run folder (after `PREFIX`), and the attributes that they hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Free parameters of a robot with their uncertainty.
+
+    Attributes
+    ----------
+    robot : Mechanism at the estimate. places : (p,) positions of the free parameters in its table.
+    unit : (p,) [SI]. directions : (p, p) V.
+    variance : (p,) of each direction; infinite for unknown ones, NaN without intervals.
+    determined : (p,) True for directions that the rows determine; of the others at most a prior is
+        known.
+    frames : which frames the measurements determine; None where it is not known, as in run folders
+        of earlier versions.
+    parts : the parts of the covariance whose size was estimated from data, with their degrees of
+        freedom; what they leave of the covariance counts as known.
+    fitted_rows : the measured rows that it comes from, so that they do not count twice; None where
+        they are not known.
+    discrepancy : slow errors of the poses that no geometry explains; None where none were found.
+        Their effect on the parameters is one of the parts.
+    shown_noise : the noise that the residuals alone show; None where it is not known.
+    information : what the data say without tolerances, to compare calibrations; None where it is
+        not known.
+    """
+
+    robot: Mechanism
+    places: IntArray
+    unit: FloatArray
+    directions: FloatArray
+    variance: FloatArray
+    determined: BoolArray
+    frames: MeasuredFrames | None = None
+    parts: tuple[CovariancePart, ...] = ()
+    fitted_rows: FittedRows | None = None
+    discrepancy: ModelDiscrepancy | None = None
+    shown_noise: ShownNoise | None = None
+    information: DataInformation | None = None
+
+    def __repr__(self) -> str:
+        """Return the robot's name and the numbers of parameters and of determined directions."""
+        return (
+            f"<Posterior of {self.robot.name}: {len(self.places)} parameters, "
+            f"{int(self.determined.sum())} directions determined>"
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(self.robot.parameters.names[i] for i in self.places)
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(p,) estimates [SI]."""
+        return self.robot.values[self.places]
+
+    @property
+    def without_discrepancy(self) -> Posterior:
+        """The posterior of the parameters if no slow error of the poses moved them."""
+        own = self.discrepancy
+        if own is None:
+            return self
+        parts = tuple(part for part in self.parts if part.source != DISCREPANCY)
+        return replace(
+            self, directions=own.directions, variance=own.variance, parts=parts, discrepancy=None
+        )
+
+    @property
+    def root(self) -> FloatArray:
+        """(p, k) square root of the covariance [SI], of the k directions of finite variance; NaN
+        without intervals.
+        """
+        is_finite = ~np.isinf(self.variance)
+        return (
+            self.unit[:, None] * self.directions[:, is_finite] * np.sqrt(self.variance[is_finite])
+        )
+
+    def count_degrees(self, effect: FloatArray) -> FloatArray:
+        """Return the effective degrees of freedom (..,) of the size of errors, whose square is the
+        sum of the squares of c components; see `combine_degrees`.
+
+        Parameters
+        ----------
+        effect : (.., c, p) [per SI] of the components.
+        """
+        squares = ((_sum_squares(effect @ part.root), part.degrees) for part in self.parts)
+        return combine_degrees(_sum_squares(effect @ self.root), squares)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of the run folder, which `posterior_from_arrays` reads."""
+        own = {
+            PREFIX + name: np.asarray(getattr(self, attribute))
+            for name, attribute in STORED.items()
+        }
+        own |= store_parts(self.parts, len(self.unit))
+        for value in (
+            self.frames,
+            self.fitted_rows,
+            self.discrepancy,
+            self.shown_noise,
+            self.information,
+        ):
+            own |= {} if value is None else value.arrays()
+        return own
+
+
+class VarianceSources(NamedTuple):
+    """What the variances of a fit are made of, beside its decomposition and penalty.
+
+    Attributes
+    ----------
+    noise : variance of the whitened rows; NaN without intervals.
+    prior : (1, p) variance of the true coordinates about nominal, from which the bias of the
+        penalty is expected; None for 1 / penalty.
+    """
+
+    noise: float
+    prior: FloatArray | None = None
+
+
+def compute_posterior(
+    robot: Mechanism,
+    places: IntArray,
+    tolerance: FloatArray,
+    decomposition: Decomposition,
+    penalty: FloatArray,
+    sources: VarianceSources = VarianceSources(1.0),  # noqa: B008
+    frames: MeasuredFrames | None = None,
+    degrees: float = np.inf,
+) -> Posterior:
+    """Return the posterior of trial 0 of a decomposition.
+
+    Parameters
+    ----------
+    robot : at the estimate. places, tolerance : (p,) of the free parameters.
+    decomposition, penalty : of the fit; columns scaled by tolerance.
+    sources : of the variances; default: stated noise, and a prior that is the penalty.
+    frames : which frames the measurements determine.
+    degrees : degrees of freedom of the noise variance; infinite where it is known.
+    """
+    directions, variance, determined = decomposition.knowledge(penalty, *sources)
+    unit = tolerance * decomposition.scale
+    by_noise = unit[:, None] * decomposition.noise_roots(penalty, sources.noise)[0]
+    return Posterior(
+        robot=robot,
+        places=places,
+        unit=unit,
+        directions=directions,
+        variance=variance,
+        determined=determined,
+        frames=frames,
+        parts=(CovariancePart(NOISE, by_noise, degrees),),
+    )
+
+
+def find_variance_sources(
+    decomposition: Decomposition,
+    penalty: FloatArray,
+    test: ResidualTest,
+    method: Method,
+    free: FreeParameters,
+) -> VarianceSources:
+    """Return what the variances of a fit are made of: noise as the test scales it, and the bias of
+    the penalty as the stated tolerances let it expect.
+    """
+    prior = method.prior_variance(decomposition, penalty, free)
+    is_known = test.intervals and (prior is None or not np.isnan(prior).any())
+    return VarianceSources(test.sigma_scale**2 if is_known else np.nan, prior)
+
+
+def add_data(
+    posterior: Posterior,
+    free: FreeParameters,
+    decomposition: Decomposition,
+    test: ResidualTest,
+    rows: FittedRows | None,
+) -> Posterior:
+    """Return a posterior with what is known of its data: rows, noise and information.
+
+    Parameters
+    ----------
+    free, decomposition, test : of the fit (t = 1). rows : see `Posterior.fitted_rows`.
+    """
+    return replace(
+        posterior,
+        fitted_rows=rows,
+        shown_noise=find_shown_noise(decomposition, test),
+        information=collect_information(free, decomposition, test),
+    )
+
+
+def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:
+    """Return the posterior in the arrays of a run folder.
+
+    Parameters
+    ----------
+    robot : the corrected robot of the run. arrays : of the run folder.
+
+    Raises
+    ------
+    EstimationError : the run has no posterior, or its robot now has other free parameters.
+    """
+    missing = [PREFIX + name for name in STORED if PREFIX + name not in arrays]
+    if missing:
+        raise EstimationError(report_finding("prior.no-posterior", array=missing[0]))
+    unit, directions, variance, determined = (arrays[PREFIX + name] for name in STORED)
+    places = np.flatnonzero(robot.parameters.free)
+    if len(places) != len(unit):
+        raise EstimationError(
+            report_finding("prior.other-count", identified=len(unit), free=len(places))
+        )
+    return Posterior(
+        robot,
+        places,
+        unit,
+        directions,
+        variance,
+        determined.astype(bool),
+        frames_from_arrays(arrays),
+        parts_from_arrays(arrays),
+        fitted_rows_from_arrays(arrays),
+        discrepancy_from_arrays(arrays),
+        shown_noise_from_arrays(arrays),
+        information_from_arrays(arrays),
+    )
+
+
+def _sum_squares(values: FloatArray) -> FloatArray:
+    """Return the sum of squares over the last two axes."""
+    return np.asarray((values**2).sum(axis=(-2, -1)))

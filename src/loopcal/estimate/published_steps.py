@@ -1,0 +1,427 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Full steps on raw rows, as published studies take them, many trials at once.
+
+Every row has weight one in millimeters and radians, every parameter is counted in millimeters and
+radians, steps are neither damped nor checked, and the filter acts on the step. The iteration ends
+when the largest component of a step is at most epsilon. With H = U S V' and s_i = S_ii the step is
+sum f_i (u_i'D / s_i) v_i, where f_i = 1 for least squares (without rank detection), s_i^2 / (s_i^2
++ lam) for ridge, and 1 for i <= k, else 0, for truncated SVD. The result depends on the number of
+steps and on the units; use `identify` for real work. Source: "least squares, ridge estimation and
+truncated SVD", Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.linearization import Start
+from loopcal.estimate.problem import Problem, problem_of_trials
+from loopcal.measure.instrument import Gaussian, Instrument
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
+from loopcal.measure.simulation import Trials
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import Solution, forward
+from loopcal.numerics.decomposition import Decomposition, are_nonzero, decompose
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
+
+MM = 1e-3
+
+EPSILON = 1e-6
+"""Largest component of a step [mm, rad] at which the iteration ends by default."""
+
+LIMIT = 1_000_000
+"""Steps at most; ridge steps shorten slowly, and 100,000 of them are common."""
+
+LINEARIZATIONS = 40
+"""Matrices H at most: enough for `LIMIT` ridge steps, see `AHEAD`, and for 40 steps of least
+squares.
+"""
+
+AHEAD = 0.5
+"""Steps taken with one H, as a share of the steps done before.
+
+Ridge converges in many steps that hardly change the machine, and so hardly change H. With the same
+H the sum of m steps has a closed form, the filter 1 - (lam / (s^2 + lam))^m. Least squares and
+truncated SVD, whose steps with the same H are zero after the first, take one step with each H.
+"""
+
+LOST = 1e4
+"""A step of more than this [mm, rad] has diverged: ten meters."""
+
+
+@dataclass(frozen=True)
+class StepRule:
+    """When the steps end.
+
+    Parameters
+    ----------
+    epsilon : largest component of a step [mm, rad] at which they end; 0 takes `limit` steps.
+    limit : steps at most. ahead : see `AHEAD`; 0 computes H for every step.
+    """
+
+    epsilon: float = EPSILON
+    limit: int = LIMIT
+    ahead: float = AHEAD
+
+
+@dataclass(frozen=True, eq=False)
+class RawSteps:
+    """Result of the steps of t trials; index k of a history is the state at the k-th H.
+
+    Attributes
+    ----------
+    values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI],
+        NaN from the step on that diverged.
+    steps : (k, t) largest component of the first step with each H [mm, rad], NaN after the end and
+        where it diverged. done : (k + 1, t) steps before each state of the history.
+    is_converged, is_diverged : (t,); neither: ended by the limit of steps or of matrices.
+    """
+
+    values: FloatArray
+    history: FloatArray
+    steps: FloatArray
+    done: IntArray
+    is_converged: BoolArray
+    is_diverged: BoolArray
+
+    @property
+    def count(self) -> IntArray:
+        """(t,) steps done."""
+        return self.done[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class RawProblem:
+    """Raw rows of t trials.
+
+    Attributes
+    ----------
+    problem : with a noise of one millimeter and one radian as whitener, and with parameters in
+        millimeters and radians. start : the poses of the nominal robot.
+    """
+
+    problem: Problem
+    start: Start
+
+    def __len__(self) -> int:
+        return len(self.problem)
+
+    def take(self, trials: IntArray) -> RawProblem:
+        """Return the problem of some trials, which may repeat."""
+        return RawProblem(self.problem.take(trials), self.start.take(trials))
+
+    def linearize(self, values: FloatArray) -> tuple[Decomposition, BoolArray]:
+        """Return the decomposition of H at values (t, p) [SI], and which trials reach all poses."""
+        z = self.problem.free.deviation(values)
+        linearized = self.problem.linearize(z, self.start)
+        factor = linearized.factor
+        reached = np.isfinite(linearized.cost) & np.isfinite(factor).all(axis=(1, 2))
+        safe = np.where(reached[:, None, None], factor, 0.0)
+        safe[:, :, -1] *= -1.0  # the rows end with predicted minus measured
+        return decompose(safe, linearized.equations, tolerance=0.0), reached
+
+
+def make_raw_problem(robot: Mechanism, trials: Trials) -> RawProblem:
+    """Return the raw rows of trials, which begin with the values of the robot."""
+    free = select_free_parameters(robot)
+    dimensions = [robot.parameters.dimensions[i] for i in free.places]
+    free = replace(free, tolerance=list_raw_units(dimensions), correlation=None)
+    sensors = tuple(
+        replace(s, noise=Gaussian(list_raw_units([c.dimension for c in s.kind.noise_columns])))
+        for s in trials.instrument.sensors
+    )
+    problem = problem_of_trials(free, replace(trials, instrument=Instrument(sensors)))
+    z = np.repeat(free.deviation(robot.values[None]), len(trials), axis=0)
+    start = problem.linearize(z, problem.start(z)).next_start
+    return RawProblem(problem, replace(start, is_near=False))
+
+
+def take_steps(raw: RawProblem, penalty: FloatArray, rule: StepRule | None = None) -> RawSteps:
+    """Take full steps from the values of the robot until they are small.
+
+    Parameters
+    ----------
+    raw : of t trials. penalty : (t | 1, p) of the directions: 0 for least squares, lam for ridge,
+        infinite for directions that truncated SVD does not use. rule : when the steps end.
+    """
+    rule = rule or StepRule()
+    free, t = raw.problem.free, len(raw)
+    penalty = np.broadcast_to(penalty, (t, penalty.shape[1]))
+    values = np.repeat(free.robot.values[None], t, axis=0)
+    diverged, converged = np.zeros(t, dtype=bool), np.zeros(t, dtype=bool)
+    count = np.zeros(t, dtype=np.int64)
+    history, steps, done = [values.copy()], [], [count.copy()]
+    for _ in range(LINEARIZATIONS if rule.ahead else rule.limit):
+        active = np.flatnonzero(~diverged & ~converged & (count < rule.limit))
+        if not active.size:
+            break
+        decomposition, reached = raw.take(active).linearize(values[active])
+        wanted = np.minimum(np.maximum(1, rule.ahead * count[active]), rule.limit - count[active])
+        wanted = wanted.astype(np.int64)
+        taken = _count_steps(decomposition, penalty[active], wanted, rule.epsilon)
+        size = _measure_step(decomposition, penalty[active], np.zeros(len(active), np.int64))
+        change = decomposition.deviation(_sum_steps(decomposition, penalty[active], taken))
+        good = reached & (size < LOST) & (np.abs(change).max(axis=1) < LOST)
+        moved = np.where(good[:, None], change, np.nan) * free.tolerance
+        values[np.ix_(active, free.places)] += moved
+        count[active] += np.where(good, taken, 1)
+        is_small = size <= rule.epsilon if rule.epsilon else np.zeros(len(active), dtype=bool)
+        converged[active], diverged[active] = good & is_small, ~good
+        history.append(values.copy())
+        done.append(count.copy())
+        steps.append(np.full(t, np.nan))
+        steps[-1][active] = np.where(good, size, np.nan)
+    size = np.stack(steps) if steps else np.zeros((0, t))
+    return RawSteps(values, np.stack(history), size, np.stack(done), converged, diverged)
+
+
+def list_raw_units(dimensions: Sequence[Dimension]) -> FloatArray:
+    """Return the raw units in SI: millimeters for lengths, radians for angles, one for ratios."""
+    return np.where([d is Dimension.LENGTH for d in dimensions], MM, 1.0)
+
+
+def penalize_none(parameters: int) -> FloatArray:
+    """Return the penalties (1, p) of least squares: none."""
+    return np.zeros((1, parameters))
+
+
+def penalize_ridge(lam: FloatArray, parameters: int) -> FloatArray:
+    """Return the penalties (l, p) of ridge for each lam (l,)."""
+    return np.repeat(np.asarray(lam, dtype=np.float64)[:, None], parameters, axis=1)
+
+
+def penalize_truncated(k: IntArray, parameters: int) -> FloatArray:
+    """Return the penalties (l, p) of truncated SVD for each k (l,): infinite beyond it."""
+    return np.where(np.arange(parameters) < np.asarray(k)[:, None], 0.0, np.inf)
+
+
+def _sum_steps(decomposition: Decomposition, penalty: FloatArray, count: IntArray) -> FloatArray:
+    """Return the coordinates (a, p) of the sum of `count` (a,) steps with the same H.
+
+    Step m + 1 has the filter f r^m with f = s^2 / (s^2 + penalty) and r = 1 - f, so that the sum
+    has the filter 1 - r^m.
+    """
+    left = 1.0 - decomposition.filter_factors(penalty)
+    kept = 1.0 - left ** count[:, None]
+    s = decomposition.singular_values
+    return np.divide(kept * decomposition.projections, s, out=np.zeros_like(s), where=s > 0.0)
+
+
+def _measure_step(
+    decomposition: Decomposition, penalty: FloatArray, before: IntArray
+) -> FloatArray:
+    """Return the largest component (a,) of the step after `before` (a,) steps with this H."""
+    left = (1.0 - decomposition.filter_factors(penalty)) ** before[:, None]
+    step = decomposition.deviation(left * decomposition.solution(penalty))
+    return np.abs(step).max(axis=1)
+
+
+def _count_steps(
+    decomposition: Decomposition, penalty: FloatArray, wanted: IntArray, epsilon: float
+) -> IntArray:
+    """Return how many of the `wanted` (a,) steps are larger than epsilon, and one at least."""
+    low, high = np.ones_like(wanted), np.maximum(wanted, 1)
+    while (low < high).any():
+        middle = (low + high) // 2
+        is_small = _measure_step(decomposition, penalty, middle) <= epsilon
+        low, high = np.where(is_small, low, middle + 1), np.where(is_small, middle, high)
+        low = np.minimum(low, high)
+    return low
+
+
+# --- The six least-squares problems of the paper's section 3: changes of leg length by parameters.
+
+SHARED = 1e-9
+"""Share of a column of G, relative to its largest entry, that counts as no effect on a leg."""
+
+
+@dataclass(frozen=True, eq=False)
+class LegForm:
+    """The matrices at one machine.
+
+    Attributes
+    ----------
+    G : (n, 6, p) change of each leg's length with the parameters.
+    S : (n, 6, 6) twist by leg lengths. D : (n, 6, p) twist by parameters.
+    members : for each leg, the positions of its parameters.
+    """
+
+    G: FloatArray
+    S: FloatArray
+    D: FloatArray
+    members: tuple[IntArray, ...]
+
+    @classmethod
+    def at(cls, machine: Mechanism, solution: Solution) -> LegForm:
+        """Linearize a machine at solved poses."""
+        slopes = differentiate_pose(machine, machine.values[None], solution.q[None], solution.state)
+        S, D = slopes.readings[0], slopes.parameters[0]
+        G = np.asarray(np.linalg.solve(S, D), dtype=np.float64)
+        size = np.abs(G).max(axis=0)
+        touched = size > SHARED * size.max(axis=0, keepdims=True)
+        members = tuple(np.flatnonzero(row) for row in touched)
+        return cls(G, S, D, members)
+
+    def compute_lengths(self, twists: FloatArray) -> FloatArray:
+        """Return the changes of leg length (n, 6) [m] that twists (n, 6) mean."""
+        return np.asarray(np.linalg.solve(self.S, twists[..., None])[..., 0], dtype=np.float64)
+
+    def fit(self, twists: FloatArray) -> FloatArray:
+        """Return the change (p,) of the parameters that fits twists (n, 6) best, leg by leg."""
+        lengths, change = self.compute_lengths(twists), np.zeros(self.G.shape[2])
+        for leg, members in enumerate(self.members):
+            change[members] = np.linalg.lstsq(self.G[:, leg, members], lengths[:, leg])[0]
+        return change
+
+    def explain(self, twists: FloatArray) -> FloatArray:
+        """Return the share (6,) of each leg's length changes that parameters could explain.
+
+        It is the ratio of norms, and 0 for residuals of least squares.
+        """
+        lengths, shares = self.compute_lengths(twists), []
+        for leg, members in enumerate(self.members):
+            q, _ = np.linalg.qr(self.G[:, leg, members])
+            explained = np.linalg.norm(q.T @ lengths[:, leg])
+            shares.append(float(explained / np.linalg.norm(lengths[:, leg])))
+        return np.array(shares)
+
+    @property
+    def conditions(self) -> FloatArray:
+        """(6,) condition number of each leg's matrix, columns unscaled."""
+        columns = [self.G[:, leg, members] for leg, members in enumerate(self.members)]
+        return np.array([np.linalg.cond(matrix) for matrix in columns])
+
+
+@dataclass(frozen=True, eq=False)
+class PerLegEstimate:
+    """Result of the identification leg by leg.
+
+    Attributes
+    ----------
+    robot : at the estimated values. estimate_history : (steps + 1, p) parameters after each step
+        [SI]. conditions : (6,) condition number of each leg's matrix in the last step.
+    is_converged : whether the last step was at most epsilon; always with a fixed number of steps.
+    """
+
+    robot: Mechanism
+    estimate_history: FloatArray
+    conditions: FloatArray
+    is_converged: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the parameters in the units of the robot file, and the condition numbers."""
+        factor, symbols = select_free_parameters(self.robot).display()
+        table = zip(self.robot.parameters.entries, self.robot.values, factor, symbols, strict=True)
+        rows = [
+            {
+                "name": p.name,
+                "unit": unit,
+                "nominal": p.nominal / unit_in_si,
+                "estimate": value / unit_in_si,
+            }
+            for p, value, unit_in_si, unit in table
+        ]
+        conditions = self.conditions.tolist()
+        return {"robot": self.robot.name, "parameters": rows, "conditions": conditions}
+
+
+def identify_per_leg(
+    robot: Mechanism, data: Measurements, steps: int = 3, epsilon: float = 0.0
+) -> PerLegEstimate:
+    """Identify a hexapod leg by leg by full Gauss-Newton steps.
+
+    Parameters
+    ----------
+    robot : start values; all parameters free. data : full poses of one kind. steps : at most.
+    epsilon : largest component of a step [mm, rad] at which they end; 0 takes all steps.
+
+    Raises
+    ------
+    EstimationError
+        The robot has not six actuators, the data are not full poses in known frames or too few, a
+        parameter moves no leg or several, or a pose is out of reach.
+    """
+    if len(robot.actuators) != 6:
+        raise EstimationError(
+            f"{robot.name} has {len(robot.actuators)} actuators; identification leg by leg needs "
+            "six legs with one actuator each; use identify"
+        )
+    observations = _select_full_poses(data)
+    q = data.readings[observations.rows]
+    values, history, conditions = robot.values.copy(), [robot.values.copy()], np.zeros(0)
+    units, is_converged = list_raw_units(robot.parameters.dimensions), epsilon == 0.0
+    for _ in range(steps):
+        machine = robot.with_values(values)
+        solution = forward(machine, q)
+        if not solution.converged.all():
+            raise EstimationError(
+                f"{robot.name} cannot reach {int((~solution.converged).sum())} of these poses; "
+                "check the readings"
+            )
+        legs = LegForm.at(machine, solution)
+        _check_members(robot, legs, len(q))
+        evaluated = observations.kind.evaluate(solution.T[None], observations.measured[None])
+        twists = -np.linalg.solve(evaluated.jacobian[0], evaluated.residual[0, :, :, None])[:, :, 0]
+        change = legs.fit(twists)
+        values = values + change
+        history.append(values.copy())
+        conditions = legs.conditions
+        if epsilon and np.abs(change / units).max() <= epsilon:
+            is_converged = True
+            break
+    machine = robot.with_values(values)
+    return PerLegEstimate(machine, np.stack(history), conditions, is_converged)
+
+
+def _check_members(robot: Mechanism, legs: LegForm, poses: int) -> None:
+    """Refuse parameters that do not move exactly one leg, or that these poses do not determine."""
+    count = np.zeros(len(robot.parameters), dtype=int)
+    for members in legs.members:
+        count[members] += 1
+    if (count != 1).any():
+        name = robot.parameters.names[int(np.argmax(count != 1))]
+        raise EstimationError(
+            f"{name} moves {int(count[count != 1][0])} legs, not exactly one, so the legs cannot "
+            "be identified one by one; use identify"
+        )
+    most = max(len(members) for members in legs.members)
+    if poses < most:
+        raise EstimationError(
+            f"{poses} poses are too few for the {most} parameters of a leg; measure at least {most}"
+        )
+    for leg, members in enumerate(legs.members):
+        columns = legs.G[:, leg, members]
+        scaled = columns / np.linalg.norm(columns, axis=0)
+        rank = int(are_nonzero(np.linalg.svd(scaled, compute_uv=False)).sum())
+        if rank < len(members):
+            raise EstimationError(
+                f"these poses determine {rank} of the {len(members)} parameters of leg {leg + 1} "
+                "(relative rank tolerance 1e-11); use identify"
+            )
+
+
+def _select_full_poses(data: Measurements) -> Observations:
+    """Return the rows of the one kind, which must measure all six coordinates of every pose."""
+    kinds = [observations for observations in data.observations if len(observations)]
+    if len(kinds) == 1:
+        kept = kinds[0].take(kinds[0].weight > 0.0)
+        unknown = kept.kind.unknown
+        if unknown:
+            raise EstimationError(
+                f"identification leg by leg needs poses in known frames, but {unknown[0]} is "
+                "unknown; use identify"
+            )
+        if kept.present.shape[1] == 6 and kept.present.all() and len(kept):
+            return kept
+    raise EstimationError(
+        "identification leg by leg needs full poses of one kind; use identify for other data"
+    )

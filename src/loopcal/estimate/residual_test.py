@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Test the residuals of a fit against the noise (chi-square), and estimate the noise.
+
+The test takes what no parameter can explain: the part of the rows outside the range of the
+parameters. No penalty and no prior enters it, so that wrong tolerances are not reported as noise.
+
+A stated sigma is taken as known to within a relative standard uncertainty u. That is knowledge of
+nu0 = 1 / (2 u^2) degrees of freedom (JCGM 100, G.4.2), to which the residuals add their own:
+
+    s^2 = (nu0 + unexplained) / (nu0 + degrees)        with nu0 + degrees degrees of freedom
+
+u = 0 takes sigma as exact (s = 1); an estimated noise has nu0 = 0. Residuals that exceed the stated
+noise beyond doubt contradict the stated sigma: then s is that of the residuals alone. Residuals
+that are far too small may be copies of each other, or averages: then s stays 1. See
+docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from loopcal.findings import Finding, Severity, report_finding
+from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.statistics import compute_chi_square_tail
+from loopcal.typing import FloatArray
+
+FEWEST_DEGREES = 5
+"""Degrees of freedom below which an estimated noise is too uncertain to weigh data against
+tolerances: with 4 its own standard deviation is 35 %. Intervals account for it by Student's t.
+"""
+
+LEVEL = 0.95
+"""Coverage of the intervals called +/-."""
+
+SIGNIFICANCE = 1e-3
+"""Probability below which a test rejects: residuals that do not agree with the noise, tolerances
+that do not agree with the data.
+"""
+
+DOUBT = 1e-2
+"""Probability below which a test does not accept either."""
+
+SIGMA_UNCERTAINTY = 0.25
+"""Relative standard uncertainty of the stated sigmas, where nothing else is said: the reliability
+that JCGM 100, G.4.2, gives as its example.
+"""
+
+ASSUMED_UNCERTAINTY = 0.5
+"""The same for sigmas that nobody stated, and that a program assumed."""
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """The residuals of a fit against the noise.
+
+    Attributes
+    ----------
+    chi_square : whitened sum of squares of the rows outside the range of the parameters; like the
+        other numbers NaN where the iteration did not converge, because it then belongs to no fit.
+        Where a loss chose the weights: of all weighted residuals.
+    degrees : its degrees of freedom, equations minus rank.
+    p_value : probability of a larger chi_square; NaN where nothing can be tested.
+    dof : equations minus the number of parameters that the method effectively uses.
+    noise : "given", "estimated", or "assumed" where nobody stated it.
+    sigma_scale : factor s on the stated sigmas; 1 where they are exact and not contradicted.
+    noise_degrees : degrees of freedom of s; infinite where the stated sigmas are exact.
+    intervals : whether intervals are given at all.
+    converged, weighted : whether the iteration converged, and whether a loss chose the weights.
+    """
+
+    chi_square: float
+    degrees: float
+    p_value: float
+    dof: float
+    noise: str
+    sigma_scale: float
+    noise_degrees: float
+    intervals: bool
+    converged: bool = True
+    weighted: bool = False
+
+    @property
+    def failed(self) -> bool:
+        """Whether the residuals exceed the stated noise beyond doubt."""
+        return self.noise == "given" and self.p_value < SIGNIFICANCE
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the residuals exceed the stated noise, and have too few degrees of freedom to
+        find out whether noise or the model is the cause.
+        """
+        return self.degrees < FEWEST_DEGREES and self.p_value < DOUBT
+
+    @property
+    def sigma_degrees(self) -> float:
+        """Degrees of freedom of s that come from the stated sigmas: nu0, or 0 where the residuals
+        contradict them.
+        """
+        return self.noise_degrees if self.weighted else self.noise_degrees - max(self.degrees, 0.0)
+
+    @property
+    def finding(self) -> Finding:
+        """The result of the test."""
+        if not self.converged:
+            return report_finding("noise.not-tested")
+        if self.noise == "estimated":
+            return self._estimated
+        if self.weighted:
+            return report_finding("noise.weighted")
+        if self.degrees < 0.5:
+            return report_finding("noise.no-degrees-of-freedom")
+        code = "noise.consistent"
+        if self.p_value < SIGNIFICANCE:
+            code = "noise.residuals-too-large"
+        elif self.p_value < DOUBT:
+            code = "noise.doubtful"
+        elif self.p_value > 1.0 - SIGNIFICANCE:
+            code = "noise.residuals-too-small"
+        ratio = float(np.sqrt(self.chi_square / self.degrees))
+        return report_finding(
+            code,
+            ratio=ratio,
+            degrees=self.degrees,
+            p_value=self.p_value,
+            scale=self.sigma_scale,
+            noise_degrees=self.noise_degrees,
+        )
+
+    @property
+    def _estimated(self) -> Finding:
+        """The result where the noise is estimated."""
+        if not self.intervals:
+            return report_finding("noise.not-estimated")
+        data: dict[str, Any] = {"scale": self.sigma_scale, "dof": self.noise_degrees}
+        if self.noise_degrees < FEWEST_DEGREES:
+            factor = coverage_factor(self.noise_degrees)
+            return report_finding("noise.few-degrees", factor=float(factor), **data)
+        return report_finding("noise.estimated", **data)
+
+
+def choose_severity(p_value: float) -> Severity:
+    """Return how much an effect counts that a test found: it is a warning where chance hardly ever
+    shows it, else information.
+    """
+    return Severity.WARNING if p_value < SIGNIFICANCE else Severity.INFO
+
+
+def run_residual_test(
+    decomposition: Decomposition,
+    penalty: FloatArray,
+    noise: str,
+    sigma_uncertainty: float = SIGMA_UNCERTAINTY,
+    weighted: bool = False,
+    converged: bool = True,
+) -> ResidualTest:
+    """Test the residuals of a fit (t = 1).
+
+    Parameters
+    ----------
+    decomposition, penalty : of the fit. noise : "given", "estimated" or "assumed"; with assumed
+        noise the test is a note.
+    sigma_uncertainty : relative standard uncertainty of the stated sigmas.
+    weighted : whether a loss chose the weights by the residuals, so that the sum of squares has no
+        known distribution.
+    converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor
+        intervals.
+    """
+    if not converged:
+        nan = np.nan
+        return ResidualTest(nan, nan, nan, nan, noise, 1.0, nan, False, False, weighted)
+    left = float(decomposition.unexplained[0])
+    m, degrees = float(decomposition.rows[0]), float((decomposition.rows - decomposition.rank)[0])
+    dof = m - float(decomposition.filter_factors(penalty).sum())
+    square, p_value = left, np.nan
+    if weighted:
+        square = float(decomposition.remaining(penalty)[0])
+    elif noise != "estimated":
+        p_value = _compute_tail(degrees, left)
+    scale, nu = _estimate_scale(left, degrees, p_value, noise, sigma_uncertainty, weighted)
+    return ResidualTest(square, degrees, p_value, dof, noise, scale, nu, nu > 0.0, True, weighted)
+
+
+def _estimate_scale(
+    unexplained: float,
+    degrees: float,
+    p_value: float,
+    noise: str,
+    uncertainty: float,
+    weighted: bool,
+) -> tuple[float, float]:
+    """Return the factor on the stated sigmas, and its degrees of freedom; see the module."""
+    if noise == "estimated" or p_value < SIGNIFICANCE:
+        return (float(np.sqrt(unexplained / degrees)), degrees) if degrees > 0 else (np.nan, 0.0)
+    stated = count_sigma_degrees(noise, uncertainty)
+    if weighted or degrees <= 0 or np.isinf(stated):
+        return 1.0, stated
+    total = stated + degrees
+    if p_value > 1.0 - SIGNIFICANCE:
+        return 1.0, total
+    return float(np.sqrt((stated + unexplained) / total)), total
+
+
+def count_sigma_degrees(noise: str, uncertainty: float) -> float:
+    """Return nu0, the degrees of freedom that the stated sigmas count for: infinite where they are
+    exact, 0 where the noise is estimated.
+
+    Parameters
+    ----------
+    noise : "given", "estimated" or "assumed". uncertainty : relative standard uncertainty u of the
+        stated sigmas.
+    """
+    if noise == "estimated":
+        return 0.0
+    if uncertainty == 0.0:
+        return np.inf
+    u = max(uncertainty, ASSUMED_UNCERTAINTY) if noise == "assumed" else uncertainty
+    return 0.5 / u / u  # the square of a tiny one is zero
+
+
+def _compute_tail(degrees: float, square: float) -> float:
+    """Return the probability of a larger sum of squares; NaN without degrees of freedom."""
+    return float(compute_chi_square_tail(degrees, square)) if degrees > 0 else np.nan
+
+
+def coverage_factor(degrees: FloatArray | float, level: float = LEVEL) -> FloatArray:
+    """Return half-widths (..,) of intervals of this coverage, in standard deviations.
+
+    They are those of Student's t, and of the normal distribution for infinite degrees of freedom.
+    """
+    from loopcal.numerics.special_functions import ndtri, stdtrit
+
+    quantile = 0.5 + 0.5 * level
+    degrees = np.asarray(degrees, dtype=np.float64)
+    is_known = np.isinf(degrees)
+    student = stdtrit(np.where(is_known, 1.0, degrees), quantile)
+    return np.asarray(np.where(is_known, ndtri(quantile), student))

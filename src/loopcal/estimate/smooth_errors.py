@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the platform that vary slowly with its pose: what no geometry explains.
+
+The error of the tool at a pose T is the sum of a displacement and a rotation about base axes, each
+component a Gaussian process of the pose with the covariance
+
+    amplitude^2 exp(-|x - x'|^2 / 2)
+
+x are the place of the tool and the rotation of the platform, or the place alone, relative to the
+center of the range of some reference poses, each coordinate in units of a length that is a multiple
+of half its range. With k of these poses as centers and the triangle L of
+their correlations, L L' = K(centers, centers), the error is phi(T) c with phi = K(T, centers) L^-T,
+independent c of variance 1, plus an independent rest that matters only far from all centers
+(Nystroem approximation; exact for up to `CENTERS` reference poses). Source: Rasmussen and Williams,
+Gaussian Processes for Machine Learning, 2006, sections 2.2 and 8.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.typing import FloatArray
+
+DISCREPANCY_PREFIX = "discrepancy_"
+"""Beginning of the names of the arrays of a run folder."""
+
+CENTERS = 40
+"""Largest number of centers: more of them are closer to each other than the error varies."""
+
+STILL = 0.01
+"""Half the range of a coordinate, as a share of the largest one (rotations times the robot's size),
+below which poses do not differ in it. Small differences, as of heights probed on a bed, are errors
+of the machine and noise: as a coordinate, they would explain the residuals by themselves."""
+
+ROUNDING = 1e-9
+"""Share of the robot's size below which no difference is one."""
+
+SAME = 1e-6
+"""Distance in normalized coordinates below which poses are the same."""
+
+JITTER = 1e-9
+"""Added to the correlation of a center with itself, so that its triangle exists."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothErrors:
+    """Slow errors of the tool with the amplitudes of their components.
+
+    Attributes
+    ----------
+    tool : (3,) [m] tool point in the platform frame. rotation : (3, 3) to which rotations refer.
+    origin, length : (6,) of rotation vectors [rad] and places [m]; an infinite length leaves a
+        coordinate out.
+    centers : (k, 6) normalized coordinates. whitening : (k, k) L^-T.
+    amplitude : (6,) standard deviations of the rotation [rad] and of the tool's place [m].
+    """
+
+    tool: FloatArray
+    rotation: FloatArray
+    origin: FloatArray
+    length: FloatArray
+    centers: FloatArray
+    whitening: FloatArray
+    amplitude: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients: those of rx, ry, rz, x, y and z in turn."""
+        return 6 * len(self.centers)
+
+    def scaled(self, amplitude: FloatArray) -> SmoothErrors:
+        """Return the errors with other amplitudes (6,)."""
+        return replace(self, amplitude=amplitude)
+
+    def twists(self, T: FloatArray) -> FloatArray:
+        """Return twists (.., 6, 6 k) of the platform's origin at poses T (.., 4, 4)."""
+        shares = self._correlate(T) @ self.whitening
+        k = len(self.centers)
+        own = np.zeros((*T.shape[:-2], 6, 6, k))
+        own[..., range(6), range(6), :] = shares[..., None, :] * self.amplitude[:, None]
+        return self._at_origin(T) @ own.reshape(*T.shape[:-2], 6, 6 * k)
+
+    def rest(self, T: FloatArray) -> FloatArray:
+        """Return twists (.., 6, 6) by the errors that have nothing to do with those at the centers,
+        independent at every pose.
+        """
+        known = ((self._correlate(T) @ self.whitening) ** 2).sum(axis=-1)
+        left = np.sqrt(np.maximum(1.0 - known, 0.0))
+        return self._at_origin(T) * (left[..., None, None] * self.amplitude)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of the run folder."""
+        return {
+            DISCREPANCY_PREFIX + field.name: getattr(self, field.name) for field in fields(self)
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> SmoothErrors:
+        """Return the errors in the arrays of a run folder."""
+        return cls(*(arrays[DISCREPANCY_PREFIX + field.name] for field in fields(cls)))
+
+    def _correlate(self, T: FloatArray) -> FloatArray:
+        """Return the correlations (.., k) of errors at poses with those at the centers."""
+        x = (_coordinates(T, self.tool, self.rotation) - self.origin) / self.length
+        return correlate(x, self.centers)
+
+    def _at_origin(self, T: FloatArray) -> FloatArray:
+        """Return (.., 6, 6) from twists of the tool point to those of the platform's origin."""
+        arm = T[..., :3, :3] @ self.tool
+        return geometry.transport_matrix(-arm.reshape(-1, 3)).reshape(*T.shape[:-2], 6, 6)
+
+
+def correlate(x: FloatArray, centers: FloatArray) -> FloatArray:
+    """Return the correlations (.., k) of errors at normalized coordinates (.., 6) and (k, 6)."""
+    return np.asarray(np.exp(-0.5 * ((x[..., None, :] - centers) ** 2).sum(axis=-1)))
+
+
+def describe_smooth_errors(
+    T: FloatArray,
+    tool: FloatArray,
+    size: float,
+    length: float = 1.0,
+    most: int = CENTERS,
+    *,
+    by_rotation: bool = True,
+) -> SmoothErrors:
+    """Return errors of unit amplitude (1 rad, 1 m) about reference poses T (n, 4, 4).
+
+    Parameters
+    ----------
+    tool : (3,) [m] tool point in the platform frame. size : of the robot [m].
+    length : over which errors vary, in halves of the range of each coordinate; a small one leaves
+        errors that different poses do not share. most : largest number of centers.
+    by_rotation : whether errors vary with the rotation of the platform, too.
+    """
+    u, _, vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    x = _coordinates(T, tool, rotation)
+    low, high = x.min(axis=0), x.max(axis=0)
+    origin, half = 0.5 * (low + high), 0.5 * (high - low)
+    lengths = half * np.r_[[size] * 3, [1.0] * 3]
+    used = (lengths > max(STILL * lengths.max(), ROUNDING * size)) & (
+        by_rotation | (np.arange(6) >= 3)
+    )
+    scale = np.where(used, length * np.where(used, half, 1.0), np.inf)
+    x = (x - origin) / scale
+    centers = x[_spread(x, most)]
+    triangle = np.linalg.cholesky(correlate(centers, centers) + JITTER * np.eye(len(centers)))
+    whitening = np.asarray(np.linalg.inv(triangle).T, dtype=np.float64)
+    return SmoothErrors(tool, rotation, origin, scale, centers, whitening, np.ones(6))
+
+
+def _spread(x: FloatArray, most: int) -> list[int]:
+    """Return the outermost of coordinates (n, 6), then always the one farthest from all chosen
+    ones, up to `most` different ones.
+    """
+    chosen = [int(np.argmax((x**2).sum(axis=1)))]
+    distance = ((x - x[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < most and distance.max() > SAME**2:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(axis=1))
+    return chosen
+
+
+def _coordinates(T: FloatArray, tool: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Return rotation vectors relative to a rotation [rad] and places of the tool [m], (.., 6)."""
+    R = T[..., :3, :3]
+    return np.concatenate([geometry.log_so3(R @ rotation.T), T[..., :3, 3] + R @ tool], axis=-1)

@@ -1,0 +1,904 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations: exponential, logarithm, their derivatives, and quaternions.
+
+All functions work elementwise over leading axes: vectors are (..., 3), rotation vectors in rad,
+rotations (..., 3, 3), quaternions (..., 4) with the scalar first. Half angles and the offset
+`_TINY` keep each formula free of 0/0, so that one expression is valid from zero to pi, without
+branches or series.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import permutations, product
+
+import numpy as np
+
+from loopcal.errors import DataError
+from loopcal.numerics.decomposition import are_nonzero
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
+
+# Added to squared lengths before the square root: far below any square that matters, far above the
+# smallest float.
+_TINY = 1e-200
+
+_HAT = np.zeros((3, 9))
+"""Entries of `hat(w)`, row by row, by those of w."""
+_HAT[0, [5, 7]], _HAT[1, [2, 6]], _HAT[2, [1, 3]] = (-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)
+
+
+def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray:
+    """Stack a rows of b entries, which broadcast against each other, into matrices (..., a, b)."""
+    shapes = {entry.shape for row in rows for entry in row if isinstance(entry, np.ndarray)}
+    shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+    stacked = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            stacked[..., i, j] = entry
+    return stacked
+
+
+def stack_blocks(rows: tuple[tuple[FloatArray | None, ...], ...]) -> FloatArray:
+    """Stack blocks (..., a, b), which broadcast against each other, into matrices; None is zero.
+
+    The first block of each row and of each column must not be None in all of them.
+    """
+    blocks = [block for row in rows for block in row if block is not None]
+    leading = {block.shape[:-2] for block in blocks}
+    shape = leading.pop() if len(leading) == 1 else np.broadcast_shapes(*leading)
+    heights = [next(b.shape[-2] for b in row if b is not None) for row in rows]
+    widths = [next(b.shape[-1] for b in c if b is not None) for c in zip(*rows, strict=True)]
+    stacked = np.zeros((*shape, sum(heights), sum(widths)))
+    top = 0
+    for height, row in zip(heights, rows, strict=True):
+        left = 0
+        for width, block in zip(widths, row, strict=True):
+            if block is not None:
+                stacked[..., top : top + height, left : left + width] = block
+            left += width
+        top += height
+    return stacked
+
+
+def hat(vector: FloatArray) -> FloatArray:
+    """Return the skew matrices (..., 3, 3) of vectors: `hat(a) @ b = a x b`."""
+    return np.reshape(np.matmul(vector, _HAT), (*vector.shape, 3))
+
+
+def _polynomial(vector: FloatArray, first: FloatArray | float, second: FloatArray) -> FloatArray:
+    """Return `I + first hat(w) + second hat(w)^2`.
+
+    Written out, it is three times faster than products of 3x3 matrices.
+    """
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    ax, ay, az = first * x, first * y, first * z
+    bx, by, bz = second * x, second * y, second * z
+    xx, yy, zz, xy, xz, yz = bx * x, by * y, bz * z, bx * y, bx * z, by * z
+    return stack_matrix(
+        (
+            (1.0 - yy - zz, xy - az, xz + ay),
+            (xy + az, 1.0 - xx - zz, yz - ax),
+            (xz - ay, yz + ax, 1.0 - xx - yy),
+        )
+    )
+
+
+def _angle(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the length of vectors (..., 3) and its square, never exactly zero."""
+    square = vector[..., 0] ** 2 + vector[..., 1] ** 2 + vector[..., 2] ** 2 + _TINY
+    return np.sqrt(square), square
+
+
+def exp_so3(vector: FloatArray) -> FloatArray:
+    """Return the rotation about `w` by its length.
+
+    `exp(w) = I + (sin t / t) hat(w) + (1 - cos t) / t^2 hat(w)^2`, `t = |w|`; the last factor is
+    computed as `(sin(t/2) / (t/2))^2 / 2`, which does not cancel.
+    """
+    angle, _ = _angle(vector)
+    half = np.sin(0.5 * angle) / (0.5 * angle)
+    return _polynomial(vector, np.sin(angle) / angle, 0.5 * half * half)
+
+
+def log_so3(rotation: FloatArray) -> FloatArray:
+    """Return the rotation vector of length at most pi, the inverse of `exp_so3`.
+
+    With the quaternion `(w, v)`, `log = 2 atan2(|v|, w) v / |v|` is as accurate near pi as near
+    zero. At exactly pi both signs of the axis are correct; one of them is returned.
+    """
+    quaternion = matrix_to_quaternion(rotation)
+    vector = quaternion[..., 1:]
+    length, _ = _angle(vector)
+    return (2.0 * np.arctan2(length, quaternion[..., 0]) / length)[..., None] * vector
+
+
+def left_jacobian_so3(vector: FloatArray) -> FloatArray:
+    """Return the derivative (..., 3, 3) of the exponential.
+
+    To first order in `d`, `exp(w + d) = exp(J(w) d) exp(w)` with
+    `J(w) = I + (1 - cos t) / t^2 hat(w) + (1 - sin t / t) / t^2 hat(w)^2`.
+    """
+    angle, square = _angle(vector)
+    half = np.sin(0.5 * angle) / (0.5 * angle)
+    return _polynomial(vector, 0.5 * half * half, (1.0 - np.sin(angle) / angle) / square)
+
+
+def left_jacobian_inverse_so3(vector: FloatArray) -> FloatArray:
+    """Return the derivative (..., 3, 3) of the logarithm.
+
+    To first order in `d`, `log(exp(d) R) = log(R) + J^-1(log R) d` with
+    `J^-1(w) = I - hat(w) / 2 + (1 - (t/2) cot(t/2)) / t^2 hat(w)^2`, regular for t < 2 pi.
+    """
+    angle, square = _angle(vector)
+    half = 0.5 * angle
+    return _polynomial(vector, -0.5, (1.0 - half * np.cos(half) / np.sin(half)) / square)
+
+
+def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:
+    """Return the rotation of a quaternion of any length but zero."""
+    scale = np.sqrt(2.0 / np.sum(quaternion * quaternion, axis=-1))
+    w, x, y, z = (scale * quaternion[..., i] for i in range(4))
+    return stack_matrix(
+        (
+            (1.0 - y * y - z * z, x * y - w * z, x * z + w * y),
+            (x * y + w * z, 1.0 - x * x - z * z, y * z - w * x),
+            (x * z - w * y, y * z + w * x, 1.0 - x * x - y * y),
+        )
+    )
+
+
+def matrix_to_quaternion(rotation: FloatArray) -> FloatArray:
+    """Return the unit quaternion of a rotation, its scalar not negative.
+
+    The entries of `4 q q'` are sums of entries of R. The row with the largest diagonal is `q` times
+    a number that is never small; normalizing it gives `q`. Source: S. W. Shepperd, "Quaternion from
+    rotation matrix", DOI 10.2514/3.55767b.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (
+        tuple(rotation[..., i, j] for j in range(3)) for i in range(3)
+    )
+    trace = xx + yy + zz
+    diagonal = (1.0 + trace, 1.0 + 2.0 * xx - trace, 1.0 + 2.0 * yy - trace, 1.0 + 2.0 * zz - trace)
+    wx, wy, wz = zy - yz, xz - zx, yx - xy
+    sxy, sxz, syz = xy + yx, xz + zx, yz + zy
+    rows = (
+        (diagonal[0], wx, wy, wz),
+        (wx, diagonal[1], sxy, sxz),
+        (wy, sxy, diagonal[2], syz),
+        (wz, sxz, syz, diagonal[3]),
+    )
+    first = diagonal[0] >= diagonal[1]
+    second = diagonal[2] >= diagonal[3]
+    lower = np.maximum(diagonal[0], diagonal[1]) >= np.maximum(diagonal[2], diagonal[3])
+    chosen = [
+        np.where(lower, np.where(first, a, b), np.where(second, c, d))
+        for a, b, c, d in zip(*rows, strict=True)
+    ]
+    scale = np.where(chosen[0] < 0.0, -1.0, 1.0) / np.sqrt(sum(entry * entry for entry in chosen))
+    return np.stack([scale * entry for entry in chosen], axis=-1)
+
+
+def measure_rotation_error(matrix: FloatArray) -> FloatArray:
+    """Return how far matrices (..., 3, 3) are from rotations, (...).
+
+    It is the largest entry of `|M M' - 1|`, infinite for a reflection.
+    """
+    error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    volume = np.sum(np.cross(matrix[..., 0], matrix[..., 1]) * matrix[..., 2], axis=-1)
+    return np.where(volume < 0.0, np.inf, error)
+
+
+def project_to_rotations(matrix: FloatArray) -> FloatArray:
+    """Return the rotations nearest to matrices (..., 3, 3) in the Frobenius norm."""
+    U, _, V = np.linalg.svd(matrix)
+    sign = np.ones(matrix.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(U @ V))
+    return (U * sign[..., None, :]) @ V
+
+
+# --- Poses as 4x4 matrices, and the twist by which loopcal updates and compares them.
+
+_LAST = np.ones((1, 1))
+"""The last number of the last row of a pose."""
+
+
+def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Return the homogeneous matrix `T = [R t; 0 1]` of rotation and translation (..., 3) [m].
+
+    Leading axes broadcast against each other.
+    """
+    return stack_blocks(((rotation, translation[..., None]), (None, _LAST)))
+
+
+def invert_pose(T: FloatArray) -> FloatArray:
+    """Return the inverse pose `[R' -R't; 0 1]`: `invert_pose(T_a_b) = T_b_a`."""
+    rotation = np.swapaxes(T[..., :3, :3], -1, -2)
+    return make_pose(rotation, -(rotation @ T[..., :3, 3:])[..., 0])
+
+
+def apply_twist(T: FloatArray, twist: FloatArray) -> FloatArray:
+    """Move poses by twists: `R <- exp(omega) R`, `t <- t + v`."""
+    return make_pose(exp_so3(twist[..., :3]) @ T[..., :3, :3], T[..., :3, 3] + twist[..., 3:])
+
+
+def pose_difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
+    """Return the twist from pose b to pose a: `(log(R_a R_b'), t_a - t_b)`.
+
+    It satisfies `apply_twist(T_b, pose_difference(T_a, T_b)) = T_a`.
+    """
+    rotation = log_so3(T_a[..., :3, :3] @ np.swapaxes(T_b[..., :3, :3], -1, -2))
+    return np.concatenate([rotation, T_a[..., :3, 3] - T_b[..., :3, 3]], axis=-1)
+
+
+def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> FloatArray:
+    """Return the map (..., 6, 6) of platform twists to another point, written in other axes.
+
+    `omega' = Q omega`, `v' = Q (v + omega x arm)`: the matrix `[[Q, 0], [-Q hat(arm), Q]]`.
+
+    Parameters
+    ----------
+    arm : (..., 3) from the platform origin to the point, in base axes [m].
+    rotation : (..., 3, 3) Q, from base axes to the new axes (default: base axes).
+    """
+    turned = np.eye(3) if rotation is None else rotation
+    return stack_blocks(((turned, None), (-(turned @ hat(arm)), turned)))
+
+
+def differentiate_by_frames(T: FloatArray) -> FloatArray:
+    """Return the twists (..., 6, 12) of platforms by motions of their base and platform frames.
+
+    A motion (w, c) of the base frame moves a pose by `(w, c + w x t)`, one of the platform frame by
+    `(R w, R c)`.
+
+    Parameters
+    ----------
+    T : (..., 4, 4) T_base_platform [m].
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    eye = np.eye(3)
+    return stack_blocks(((eye, None, R, None), (-hat(t), eye, None, R)))
+
+
+def differentiate_entries(T: FloatArray) -> FloatArray:
+    """Return the derivative (..., 12, 6) of the numbers [R t] of poses, row by row, by the twist.
+
+    A column r of the rotation moves by `omega x r`, the origin by `v`.
+    """
+    slope = np.zeros((*T.shape[:-2], 3, 4, 6))
+    columns = np.swapaxes(T[..., :3, :3], -1, -2)
+    slope[..., :3, :3] = -np.swapaxes(hat(columns), -3, -2)
+    slope[..., 3, 3:] = np.eye(3)
+    return slope.reshape(*T.shape[:-2], 12, 6)
+
+
+def differentiate_by_entries(T: FloatArray) -> FloatArray:
+    """Return the derivative (..., 6, 12) of the twist by the numbers of a pose.
+
+    `omega` is half the sum of r x dr over the columns of the rotation. It is the inverse of
+    `differentiate_entries` for motions of a rigid body.
+    """
+    scale = np.repeat([0.5, 1.0], 3)[:, None]
+    return scale * np.swapaxes(differentiate_entries(T), -1, -2)
+
+
+# --- Orientation by three angles: the 24 Euler conventions, and tilt and torsion.
+
+_SEQUENCES = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx", "xyx", "xzx", "yxy", "yzy", "zxz", "zyz")
+EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
+
+# Below this cosine (or sine) of the middle angle [1], a few ulps, two axes are parallel and the
+# first angle is set to zero.
+_GIMBAL = 1e-15
+
+Vector = tuple[FloatArray, ...]
+"""Three components (...) of vectors."""
+
+
+def wrap_angle(angle: FloatArray | float) -> FloatArray:
+    """Return angles (...) plus full turns, in (-pi, pi] [rad]."""
+    return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+
+
+def rotation_about_axis(angle: FloatArray | float, axis: int) -> FloatArray:
+    """Return the rotations about coordinate axis 0, 1 or 2 by angles (...) [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    if axis == 0:
+        return stack_matrix(((1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
+    if axis == 1:
+        return stack_matrix(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
+    return stack_matrix(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+
+
+def check_order(order: str) -> None:
+    """Refuse an order that is none of EULER_ORDERS; raises DataError."""
+    if order not in EULER_ORDERS:
+        raise DataError(
+            f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} for "
+            "rotations about fixed axes, or the same in capitals for rotations about the moving "
+            "axes"
+        )
+
+
+def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
+    """Return the axes as a moving sequence, and whether the angles are in reverse (fixed axes).
+
+    `Rz(c) Ry(b) Rx(a)` about fixed axes "xyz" is the same product as "ZYX" about moving ones.
+    """
+    check_order(order)
+    axes = tuple("xyz".index(letter) for letter in order.lower())
+    fixed = order.islower()
+    first, second, third = axes[::-1] if fixed else axes
+    return (first, second, third), fixed
+
+
+def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
+    """Return the rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz"."""
+    axes, fixed = _moving_axes(order)
+    moving = angles[..., ::-1] if fixed else angles
+    columns = [np.eye(3)[:, i, None] for i in range(3)]
+    for angle, axis in zip(moving.reshape(-1, 3).T, axes, strict=True):
+        # the turn combines the columns of the two other axes
+        c, s, i, j = np.cos(angle), np.sin(angle), (axis + 1) % 3, (axis + 2) % 3
+        first, second = columns[i], columns[j]
+        columns[i], columns[j] = first * c + second * s, second * c - first * s
+    return np.stack(columns).T.copy().reshape(*angles.shape[:-1], 3, 3)
+
+
+def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
+    """Return the Euler angles of a rotation, the inverse of `euler_to_matrix`.
+
+    With `R = Ri(a1) Rj(a2) Rk(a3)` about moving axes, a1 and a2 come from arc tangents of entries
+    of R, and a3 from `Ri(a1)' R = Rj(a2) Rk(a3)`. The angles reproduce R to rounding even if the
+    middle angle makes two axes parallel; the first moving angle is zero then. First and last angle
+    are in (-pi, pi], the middle one in [-pi/2, pi/2] (three letters) or [0, pi] (first letter
+    repeated).
+    """
+    (i, j, last), fixed = _moving_axes(order)
+    k = 3 - i - j
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    if i == last:
+        sine, cosine = rotation[..., j, i], -sign * rotation[..., k, i]
+        regular = np.hypot(sine, cosine)
+        second = np.arctan2(regular, rotation[..., i, i])
+    else:
+        sine, cosine = -sign * rotation[..., j, k], rotation[..., k, k]
+        regular = np.hypot(sine, cosine)
+        second = np.arctan2(sign * rotation[..., i, k], regular)
+    first = np.where(regular > _GIMBAL, np.arctan2(sine, cosine), 0.0)
+    # Row j of Ri(a1)' R; the middle turn is about axis j and leaves this row to the last turn
+    # alone.
+    row = (
+        np.cos(first)[..., None] * rotation[..., j, :]
+        + (sign * np.sin(first))[..., None] * rotation[..., k, :]
+    )
+    third = np.arctan2(-sign * row[..., k] if i == last else sign * row[..., i], row[..., j])
+    return np.stack([third, second, first] if fixed else [first, second, third], axis=-1)
+
+
+def euler_rates(angles: FloatArray, order: str) -> FloatArray:
+    """Return E (..., 3, 3) with `omega = E d(angles)`, omega in the axes that the rotation maps to.
+
+    About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular if two axes
+    are parallel.
+    """
+    columns, fixed = _rate_columns(angles, order)
+    columns = columns[::-1] if fixed else columns
+    return stack_matrix(tuple(zip(*columns, strict=True)))
+
+
+def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
+    """Return the inverse of `euler_rates`, `d(angles) = E^-1 omega`; huge if two axes are parallel.
+
+    The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
+    """
+    (first, second, third), fixed = _rate_columns(angles, order)
+    across = _cross(second, third)
+    determinant = _nonzero(across[0] * first[0] + across[1] * first[1] + across[2] * first[2])
+    rows = (across, _cross(third, first), _cross(first, second))
+    rows = rows[::-1] if fixed else rows
+    return stack_matrix(tuple(tuple(entry / determinant for entry in row) for row in rows))
+
+
+def _rate_columns(angles: FloatArray, order: str) -> tuple[tuple[Vector, ...], bool]:
+    """Return the columns of `euler_rates` about moving axes, and whether they are in reverse."""
+    (i, j, last), fixed = _moving_axes(order)
+    moving = angles[..., ::-1] if fixed else angles
+    k, sign = 3 - i - j, 1.0 if (j - i) % 3 == 1 else -1.0
+    (c, s), (cc, ss) = ((np.cos(moving[..., a]), np.sin(moving[..., a])) for a in (0, 1))
+    s, ss = sign * s, sign * ss
+    # Rj(a2) turns ek by ss towards ei, and ei by -ss towards ek; Ri(a1) turns ek by -s towards ej
+    along, across = (cc, -ss) if last == i else (ss, cc)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    by_axes = ((one, zero, zero), (zero, c, s), (along, -s * across, c * across))
+    place = np.argsort((i, j, k))
+    return tuple(tuple(column[a] for a in place) for column in by_axes), fixed
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross product of vectors given by their components."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _nonzero(divisor: FloatArray) -> FloatArray:
+    """Return a divisor without exact zeros: singular rows become huge, others stay correct."""
+    return np.where(divisor == 0.0, 1e-100, divisor)
+
+
+def tilt_torsion_to_matrix(
+    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
+) -> FloatArray:
+    """Return the rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
+
+    The platform normal leans by theta towards the azimuth phi; psi rotates about the normal.
+    Source: I. A. Bonev, J. Ryu, "A new approach to orientation workspace analysis of 6-DOF parallel
+    manipulators", DOI 10.1016/S0094-114X(00)00032-X.
+    """
+    return (
+        rotation_about_axis(phi, 2)
+        @ rotation_about_axis(theta, 1)
+        @ rotation_about_axis(psi - phi, 2)
+    )
+
+
+def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return azimuth, tilt and torsion of a rotation, the inverse of `tilt_torsion_to_matrix`.
+
+    phi and psi are in (-pi, pi], theta in [0, pi]. At zero tilt phi is undefined and returned as
+    zero; psi is defined.
+    """
+    angles = matrix_to_euler(rotation, "ZYZ")
+    phi, theta = angles[..., 0], angles[..., 1]
+    return phi, theta, wrap_angle(phi + angles[..., 2])
+
+
+def tilt_torsion_rates(
+    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
+) -> FloatArray:
+    """Return E (..., 3, 3) with `omega = E d(phi, theta, psi)`; singular at zero tilt.
+
+    Its columns are `ez - R ez`, `Rz(phi) ey`, `R ez`. psi has no effect, since the torsion comes
+    first; it makes all rates have equal arguments.
+    """
+    cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
+    nx, ny, nz = cphi * stheta, sphi * stheta, ctheta + 0.0 * psi
+    return stack_matrix(((-nx, -sphi, nx), (-ny, cphi, ny), (1.0 - nz, 0.0, nz)))
+
+
+def tilt_torsion_rates_inverse(
+    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
+) -> FloatArray:
+    """Return the inverse of `tilt_torsion_rates`, `d(phi, theta, psi) = E^-1 omega`.
+
+    With the normal n and its derivative e in theta, which with `Rz(phi) ey` are three orthogonal
+    directions: `dphi = -e . omega / sin(theta)`, `dtheta = Rz(phi) ey . omega`, `dpsi = (n -
+    tan(theta/2) e) . omega`. The first row alone is huge at zero tilt.
+    """
+    cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
+    half = np.tan(0.5 * theta) + 0.0 * psi
+    ex, ey, ez = cphi * ctheta, sphi * ctheta, -stheta
+    sine = _nonzero(stheta)
+    return stack_matrix(
+        (
+            (-ex / sine, -ey / sine, -ez / sine),
+            (-sphi, cphi, 0.0),
+            (cphi * stheta - half * ex, sphi * stheta - half * ey, ctheta - half * ez),
+        )
+    )
+
+
+# --- Forms of orientation in columns: rotation vector, quaternion, tilt and torsion, Euler angles.
+
+Conversion = Callable[[FloatArray], FloatArray]
+
+
+def _repeat_identity(values: FloatArray) -> FloatArray:
+    return np.broadcast_to(np.eye(3), (*values.shape[:-1], 3, 3))
+
+
+@dataclass(frozen=True)
+class OrientationForm:
+    """A form in which a rotation is written; the name decides all else.
+
+    Attributes
+    ----------
+    name : its name in files, e.g. "euler-xyz".
+    columns : names of its c columns. noise_columns : names of the three noises.
+    dimension : of the columns.
+    to_matrix : columns (..., c) to rotations (..., 3, 3). from_matrix : the inverse.
+    rates : columns to E (..., 3, 3). rates_inverse : columns to E^-1, huge where E is singular.
+    angles : whether the columns are three angles, of which any may be measured alone.
+    """
+
+    name: str
+    columns: tuple[str, ...] = field(compare=False)
+    noise_columns: tuple[str, str, str] = field(compare=False)
+    dimension: Dimension = field(compare=False)
+    to_matrix: Conversion = field(compare=False, repr=False)
+    from_matrix: Conversion = field(compare=False, repr=False)
+    rates: Conversion = field(default=_repeat_identity, compare=False, repr=False)
+    rates_inverse: Conversion = field(default=_repeat_identity, compare=False, repr=False)
+    angles: bool = field(default=False, compare=False)
+
+
+def _split(convert: Callable[..., FloatArray], values: FloatArray) -> FloatArray:
+    """Convert azimuth, tilt and torsion (..., 3) by a function of the three."""
+    return convert(values[..., 0], values[..., 1], values[..., 2])
+
+
+def _stack_tilt_torsion(rotation: FloatArray) -> FloatArray:
+    """Return azimuth, tilt and torsion (..., 3) [rad] of rotations."""
+    return np.stack(matrix_to_tilt_torsion(rotation), axis=-1)
+
+
+_SIMPLE = {
+    form.name: form
+    for form in (
+        OrientationForm(
+            "rotation-vector",
+            ("rx", "ry", "rz"),
+            ("rx", "ry", "rz"),
+            Dimension.ANGLE,
+            exp_so3,
+            log_so3,
+        ),
+        OrientationForm(
+            "quaternion",
+            ("qw", "qx", "qy", "qz"),
+            ("rx", "ry", "rz"),
+            Dimension.RATIO,
+            quaternion_to_matrix,
+            matrix_to_quaternion,
+        ),
+        OrientationForm(
+            "tilt-torsion",
+            ("phi", "theta", "psi"),
+            ("phi", "theta", "psi"),
+            Dimension.ANGLE,
+            partial(_split, tilt_torsion_to_matrix),
+            _stack_tilt_torsion,
+            partial(_split, tilt_torsion_rates),
+            partial(_split, tilt_torsion_rates_inverse),
+            angles=True,
+        ),
+    )
+}
+
+
+def parse_orientation(name: str) -> OrientationForm:
+    """Return the form of orientation with this name.
+
+    Names are "rotation-vector", "quaternion" (scalar first, any length), "tilt-torsion", and
+    "euler-" with one of the 24 orders. Raises DataError for another name.
+    """
+    if name in _SIMPLE:
+        return _SIMPLE[name]
+    if not name.startswith("euler-"):
+        raise DataError(
+            f"unknown orientation form {name!r}; use {', '.join(_SIMPLE)}, or euler- and an order "
+            "such as euler-xyz"
+        )
+    order = name.removeprefix("euler-")
+    check_order(order)
+    return OrientationForm(
+        name,
+        ("a", "b", "c"),
+        ("a", "b", "c"),
+        Dimension.ANGLE,
+        partial(euler_to_matrix, order=order),
+        partial(matrix_to_euler, order=order),
+        partial(euler_rates, order=order),
+        partial(euler_rates_inverse, order=order),
+        angles=True,
+    )
+
+
+# --- Alignment in closed form: frames, points and centers from points, poses, rays or lengths.
+
+_SIGNED_PERMUTATIONS = [
+    np.eye(3)[list(order)] * sign
+    for order in permutations(range(3))
+    for sign in product((1.0, -1.0), repeat=3)
+]
+OCTAHEDRAL_ROTATIONS: FloatArray = np.array(
+    [R for R in _SIGNED_PERMUTATIONS if np.linalg.det(R) > 0.0]
+)
+"""The 24 rotations (24, 3, 3) of a cube: every rotation is within 63 degrees of one of them."""
+OCTAHEDRAL_ROTATIONS.setflags(write=False)
+
+TINY = 1e-300
+"""Divisor [1] in place of zero."""
+
+FLATNESS = 1e-6
+"""Ratio of extents [1] below which points count as coplanar, or as collinear."""
+
+ROTATION_CHANGE = 1e-6
+"""Change of the entries of a rotation [1] that ends the alternation in `solve_directions`; a
+descent refines the result anyway.
+"""
+
+ALIGNMENT_TOLERANCE = 1e-9
+"""Singular values below this share of the largest count as zero [1]."""
+
+ANCHOR_TOLERANCE, ANCHOR_RANK = 1e-6, 4
+"""Relative singular value [1] below which positions do not determine the anchor of a line, and the
+rank that determines it.
+"""
+
+
+def solve_least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the least-squares solution of `A x = b`, the shortest one where it is not unique.
+
+    Singular values below `ALIGNMENT_TOLERANCE` times the largest count as zero.
+    """
+    return np.asarray(np.linalg.lstsq(A, b, rcond=ALIGNMENT_TOLERANCE)[0], dtype=float)
+
+
+def align_point_sets(points: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the pose T (4, 4) that minimizes `sum |T p - r|^2` over points p, reference r (r, 3).
+
+    Source: Umeyama, IEEE Transactions on Pattern Analysis 13(4) 376, 1991, doi 10.1109/34.88573,
+    without the scale.
+    """
+    middle, center = points.mean(axis=0), reference.mean(axis=0)
+    R = project_to_rotations((reference - center).T @ (points - middle))
+    return make_pose(R, center - R @ middle)
+
+
+def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> FloatArray:
+    """Return the rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`.
+
+    The vector v holds the nine entries of R row by row. Damped Gauss-Newton on the rotation group
+    begins at the rotation nearest to the unconstrained minimum and at the 24 rotations of a cube.
+
+    Parameters
+    ----------
+    H : (9, 9), positive semidefinite. g : (9,)
+    count : largest number of different rotations to return.
+    """
+    from loopcal.numerics.gauss_newton import minimize_from_starts
+
+    unconstrained = project_to_rotations(solve_least_squares(H, g).reshape(3, 3))
+    start = np.concatenate([unconstrained[None], OCTAHEDRAL_ROTATIONS])
+    root = _square_root(H)
+    root = root / max(float(np.linalg.norm(root)), TINY)  # residuals of order one
+    target = solve_least_squares(root.T, g / max(float(np.trace(H)), TINY))
+
+    def linearize(vector: FloatArray, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+        R, turn = exp_so3(vector) @ start[numbers], left_jacobian_so3(vector)
+        # dR = hat(w) R for w along each axis
+        by_turn = np.stack([(hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
+        return R.reshape(-1, 9) @ root.T - target, root @ by_turn @ turn
+
+    vector, cost = minimize_from_starts(linearize, np.zeros((len(start), 3)))
+    return _select_distinct((exp_so3(vector) @ start)[np.argsort(cost)])[:count]
+
+
+def _select_distinct(R: FloatArray) -> FloatArray:
+    """Return those of the rotations (k, 3, 3) whose entries differ by more than 0.02 from all
+    earlier ones.
+    """
+    kept: list[FloatArray] = []
+    for rotation in R:
+        if all(np.abs(rotation - other).max() > 0.02 for other in kept):
+            kept.append(rotation)
+    return np.array(kept)
+
+
+def solve_hand_eye(
+    T: FloatArray, measured: FloatArray, frame: FloatArray | None, tool: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return frame F and tool X (4, 4) with `F measured = T X`; at most one of them is given.
+
+    Rotations: the trace of `sum R_F' R_T R_X R_measured'` is largest at the leading singular
+    vectors of `sum R_T kron R_measured` (Shah, Journal of Mechanisms and Robotics 5(3) 031007,
+    2013, doi 10.1115/1.4024473). Translations follow from a linear system.
+
+    Parameters
+    ----------
+    T : (r, 4, 4) T_base_platform.
+    measured : (r, 4, 4) T_frame_tool.
+    frame, tool : (4, 4), or None where unknown.
+    """
+    A, B = T[:, :3, :3], measured[:, :3, :3]
+    if tool is not None:
+        R_F = (
+            project_to_rotations(np.einsum("rij,jk,rlk->il", A, tool[:3, :3], B))
+            if frame is None
+            else frame[:3, :3]
+        )
+        R_X = tool[:3, :3]
+    elif frame is not None:
+        R_F = frame[:3, :3]
+        R_X = project_to_rotations(np.einsum("rji,jk,rkl->il", A, R_F, B))
+    else:
+        K = np.einsum("rij,rkl->ikjl", A, B).reshape(9, 9)
+        U, _, V = np.linalg.svd(K)
+        left, right = U[:, 0].reshape(3, 3), V[0].reshape(3, 3)
+        sign = 1.0 if np.linalg.det(left) > 0.0 else -1.0
+        R_F, R_X = project_to_rotations(sign * left), project_to_rotations(sign * right)
+    # R_F m + t_F = A t_X + t
+    identity = np.broadcast_to(np.eye(3), A.shape)
+    rhs = T[:, :3, 3] - measured[:, :3, 3] @ R_F.T
+    columns = []
+    if frame is None:
+        columns.append(identity)
+    else:
+        rhs = rhs - frame[:3, 3]
+    if tool is None:
+        columns.append(-A)
+    else:
+        rhs = rhs + A @ tool[:3, 3]
+    solution = solve_least_squares(
+        np.concatenate(columns, axis=-1).reshape(rhs.size, -1), rhs.ravel()
+    )
+    t_F = solution[:3] if frame is None else frame[:3, 3]
+    t_X = solution[-3:] if tool is None else tool[:3, 3]
+    return make_pose(R_F, t_F), make_pose(R_X, t_X)
+
+
+def solve_frame_and_points(
+    measured: FloatArray, moving: FloatArray, constant: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a frame and points on a moving body from `R measured + t = moving p + constant`.
+
+    For a given rotation R the other unknowns enter linearly. Eliminating them leaves a quadratic
+    form of R.
+
+    Parameters
+    ----------
+    measured : (q, 3) points in the frame. moving : (q, 3, w). constant : (q, 3).
+
+    Returns
+    -------
+    frames : (k, 4, 4) candidates (R, t). points : (k, w), p of each candidate.
+    """
+    q, w = len(measured), moving.shape[-1]
+    C = np.concatenate([moving, -np.broadcast_to(np.eye(3), (q, 3, 3))], axis=-1).reshape(
+        3 * q, w + 3
+    )
+    M = (np.eye(3)[None, :, :, None] * measured[:, None, None, :]).reshape(3 * q, 9)
+    Q = _column_space(C)
+    b = constant.ravel()
+    M_out, b_out = M - Q @ (Q.T @ M), b - Q @ (Q.T @ b)
+    R = minimize_over_rotations(M_out.T @ M_out, M_out.T @ b_out)
+    rest = solve_least_squares(C, (M @ R.reshape(-1, 9).T) - b[:, None]).T
+    return make_pose(R, rest[:, w:]), rest[:, :w]
+
+
+def solve_resection(rays: FloatArray, points: FloatArray) -> FloatArray:
+    """Return candidate frames (k, 4, 4) of a station from rays to known points, the best first.
+
+    `(1 - b b') (A p - s) = 0` with A = R' and s = R' t is linear in A and s. Eliminating s leaves a
+    quadratic form of A.
+
+    Parameters
+    ----------
+    rays : (r, 3) unit vectors b in the frame of the station.
+    points : (r, 3) points p in the base [m].
+    """
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    middle = points.mean(axis=0)
+    M = np.einsum("rij,rk->rijk", across, points - middle).reshape(-1, 9)
+    C = across.reshape(-1, 3)
+    Q = _column_space(C)
+    out = M - Q @ (Q.T @ M)
+    A = minimize_over_rotations(out.T @ out, np.zeros(9), count=8)
+    s = solve_least_squares(C, M @ A.reshape(-1, 9).T).T
+    ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
+    order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")
+    R = np.swapaxes(A, -1, -2)
+    return make_pose(R, (R @ s[..., None])[..., 0] + middle)[order]
+
+
+def solve_trilateration(
+    points: FloatArray, distances: FloatArray, *, with_offset: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return centers c and offsets o with `|p - c| + o = d`.
+
+    `|p|^2 - d^2 = 2 p'c - 2 d o - (|c|^2 - o^2)` is linear in c, o and the bracket. Distances from
+    points near a plane do not determine on which side of it c is, so both sides are candidates.
+
+    Parameters
+    ----------
+    points : (r, 3) p [m]. distances : (r,) d [m]. with_offset : whether o is unknown; else 0.
+
+    Returns
+    -------
+    centers : (k, 3), offsets : (k,); k = 3, or 2 (one on each side) where the points are coplanar.
+    """
+    middle = points.mean(axis=0)
+    p = points - middle
+    _, s, axes = np.linalg.svd(p, full_matrices=False)
+    columns = [2.0 * p, -np.ones((len(p), 1))] + (
+        [-2.0 * distances[:, None]] if with_offset else []
+    )
+    solution = solve_least_squares(
+        np.concatenate(columns, axis=1), np.sum(p * p, axis=1) - distances**2
+    )
+    offset, center, normal = solution[4] if with_offset else 0.0, solution[:3], axes[2]
+    foot = center - (center @ normal) * normal
+    height = np.sqrt(
+        max(float(np.mean((distances - offset) ** 2 - np.sum((p - foot) ** 2, axis=1))), 0.0)
+    )
+    centers = foot + height * np.array([[1.0], [-1.0]]) * normal
+    if s[2] > FLATNESS * s[0]:
+        centers = np.concatenate([center[None], centers])
+    return middle + centers, np.full(len(centers), offset)
+
+
+def solve_line_anchor(
+    positions: FloatArray, extensions: FloatArray
+) -> tuple[FloatArray, int, FloatArray]:
+    """Return the anchor a of a line from positions x and the extensions d of the line at them.
+
+    A line from a to x is d longer than at the origin: `|x - a| = |a| + d`, and therefore `x'a + d
+    |a| = (x'x - d^2) / 2`, which is linear in a and |a|.
+
+    Parameters
+    ----------
+    positions : (k, 3) x. extensions : (k,) d, in the same unit.
+
+    Returns
+    -------
+    anchor : (3,) a.
+    rank : of the equations. Below `ANCHOR_RANK` the positions are too few, or in a plane through
+        the origin, and the anchor is not determined.
+    singular_values : of the equations.
+    """
+    rows = np.column_stack([positions, extensions])
+    target = 0.5 * ((positions * positions).sum(axis=1) - extensions * extensions)
+    solution, _, rank, s = np.linalg.lstsq(rows, target, rcond=ANCHOR_TOLERANCE)
+    return solution[:3], int(rank), s
+
+
+def solve_directions(
+    measured: FloatArray, rotations: FloatArray, axis: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return orientations R and directions a with `R measured = rotations a`, the best first.
+
+    Each of R and a follows in closed form from the other one. The alternation begins at 24
+    orientations. A given `axis` leaves R alone, in one step.
+
+    Parameters
+    ----------
+    measured : (r, 3) unit vectors in the frame of the instrument.
+    rotations : (r, 3, 3).
+    axis : (3,) the direction a, or None where unknown.
+
+    Returns
+    -------
+    R : (k, 3, 3). a : (k, 3).
+    """
+    if axis is not None:
+        R = project_to_rotations(np.einsum("rij,j,rk->ik", rotations, axis, measured))
+        return R[None], axis[None]
+    R = np.array(OCTAHEDRAL_ROTATIONS)
+    a = np.zeros((len(R), 3))
+    # both steps need the rows only through these 27 sums
+    sums = np.einsum("rji,rl->ijl", rotations, measured)
+    for _ in range(100):
+        a = np.einsum("ijl,kjl->ki", sums, R)
+        a /= np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
+        before, R = R, project_to_rotations(np.einsum("jil,kj->kil", sums, a))
+        if np.abs(R - before).max() < ROTATION_CHANGE:
+            break
+    error = np.linalg.norm(
+        np.einsum("kij,rj->kri", R, measured) - np.einsum("rij,kj->kri", rotations, a), axis=(1, 2)
+    )
+    order = np.argsort(error)
+    return R[order][:6], a[order][:6]
+
+
+def _square_root(H: FloatArray) -> FloatArray:
+    """Return a matrix S with S'S = H."""
+    values, vectors = np.linalg.eigh(H)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def _column_space(C: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the columns of C."""
+    U, s, _ = np.linalg.svd(C, full_matrices=False)
+    return U[:, are_nonzero(s, ALIGNMENT_TOLERANCE)]

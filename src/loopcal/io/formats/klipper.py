@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Klipper's printer.cfg of a delta printer: geometry, probes of `DELTA_CALIBRATE`, corrections.
+
+Options are `name: value` or `name = value` in `[sections]`. What `SAVE_CONFIG` stored follows a
+header line, with `#*# ` in front of each line; an option of the main part hides a stored one.
+
+Tower k = a, b, c has `angle`, `arm_length` and `position_endstop` in [stepper_k]; `delta_radius` is
+in [printer]. A stable position counts the motor steps of each tower below its end stop, so that
+readings do not depend on the geometry: reading = steps * rotation_distance / (microsteps *
+full_steps_per_rotation * gear_ratio), or older `step_distance`. [delta_calibrate] contains heights
+(`height0`, `height0_pos`, also `manual_height0`) and distances (`distance0`, `distance0_pos1`,
+`distance0_pos2`). Source: the documents "Configuration reference", "G-Codes" (SAVE_CONFIG) and
+"Delta calibrate" of Klipper, and how its configfile module reads the two parts.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from loopcal.errors import FileError
+from loopcal.findings import Quantity, report_finding
+from loopcal.io.core.csv_table import parse_finite
+from loopcal.io.core.text_file import read_text
+from loopcal.io.formats.delta_gcode import NOMINAL_ANGLES, DeltaGeometry, format_robot, get_geometry
+from loopcal.io.formats.program_format import (
+    DECIMALS,
+    Exported,
+    ExportSource,
+    Format,
+    Imported,
+    ImportOptions,
+    Name,
+    Value,
+    ValueFile,
+    shorten_numbers,
+)
+
+if TYPE_CHECKING:
+    from loopcal.measure.measurements import Measurements
+
+STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
+PROBED = "delta_calibrate"
+SHOWN = 4
+"""Sections that are named of a file that is not a printer.cfg."""
+
+MARK = "#*#"
+HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
+NEW_BLOCK = (HEADER, "#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.", MARK)
+SECTION = re.compile(r"\[([^]]+)\]")
+OPTION = re.compile(r"([^:=\s][^:=]*?)(\s*[:=]\s*)(.*?)\s*$")
+COMMENT = re.compile(r"#.*|(?:^|(?<=\s));.*")
+
+
+@dataclass(frozen=True)
+class KlipperConfig(ValueFile):
+    """A configuration file, whose values are options by section and name.
+
+    Attributes
+    ----------
+    saved : section -> line of its header in the saved part. header : first line of that part, None
+        without one. includes : files that it includes.
+    """
+
+    saved: Mapping[str, int]
+    header: int | None
+    includes: tuple[str, ...]
+
+    title = "[{0}] {1}"
+    phrase = "{1!r} of [{0}]"
+
+    def describe_missing(self, group: str, name: str) -> str:
+        """Return the sentence about an option that does not exist."""
+        files = ", ".join(self.includes)
+        hint = f" (if {files} contains it, move it into this file)" if files else ""
+        return f"option {name!r} of [{group}] is missing{hint}; add it"
+
+    def positive(self, section: str, option: str, default: float | None = None) -> float:
+        """Return a positive number of an option, or the default; FileError for another."""
+        value = self.number(section, option, default)
+        if not value > 0:
+            sentence = f"{option!r} of [{section}] is {value:g}; write a positive number"
+            raise self.error(sentence, section, option)
+        return value
+
+    def with_lines(self, lines: Sequence[str]) -> KlipperConfig:
+        """Return the file with other lines."""
+        return parse_config(lines, self.path)
+
+    def insert(self, lines: list[str], name: Name, text: str) -> None:
+        """Insert a new option into the saved part, which is added where there is none."""
+        (section, option), end = name, self.line_end
+        line = f"{MARK} {option} = {text}{end}"
+        if self.header is None:
+            lines += [*([end] if lines else []), *(line + end for line in NEW_BLOCK)]
+        if section in self.saved:
+            lines.insert(self.saved[section] + 1, line)
+            return
+        while not lines[-1].strip():
+            lines.pop()
+        first = [] if lines[-1].strip() == MARK else [MARK + end]
+        lines += [*first, f"{MARK} [{section}]{end}", line]
+
+
+def read_config(path: Path) -> KlipperConfig:
+    """Read a configuration.
+
+    Raises
+    ------
+    FileError : it is unreadable, its saved part was edited, or it is not that of a delta printer.
+    """
+    cfg = parse_config_file(path)
+    is_stated = cfg.has("printer", "kinematics")
+    kinematics = cfg.text("printer", "kinematics") if is_stated else ""
+    sections = tuple(dict.fromkeys(section for section, _ in cfg.values))
+    if kinematics == "delta" or (not is_stated and (cfg.includes or STEPPERS[0] in sections)):
+        return cfg
+    finding = report_finding(
+        "files.not-a-delta-configuration", kinematics=kinematics, sections=sections[:SHOWN]
+    )
+    raise cfg.error(finding, "printer", "kinematics")
+
+
+def parse_config(lines: Sequence[str], path: Path) -> KlipperConfig:
+    """Find options and sections."""
+    header = next((i for i, line in enumerate(lines) if line.rstrip() == HEADER), None)
+    options: dict[Name, Value] = {}
+    saved: dict[str, int] = {}
+    includes: list[str] = []
+    section, main_part = "", frozenset[Name]()
+    last = max((i for i, line in enumerate(lines) if line.strip()), default=0)
+    for i, line in enumerate(lines[: last + 1]):
+        if i == header:
+            section, main_part = "", frozenset(options)
+        offset = 0
+        if header is not None and i >= header:
+            if not line.startswith(MARK) or line[3:4] not in ("", " ", "\n", "\r"):
+                sentence = (
+                    f"this line below SAVE_CONFIG has no {MARK!r}, so Klipper ignores the block"
+                )
+                raise FileError(f"{sentence}; move it up", path, i + 1)
+            offset = 4
+        content = COMMENT.sub("", line[offset:].rstrip("\r\n")).rstrip()
+        if not content or content[0].isspace():
+            continue
+        if match := SECTION.match(content):
+            section = match[1]
+            if section.startswith("include "):
+                includes.append(section.removeprefix("include ").strip())
+            if offset:
+                saved[section] = i
+        elif (match := OPTION.match(content)) and section:
+            key = (section, match[1].lower())
+            if key not in main_part:
+                options[key] = Value(match[3], i, offset + match.start(3))
+    return KlipperConfig(path, tuple(lines), options, saved, header, tuple(includes))
+
+
+FULL_STEPS = 200.0
+MM = 1e-3
+
+
+@dataclass(frozen=True)
+class _Probes:
+    """Stable positions [steps] by label, heights (label, value) and distances (label, label, value)
+    in mm.
+    """
+
+    positions: dict[str, tuple[float, ...]]
+    heights: list[tuple[str, float]]
+    distances: list[tuple[str, str, float]]
+
+
+def read(path: Path, options: ImportOptions) -> Imported:
+    """Read geometry and measurements.
+
+    Raises
+    ------
+    FileError : an option is missing or not a number, or the printer is not a delta.
+    """
+    cfg = read_config(path)
+    probes = _parse_probes(cfg)
+    program, has_distances = "a printer.cfg of Klipper", bool(probes.distances)
+    text = format_robot(parse_geometry(cfg), options, path, program, has_distances)
+    if not probes.positions:
+        return Imported(text, None, (report_finding("files.no-probed-heights"),))
+    steps = [get_step_distance(cfg, section) for section in STEPPERS]
+    finding = report_finding(
+        "files.probe-noise-assumed",
+        heights=len(probes.heights),
+        distances=len(probes.distances),
+        sigma_height=Quantity(options.choose_noise("height") / MM, "mm"),
+        sigma_distance=Quantity(options.choose_noise("distance") / MM, "mm"),
+    )
+    return Imported(text, _build_measurements(probes, steps, options), (finding,))
+
+
+def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
+    """Return the geometry with Klipper's defaults: arm and stop of tower a, angles 210, 330, 90."""
+    angles = zip(STEPPERS, NOMINAL_ANGLES, strict=True)
+    arm = cfg.number(STEPPERS[0], "arm_length")
+    stop = cfg.number(STEPPERS[0], "position_endstop")
+    return DeltaGeometry(
+        cfg.number("printer", "delta_radius"),
+        tuple(cfg.number(s, "angle", nominal) for s, nominal in angles),
+        tuple(cfg.number(s, "arm_length", arm) for s in STEPPERS),
+        tuple(cfg.number(s, "position_endstop", stop) for s in STEPPERS),
+    )
+
+
+def get_step_distance(cfg: KlipperConfig, section: str) -> float:
+    """Return the length of one motor step [mm]."""
+    has_rotation = cfg.has(section, "rotation_distance")
+    if not has_rotation and cfg.has(section, "step_distance"):
+        return cfg.positive(section, "step_distance")
+    rotation = cfg.positive(section, "rotation_distance")
+    steps = cfg.positive(section, "microsteps")
+    steps *= cfg.positive(section, "full_steps_per_rotation", FULL_STEPS)
+    return rotation / (steps * _parse_gear_ratio(cfg, section))
+
+
+def write(source: ExportSource, into: Path | None) -> Exported:
+    """Return the corrected numbers in an existing printer.cfg, or a saved block to paste."""
+    geometry = get_geometry(source, "klipper", DECIMALS)
+    wanted: dict[Name, float | str] = {("printer", "delta_radius"): geometry.radius}
+    defaults: dict[Name, float] = {}
+    for k, section in enumerate(STEPPERS):
+        wanted[section, "angle"] = geometry.angles[k]
+        defaults[section, "angle"] = NOMINAL_ANGLES[k]
+        for option, values in (("arm_length", geometry.arms), ("position_endstop", geometry.stops)):
+            wanted[section, option] = values[k]
+            if k:  # left out, it is that of tower a
+                defaults[section, option] = values[0]
+    if into is not None:
+        return read_config(into).export(into, wanted, defaults)
+    if source.is_for_people:
+        return _list_options(shorten_numbers(wanted, DECIMALS))
+    new = parse_config((), Path("printer.cfg"))
+    return new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
+
+
+def _list_options(wanted: Mapping[Name, float | str]) -> Exported:
+    """Return options for people: they change them where they are, because an option of the main
+    part would hide one of a pasted block.
+    """
+    lines: list[str] = []
+    for (section, option), text in wanted.items():
+        header = f"[{section}]"
+        lines += [header] if header not in lines else []
+        lines.append(f"{option}: {text}")
+    content = "\n".join(lines) + "\n"
+    return Exported(content, (report_finding("files.options-to-change"),))
+
+
+def parse_config_file(path: Path) -> KlipperConfig:
+    """Return the options of a file."""
+    return parse_config(read_text(path, "printer.cfg").splitlines(keepends=True), path)
+
+
+def _parse_probes(cfg: KlipperConfig) -> _Probes:
+    """Return the probes of [delta_calibrate]; FileError for a record that lacks a part."""
+    probes = _Probes({}, [], [])
+    for name in ("height", "manual_height"):
+        for record in _list_records(cfg, name, ("", "_pos")):
+            probes.positions[record] = _parse_steps(cfg, f"{record}_pos")
+            probes.heights.append((record, cfg.number(PROBED, record)))
+    for record in _list_records(cfg, "distance", ("", "_pos1", "_pos2")):
+        ends = (f"{record}_pos1", f"{record}_pos2")
+        for end in ends:
+            probes.positions[end] = _parse_steps(cfg, end)
+        probes.distances.append((*ends, cfg.number(PROBED, record)))
+    return probes
+
+
+def _list_records(cfg: KlipperConfig, name: str, suffixes: Sequence[str]) -> list[str]:
+    """Return the names of the records `height0`, `height1`, ... of which any part exists.
+
+    Klipper reads up to the first number that is missing, and ignores all records behind it.
+
+    Raises
+    ------
+    FileError : a record lacks one of its parts (suffixes of its name), or a number is left out; at
+        a line of the record, or of the next one.
+    """
+    pattern = re.compile(rf"{name}(\d+)({'|'.join(suffixes)})")
+    records: dict[int, list[str]] = {}
+    for section, option in cfg.values:
+        if section == PROBED and (match := pattern.fullmatch(option)):
+            records.setdefault(int(match[1]), []).append(option)
+    for place, number in enumerate(sorted(records)):
+        present = records[number]
+        lacking = [part for part in suffixes if f"{name}{number}{part}" not in present]
+        code = "files.probe-part-missing" if lacking else "files.probe-left-out"
+        if lacking or number != place:
+            missing = f"{name}{number}{lacking[0]}" if lacking else f"{name}{place}"
+            finding = report_finding(code, present=present[0], missing=missing, section=PROBED)
+            raise cfg.error(finding, PROBED, present[0])
+    return [f"{name}{number}" for number in range(len(records))]
+
+
+def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
+    """Return the steps of the towers, separated by commas."""
+    steps = cfg.numbers(PROBED, option, ",")
+    if len(steps) != len(STEPPERS):
+        sentence = f"{option!r} of [{PROBED}] has {len(steps)} numbers, but three are needed"
+        raise cfg.error(f"{sentence}, the steps of the towers; correct it", PROBED, option)
+    return steps
+
+
+def _build_measurements(
+    probes: _Probes, steps: list[float], options: ImportOptions
+) -> Measurements:
+    """Return heights as the component z, distances as separations of two poses."""
+    from loopcal.measure.kinds.distance import Separation
+    from loopcal.measure.kinds.poses import Component
+    from loopcal.measure.measurements import Measurements
+    from loopcal.measure.observations import Observations
+
+    labels = tuple(probes.positions)
+    readings = np.array([probes.positions[label] for label in labels]) * np.array(steps) * MM
+    observations = []
+    if probes.heights:
+        kind = Component(components=("z",)).with_tool(np.eye(4))
+        rows = [labels.index(label) for label, _ in probes.heights]
+        measured = np.array([[value * MM] for _, value in probes.heights])
+        sigma, is_assumed = options.choose_noise("height"), options.is_noise_assumed("height")
+        heights = Observations.from_sigma(kind, rows, measured, sigma)
+        observations.append(replace(heights, is_noise_assumed=is_assumed))
+    if probes.distances:
+        kind = Separation().with_tool(np.eye(4))
+        pairs = [(labels.index(a), labels.index(b)) for a, b, _ in probes.distances]
+        measured = np.array([[value * MM] for *_, value in probes.distances])
+        sigma, is_assumed = options.choose_noise("distance"), options.is_noise_assumed("distance")
+        distances = Observations.from_sigma(kind, pairs, measured, sigma)
+        observations.append(replace(distances, is_noise_assumed=is_assumed))
+    return Measurements(options.name, readings, tuple(observations), labels=labels)
+
+
+def _parse_gear_ratio(cfg: KlipperConfig, section: str) -> float:
+    """Return the turns of the motor for one of the last gear: `57:11, 2:1` is 57 / 11 * 2."""
+    if not cfg.has(section, "gear_ratio"):
+        return 1.0
+    text, ratio = cfg.text(section, "gear_ratio"), 1.0
+    for pair in text.split(","):
+        teeth = [parse_finite(part.strip()) or 0.0 for part in pair.split(":")]
+        ratio *= teeth[0] / teeth[1] if len(teeth) == 2 and teeth[1] else 0.0
+    if not ratio > 0:
+        sentence = f"gear_ratio is {text!r}; write it as 80:16, or 57:11, 2:1 for several gears"
+        raise cfg.error(sentence, section, "gear_ratio")
+    return ratio
+
+
+FORMAT = Format(
+    "klipper",
+    "printer.cfg of a Klipper delta printer",
+    (".cfg",),
+    read,
+    write,
+    read_options=("sigma_height", "sigma_distance", "sigma_tape"),
+    stores_fit=True,
+)

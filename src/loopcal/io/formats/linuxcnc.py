@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LinuxCNC's genhexkins: joints of a hexapod, and the lead of its screws, as `setp` lines of HAL.
+
+    setp genhexkins.base.N.x ..        center of a joint on the base (platform.N: on the platform)
+    setp genhexkins.base-n.N.x ..      axis of that joint (platform-n.N), used with a screw lead
+    setp genhexkins.screw-lead ..      change of a strut's length in one turn;  N = 0..5
+
+A strut's joint position is the distance between its centers (plus the screw's correction), so the
+lengths of the robot file are zero, and what a calibration adds to them shifts the zero of the
+joint, which these pins cannot express. The correction is screw-lead * asin(sin a) / (2 pi) of the
+angle a about the strut between the two axes, where loopcal has the angle itself: the same below a
+quarter turn. A strut beyond a quarter turn at home is read as what the formula makes of it there, a
+screw of the other hand counted from the other side of its axis (-lead, -platform-n).
+`spindle-offset` and `tool-offset` are added to z of all centers. No unit is stated: it is the
+machine's. Source: the documentation of genhexkins (LinuxCNC, "Kinematics").
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from loopcal.errors import DataError, FileError
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.csv_table import format_scaled
+from loopcal.io.core.text_file import read_text
+from loopcal.io.formats.program_format import (
+    DECIMALS,
+    Exported,
+    ExportSource,
+    Format,
+    Imported,
+    ImportOptions,
+    Name,
+    Value,
+    ValueFile,
+    format_head,
+    get_record,
+)
+from loopcal.mechanism.families.gough import Gough
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension, find_unit
+
+COMPONENT = "genhexkins"
+SETP = re.compile(rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(\s*=\s*|\s+)([^\s#]+)")
+LEAD, OFFSETS = "screw-lead", ("spindle-offset", "tool-offset")
+SIDES, UP = ("base", "platform"), np.array([0.0, 0.0, 1.0])
+ROUNDING = 1e-12
+"""Relative difference of numbers that count as the same."""
+
+REMARK = "Readings are strut lengths, so the lengths at reading zero are 0."
+ROBOT = """\
+legs: {legs}
+base:
+{base}
+platform:
+{platform}
+lengths: 0
+home: {{z: {home}}}
+stored_parameters: [leg*.base.?, leg*.platform.?]     # what genhexkins stores
+{tolerances}{screw}"""
+TOLERANCES = "tolerances: {{base: {{sd: {sd}}}, platform: {{sd: {sd}}}}}     # measured by hand\n"
+SCREW = """\
+screw:
+  lead: {lead}
+  base_axes:
+{base}
+  platform_axes:
+{platform}
+"""
+
+
+@dataclass(frozen=True)
+class HalFile(ValueFile):
+    """A HAL file, whose values are pins of genhexkins."""
+
+    title = phrase = "{0}.{1}"
+
+    def describe_missing(self, group: str, name: str) -> str:
+        """Return the sentence about a pin that is not set."""
+        return f"'setp {group}.{name} ..' is missing, and loopcal assumes no default; add it"
+
+    def with_lines(self, lines: Sequence[str]) -> HalFile:
+        """Return the file with other lines."""
+        return _parse_hal(lines, self.path)
+
+    def insert(self, lines: list[str], name: Name, text: str) -> None:
+        """Insert a line for a new pin at the end."""
+        lines.append(f"setp {'.'.join(name)} {text}{self.line_end}")
+
+    def format(self, number: float) -> str:
+        """Return a number with the fewest digits that read back equal."""
+        return format_scaled(number, 1.0)
+
+    def is_same(self, a: float, b: float) -> bool:
+        """Return whether two numbers differ by rounding only."""
+        return abs(a - b) <= ROUNDING * max(1.0, abs(b))
+
+    def pin(self, name: str, default: float | None = None) -> float:
+        """Return the number of a pin, or the default; FileError where there is neither."""
+        return self.number(COMPONENT, name, default)
+
+    def points(self, kind: str) -> FloatArray:
+        """Return the six centers or axes (6, 3); LinuxCNC has z at 0 where it is not set."""
+        names = [f"{kind}.{n}" for n in range(6)]
+        xyz = [(self.pin(f"{n}.x"), self.pin(f"{n}.y"), self.pin(f"{n}.z", 0.0)) for n in names]
+        return np.array(xyz)
+
+    @property
+    def lift(self) -> float:
+        """Height that is added to all centers."""
+        return sum(self.pin(name, 0.0) for name in OFFSETS)
+
+
+def read(path: Path, options: ImportOptions) -> Imported:
+    """Read the pins.
+
+    Raises
+    ------
+    FileError : a pin is missing or not a number, or no unit of length is given.
+    """
+    hal = _read_hal(path)
+    if options.length_unit is None:
+        raise FileError(report_finding("files.unit-missing"), path)
+    unit = find_unit(options.length_unit, Dimension.LENGTH)
+    lift, lead = hal.lift, hal.pin(LEAD, 0.0)
+    base, platform = (hal.points(side) + lift * UP for side in SIDES)
+    findings: tuple[Finding, ...] = ()
+    if options.home_height is None:
+        home = sum(math.hypot(x, y) for x, y, _ in base.tolist()) / 6
+        findings = (report_finding("files.home-assumed", height=f"{home:g} {unit}"),)
+    else:
+        home = options.home_height / unit.factor_to_si
+    screw = ""
+    if lead:
+        low, high = hal.points("base-n"), hal.points("platform-n")
+        hands = _get_hands(platform + home * UP - base, low, high)
+        leads = lead if min(hands) > 0 else (hands * lead).tolist()
+        turned = hands[:, None] * high
+        screw = SCREW.format(
+            lead=leads, base=_format_list(low, 4), platform=_format_list(turned, 4)
+        )
+    what, units = "genhexkins settings of LinuxCNC", (unit.symbol, "deg")
+    head = format_head(path, what, "gough", options.name, units, REMARK)
+    text = head + ROBOT.format(
+        legs="ups" if lead else "rod",
+        base=_format_list(base, 2),
+        platform=_format_list(platform, 2),
+        home=home,
+        tolerances=_format_tolerances(options, unit.factor_to_si),
+        screw=screw,
+    )
+    return Imported(text, None, findings)
+
+
+def _format_tolerances(options: ImportOptions, factor: float) -> str:
+    """Return the tolerances of joint centers that were measured by hand; nothing for others."""
+    if options.sigma_tape is None:
+        return ""
+    return TOLERANCES.format(sd=f"{options.sigma_tape / factor:.7g}")
+
+
+def write(source: ExportSource, into: Path | None) -> Exported:
+    """Return the corrected pins in an existing HAL file, or `setp` lines of their own."""
+    record: Gough = get_record(source, Gough, "linuxcnc", "a hexapod of the family gough")
+    unit = find_unit(source.robot.units[Dimension.LENGTH])
+    hal = _parse_hal((), Path("hexapod.hal")) if into is None else _read_hal(into)
+    lead = hal.pin(LEAD) if hal.has(COMPONENT, LEAD) else None
+    wanted = _list_pins(source, record, unit.factor_to_si, hal.lift, lead)
+    findings = _report_inexpressible(source, unit.factor_to_si, unit.symbol)
+    if into is None:
+        findings = (report_finding("files.machine-unit", unit=unit.symbol), *findings)
+    return hal.export(into, wanted, dict.fromkeys(wanted, 0.0), tuple(findings))
+
+
+def _list_pins(
+    source: ExportSource, record: Gough, factor: float, lift: float, present: float | None
+) -> dict[Name, float | str]:
+    """Return pin -> value in the file's unit; `present` is the lead there, whose sign is kept."""
+    values, pins = source.values(), {}
+    for n in range(6):
+        for side in SIDES:
+            for axis in "xyz":
+                name = f"leg{n + 1}.{side}.{axis}"
+                value = values[name] / factor
+                shifted = value - (lift if axis == "z" else 0.0)
+                shifted = source.round_number(shifted, name, factor, DECIMALS)
+                pins[f"{side}.{n}.{axis}"] = float(format_scaled(shifted, 1.0))
+    if record.screw is not None:
+        legs = record.screw.legs()
+        lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
+        if any(abs(abs(leg.lead) - abs(lead)) > ROUNDING * abs(lead) for leg in legs):
+            sentence = f"{source.robot.name} has screws of different lead, but genhexkins has one"
+            raise DataError(f"{sentence} lead; use json or csv")
+        pins[LEAD] = lead / factor
+        for n, leg in enumerate(legs):
+            sign = math.copysign(1.0, leg.lead * lead)
+            for i, axis in enumerate("xyz"):
+                pins[f"base-n.{n}.{axis}"] = leg.base_axis[i]
+            for i, axis in enumerate("xyz"):
+                pins[f"platform-n.{n}.{axis}"] = 0.0 + sign * leg.platform_axis[i]
+    return {(COMPONENT, pin): value for pin, value in pins.items()}
+
+
+def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> Iterator[Finding]:
+    """Yield what has no pin: lengths at reading zero, and further parameters."""
+    values = source.values()
+    for n in range(6):
+        length = values.pop(f"leg{n + 1}.length", 0.0) / factor
+        if abs(length) > ROUNDING:
+            text = f"{length:.{DECIMALS}f} {symbol}"
+            yield report_finding("files.strut-length", strut=n, length=text)
+    expressed = re.compile(r"leg\d\.(base|platform)\.[xyz]$")
+    table = source.robot.parameters
+    changed = zip(table.names, source.robot.values, table.nominal, strict=True)
+    others = [name for name, value, nominal in changed if value != nominal and name in values]
+    others = [name for name in others if not expressed.match(name)]
+    if others:
+        yield report_finding("files.not-expressed", format="genhexkins", names=tuple(others))
+
+
+def _read_hal(path: Path) -> HalFile:
+    """Read the pins of a file; FileError where it has none."""
+    hal = _parse_hal(read_text(path, "HAL file").splitlines(keepends=True), path)
+    if not hal.values:
+        sentence = f"this file has no 'setp {COMPONENT}...'"
+        raise FileError(f"{sentence}; name the HAL file that sets the geometry", path)
+    return hal
+
+
+def _parse_hal(lines: Sequence[str], path: Path) -> HalFile:
+    """Find the pins."""
+    matches = ((i, SETP.match(line)) for i, line in enumerate(lines))
+    pins = {(COMPONENT, m[1]): Value(m[3], i, m.start(3)) for i, m in matches if m is not None}
+    return HalFile(path, tuple(lines), pins)
+
+
+def _get_hands(struts: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return (6,) -1 where the axes are beyond a quarter turn about the strut at home, else 1."""
+    across = (low * high).sum(1) * (struts * struts).sum(1)
+    across -= (low * struts).sum(1) * (high * struts).sum(1)
+    return np.where(across < 0, -1.0, 1.0)
+
+
+def _format_list(points: FloatArray, indent: int) -> str:
+    return "\n".join(f"{' ' * indent}- {point}" for point in (0.0 + points).tolist())
+
+
+FORMAT = Format(
+    "linuxcnc",
+    "genhexkins settings of a LinuxCNC hexapod",
+    (".hal",),
+    read,
+    write,
+    read_options=("length_unit", "home_height", "sigma_tape"),
+)
+
+
+# --- LinuxCNC's INI file: HOME_OFFSET of the struts of a hexapod with the kinematics genhexkins.
+
+STRUTS = 6
+OFFSET = "HOME_OFFSET"
+UNITS_NAME = ("TRAJ", "LINEAR_UNITS")
+LINEAR_UNITS = {"mm": "mm", "metric": "mm", "in": "in", "inch": "in", "imperial": "in"}
+"""Word of LINEAR_UNITS -> our unit."""
+
+_SECTION = re.compile(r"\s*\[(\w+)\]")
+_ENTRY = re.compile(r"\s*(\w+)\s*=\s*([^\s#;]+)")
+
+
+@dataclass(frozen=True)
+class IniFile(ValueFile):
+    """An INI file, whose values are entries by section; of equal ones the first counts."""
+
+    title = "[{0}]{1}"
+    phrase = "{1} of [{0}]"
+
+    def describe_missing(self, group: str, name: str) -> str:
+        """Return the sentence about an entry that does not exist."""
+        return f"[{group}] has no {name}; add the one of the machine"
+
+    def with_lines(self, lines: Sequence[str]) -> IniFile:
+        """Return the file with other lines."""
+        return _parse_ini(lines, self.path)
+
+    def insert(self, lines: list[str], name: Name, text: str) -> None:
+        """Insert an entry with its section at the end."""
+        lines += [f"[{name[0]}]{self.line_end}", f"{name[1]} = {text}{self.line_end}"]
+
+
+def write_ini(source: ExportSource, into: Path | None) -> Exported:
+    """Return an INI file with corrected offsets, or entries of their own."""
+    get_record(source, Gough, "linuxcnc-ini", "a hexapod of the family gough")
+    values, table = source.values(), source.robot.parameters
+    nominal = dict(zip(table.names, table.nominal.tolist(), strict=True))
+    lengths = [f"leg{n + 1}.length" for n in range(STRUTS)]
+    own = source.robot.units[Dimension.LENGTH]
+    if into is None:
+        if source.is_for_people:
+            return _list_changes(source, lengths, nominal, own)
+        if not all(nominal[name] for name in lengths):
+            raise DataError(report_finding("files.ini-needed", robot=source.robot.name))
+        factor = find_unit(own).factor_to_si
+        wanted: dict[Name, float | str] = {
+            (f"JOINT_{n}", OFFSET): source.round_number(
+                values[name] / factor, name, factor, DECIMALS
+            )
+            for n, name in enumerate(lengths)
+        }
+        notes = (
+            report_finding("files.machine-unit", unit=own),
+            report_finding("files.offset-at-reading-zero"),
+        )
+        return _parse_ini((), Path("machine.ini")).export(None, wanted, {}, notes)
+    ini = _parse_ini(read_text(into, "INI file").splitlines(keepends=True), into)
+    unit = _read_unit(ini, own)
+    factor = find_unit(unit).factor_to_si
+    wanted = {
+        (f"JOINT_{n}", OFFSET): source.round_number(
+            ini.number(f"JOINT_{n}", OFFSET) + (values[name] - nominal[name]) / factor,
+            name,
+            factor,
+            DECIMALS,
+        )
+        for n, name in enumerate(lengths)
+    }
+    findings: tuple[Finding, ...] = ()
+    if not ini.has(*UNITS_NAME):
+        findings = (report_finding("files.machine-unit", unit=unit),)
+    return ini.export(into, wanted, {}, findings)
+
+
+def _list_changes(
+    source: ExportSource, lengths: Sequence[str], nominal: Mapping[str, float], unit: str
+) -> Exported:
+    """Return what to add to each offset, as lines for people."""
+    factor, values = find_unit(unit).factor_to_si, source.values()
+    lines = []
+    for n, name in enumerate(lengths):
+        added = (values[name] - nominal[name]) / factor
+        number = f"{source.round_number(added, name, factor, DECIMALS) + 0.0:+.{DECIMALS}f}"
+        shown = number.rstrip("0").rstrip(".")
+        lines += [f"[JOINT_{n}]", f"# add {shown} {unit} to {OFFSET}"]
+    return Exported("\n".join(lines) + "\n")
+
+
+def _read_unit(ini: IniFile, own: str) -> str:
+    """Return the unit of lengths of the machine; the robot's where the file states none."""
+    if not ini.has(*UNITS_NAME):
+        return own
+    text = ini.text(*UNITS_NAME)
+    if text.lower() not in LINEAR_UNITS:
+        allowed = ", ".join(LINEAR_UNITS)
+        raise ini.error(f"{UNITS_NAME[1]} is {text!r}; allowed: {allowed}", *UNITS_NAME)
+    return LINEAR_UNITS[text.lower()]
+
+
+def _parse_ini(lines: Sequence[str], path: Path) -> IniFile:
+    """Find the entries."""
+    section, values = "", dict[Name, Value]()
+    for i, line in enumerate(lines):
+        if match := _SECTION.match(line):
+            section = match[1]
+        elif match := _ENTRY.match(line):
+            values.setdefault((section, match[1]), Value(match[2], i, match.start(2)))
+    return IniFile(path, tuple(lines), values)
+
+
+INI_FORMAT = Format(
+    "linuxcnc-ini", "HOME_OFFSET of a LinuxCNC hexapod in its INI file", (".ini",), None, write_ini
+)

@@ -1,0 +1,461 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bases of the kinds that measure directions: an axis of the platform from a frame, or gravity on
+the platform.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.geometry import solve_directions
+from loopcal.measure.array_checks import check_direction, check_pose, set_fields
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import (
+    Column,
+    Evaluation,
+    InvalidRows,
+    Kind,
+    is_incomplete,
+    list_rows,
+)
+from loopcal.measure.kinds.points import convert_camera_angles, predict_camera_angles
+from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class DirectionKind(Kind):
+    """A kind that is a function of a direction `d = S' Q a`, with S an orientation and a a
+    direction; both may be unknown.
+
+    Outward, Q = R, the platform's rotation: a is an axis of the platform, S the orientation of an
+    instrument in the base. Inward, Q = R': a is a direction of the base (gravity), S the mounting
+    of a sensor on the platform. With s the rotation of S: `dd = S' (dQ a) + S' Q da + S' (Q a x
+    s)`, where `dR a = omega x R a`, `dR' a = R' (a x omega)`.
+
+    Parameters
+    ----------
+    unknown : tuple of str
+        Which of `allowed_unknown`, (orientation, direction), are unknown: three and two numbers.
+        One value holds for a session.
+    """
+
+    unknown: tuple[str, ...] = ()
+
+    inward: ClassVar[bool] = False
+    angle_error: ClassVar[str] = "orientation"
+
+    @property
+    @abstractmethod
+    def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
+        """Name and rotation (3, 3) of the orientation; name and unit vector of the direction."""
+
+    @cached_property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Orientation and direction."""
+        orientation, S, direction, a = self.stated
+        items = (
+            setup.make_orientation_item(orientation, S),
+            setup.make_direction_item(direction, a),
+        )
+        return dict(zip(self.allowed_unknown, items, strict=True))
+
+    def locate_direction(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the direction d (.., 3) and its derivative (.., 3, 6 + u)."""
+        _, S, _, stated = self.stated
+        of_orientation, of_direction = self.allowed_unknown
+        rotation, angles = (self.item_values(values, name) for name in self.allowed_unknown)
+        R = T[..., :3, :3]
+        Q = np.swapaxes(R, -1, -2) if self.inward else R
+        if rotation is not None:
+            S = geometry.exp_so3(rotation) @ S
+        St = np.swapaxes(S, -1, -2)
+        a = setup.place_direction(stated, angles)
+        rotated = (Q @ a[..., None])[..., 0]
+        by_omega = St @ (Q @ geometry.hat(a) if self.inward else -geometry.hat(rotated))
+        blocks = {"twist": np.concatenate([by_omega, np.zeros_like(by_omega)], axis=-1)}
+        if rotation is not None:
+            by_rotation = geometry.left_jacobian_so3(rotation)
+            blocks[of_orientation] = St @ geometry.hat(rotated) @ by_rotation
+        if angles is not None:
+            blocks[of_direction] = St @ Q @ setup.linearize_direction(stated, angles)
+        d = (St @ rotated[..., None])[..., 0]
+        return d, self.join_columns(blocks, d.shape)
+
+    @abstractmethod
+    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the columns (.., m) of directions d (.., 3), and their derivatives (.., m, 3)."""
+
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
+        d, rows = self.locate_direction(T, values)
+        predicted, slopes = self.predict(d)
+        return self.split_columns(predicted, slopes @ rows)
+
+    @abstractmethod
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the unit vectors d (.., 3) that columns (.., c) can stand for, usually one."""
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return orientation and direction in closed form, from the whole rotation group."""
+        complete = ~np.any(np.isnan(measured), axis=-1)
+        if not self.unknown or np.count_nonzero(complete) < 3:
+            return self.nominal_values[None]
+        R = T[complete, :3, :3]
+        Q = np.swapaxes(R, -1, -2) if self.inward else R
+        directions = self.convert_to_directions(measured[complete])
+        return np.concatenate([self._solve(Q, d) for d in directions])
+
+    def _solve(self, Q: FloatArray, d: FloatArray) -> FloatArray:
+        """Return candidates (k, u) from measured directions d (r, 3)."""
+        _, S, _, a = self.stated
+        of_orientation, of_direction = self.allowed_unknown
+        if of_orientation in self.unknown:
+            known = None if of_direction in self.unknown else a
+            rotations, directions = solve_directions(d, Q, known)
+        else:
+            mean = np.einsum("rji,jk,rk->i", Q, S, d)
+            rotations, directions = S[None], (mean / np.linalg.norm(mean))[None]
+        items = {
+            of_orientation: setup.encode_rotation(S, rotations),
+            of_direction: setup.encode_direction(a, directions),
+        }
+        return self.assemble_values(items)
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class AxisKind(DirectionKind):
+    """A kind that measures an axis of the platform in the frame of an instrument.
+
+    Parameters
+    ----------
+    T_base_frame : (4, 4)
+        Frame of the instrument in the base; only its orientation matters.
+    frame : str
+        Name of the frame. Kinds that use the same name share its parameters.
+    Others: see `DirectionKind`.
+    """
+
+    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+    frame: str = "frame"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        set_fields(self, T_base_frame=check_pose(self.T_base_frame, "T_base_frame"))
+
+
+# --- Kind `direction`: an axis of the platform as a unit vector in a frame, such as the normal of
+# a probed face.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Direction(AxisKind):
+    """Direction of an axis. Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to
+    the measured direction m.
+
+    The residual is twice the tangent of half the angle between the predicted direction d and m,
+    along the two vectors B. It equals the angle where that is small, and is unbounded where d is
+    opposite to m.
+
+    Setup parameters [rad]: `frame.rx` to `frame.rz`, `axis.u` and `axis.v`.
+
+    Parameters
+    ----------
+    axis : (3,)
+        The axis on the platform, of any length. If the axis is unknown, its nominal value.
+    axis_name : str
+        Name of the axis; its parameters begin with it.
+    Others: see `AxisKind`; "frame" and "axis" may be unknown.
+
+    Raises
+    ------
+    DataError
+        If the length of the axis is zero, the frame is not a pose, or `unknown` lists something
+        else.
+
+    Examples
+    --------
+    >>> kind = Direction(axis=np.array([0.0, 0.0, 1.0]))
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 2)))
+    array([[[0., 0., 1.]]])
+    """
+
+    axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    axis_name: str = "axis"
+
+    name: ClassVar[str] = "direction"
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "axis")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        set_fields(self, axis=check_direction(self.axis, "the axis"))
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known axis, and an unknown one in an unknown frame."""
+        return (
+            cls(),
+            cls(
+                axis=np.array([0.0, 0.6, 0.8]),
+                unknown=("axis", "frame"),
+                frame="cmm",
+                axis_name="face",
+            ),
+        )
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The three components, as measuring machines write them."""
+        return tuple(Column(name, Dimension.RATIO) for name in ("i", "j", "k"))
+
+    @property
+    def noise_columns(self) -> tuple[Column, ...]:
+        """Two angles perpendicular to the direction."""
+        return (Column("across_a", Dimension.ANGLE), Column("across_b", Dimension.ANGLE))
+
+    @property
+    def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
+        """Frame and axis."""
+        return self.frame, self.T_base_frame[:3, :3], self.axis_name, self.axis
+
+    @property
+    def placeholder(self) -> FloatArray:
+        """The z axis, where no direction was measured."""
+        return np.array([0.0, 0.0, 1.0])
+
+    def detect_present(self, measured: FloatArray) -> BoolArray:
+        """Return both residuals as present, or none where a component is missing."""
+        return np.repeat(~np.any(np.isnan(measured), axis=-1, keepdims=True), 2, axis=-1)
+
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
+        """Return rows with an incomplete direction, or one whose length is not 1."""
+        length = np.linalg.norm(measured, axis=-1)
+        return list_rows(
+            is_incomplete(measured),
+            lambda _: "has an incomplete direction; give i, j and k, or none of them",
+        ) + list_rows(
+            np.abs(length - 1.0) > 1e-3,
+            lambda i: f"has a direction of length {length[i]:.6g}; the length must be 1 to 1e-3",
+        )
+
+    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the direction itself."""
+        return d, np.eye(3)
+
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the columns, scaled to length one."""
+        return (measured / np.linalg.norm(measured, axis=-1, keepdims=True),)
+
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
+        d, rows = self.locate_direction(T, values)
+        length = np.sqrt(np.sum(measured * measured, axis=-1, keepdims=True))
+        # a row with a missing component has no direction: its length is not 1
+        complete = length > 0.5
+        m = np.where(complete, measured / np.where(complete, length, 1.0), self.placeholder)
+        Bt = np.swapaxes(make_perpendicular_basis(m), -1, -2)
+        facing = 1.0 + np.sum(m * d, axis=-1, keepdims=True)
+        scale = 2.0 / np.where(facing > 1e-9, facing, 1e-9)
+        residual = scale * (Bt @ d[..., None])[..., 0]
+        slopes = scale[..., None] * (Bt - 0.5 * residual[..., None] * m[..., None, :])
+        return self.split_columns(residual, slopes @ rows)
+
+    def _measure(
+        self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> FloatArray:
+        """Return columns (t, r, 3), rotated by noise (t, r, 2) perpendicular to the direction."""
+        d, _ = self.locate_direction(T, values)
+        rotation = np.cross(d, (make_perpendicular_basis(d) @ noise[..., None])[..., 0])
+        return (geometry.exp_so3(rotation) @ d[..., None])[..., 0]
+
+
+# --- Kind `inclination`: two tilts of the platform against gravity, by inclinometers on it.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Inclination(DirectionKind):
+    """Elevations of a sensor's x and y axis above the horizontal. Residual: differences of angles.
+
+    With the upward vertical d in axes of the sensor: `tilt_x = atan2(d_x, hypot(d_y, d_z))`,
+    `tilt_y` likewise.
+
+    Setup parameters [rad]: `inclinometer.rx` to `inclinometer.rz`, `gravity.u` and `gravity.v`.
+
+    Parameters
+    ----------
+    up : (3,)
+        The upward vertical in the base, of any length. If gravity is unknown, its nominal value.
+    T_platform_sensor : (4, 4)
+        Mounting of the sensor; only its orientation matters.
+    sensor : str
+        Name of the sensor; the parameters of its mounting begin with it.
+    unknown : tuple of str
+        Which of "mounting" and "gravity" are unknown.
+
+    Raises
+    ------
+    DataError
+        If the length of the vertical is zero, the mounting is not a pose, or `unknown` lists
+        something else.
+
+    Examples
+    --------
+    >>> from loopcal.geometry import make_pose, rotation_about_axis
+    >>> T = make_pose(rotation_about_axis(0.1, 0), np.zeros(3))
+    >>> Inclination().measure(T[None, None], noise=np.zeros((1, 1, 2))).round(6)
+    array([[[0. , 0.1]]])
+    """
+
+    up: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    T_platform_sensor: FloatArray = field(default_factory=lambda: np.eye(4))
+    sensor: str = "inclinometer"
+
+    name: ClassVar[str] = "inclination"
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("mounting", "gravity")
+    inward: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        mounting = check_pose(self.T_platform_sensor, "T_platform_sensor")
+        set_fields(self, up=check_direction(self.up, "the vertical"), T_platform_sensor=mounting)
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a level base, an unknown vertical, and an unknown mounting too."""
+        return (
+            cls(),
+            cls(unknown=("gravity",)),
+            cls(unknown=("mounting", "gravity"), sensor="level"),
+        )
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Two angles."""
+        return (Column("tilt_x", Dimension.ANGLE), Column("tilt_y", Dimension.ANGLE))
+
+    @property
+    def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
+        """Mounting and vertical."""
+        return self.sensor, self.T_platform_sensor[:3, :3], "gravity", self.up
+
+    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return both elevations (.., 2) and their derivatives (.., 2, 3)."""
+        x, y, z = d[..., 0], d[..., 1], d[..., 2]
+        level_x, level_y = np.sqrt(y * y + z * z), np.sqrt(x * x + z * z)
+        angles = np.stack([np.arctan2(x, level_x), np.arctan2(y, level_y)], axis=-1)
+        # d has length one
+        first = np.stack([level_x, -x * y / level_x, -x * z / level_x], axis=-1)
+        second = np.stack([-x * y / level_y, level_y, -y * z / level_y], axis=-1)
+        return angles, np.stack([first, second], axis=-2)
+
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the vertical in an upright sensor; with an unknown mounting, also in one that
+        hangs upside down, which shows the same tilts.
+        """
+        side = np.sin(measured)
+        rest = np.sqrt(np.maximum(1.0 - np.sum(side * side, axis=-1, keepdims=True), 0.0))
+        d = np.concatenate([side, rest], axis=-1)
+        upright = d / np.linalg.norm(d, axis=-1, keepdims=True)
+        upside_down = upright * np.array([1.0, 1.0, -1.0])
+        return (upright, upside_down) if "mounting" in self.unknown else (upright,)
+
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
+        """Return rows whose two tilts are impossible together."""
+        sentence = (
+            "has tilts of {:.6g} and {:.6g} deg, which are impossible together: elevations of two "
+            "perpendicular axes add up to at most 90 deg; check the unit"
+        )
+        is_beyond_vertical = np.any(np.abs(measured) > np.pi / 2, axis=-1)
+        return list_rows(
+            is_beyond_vertical | (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0),
+            lambda i: sentence.format(*np.rad2deg(measured[i])),
+        )
+
+
+# --- Kind `autocollimation`: two angles of a mirror on the platform against the optical axis of
+# an autocollimator.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Autocollimation(AxisKind):
+    """Angles of a mirror's normal. Residual: differences of `atan2(d_x, d_z)` and `atan2(d_y,
+    d_z)`, wrapped.
+
+    d is the normal of the mirror in the frame of the instrument. The z axis of that frame is the
+    optical axis and has the direction of the normal, towards the instrument. Angles are those of
+    the mirror. An instrument that states angles of the reflected beam states twice these values.
+
+    Setup parameters [rad]: `frame.rx` to `frame.rz`, `mirror.u` and `mirror.v`.
+
+    Parameters
+    ----------
+    normal : (3,)
+        Normal of the mirror on the platform, of any length. If the mirror is unknown, its nominal
+        value.
+    mirror : str
+        Name of the mirror; its parameters begin with it.
+    Others: see `AxisKind`; "frame" and "mirror" may be unknown.
+
+    Raises
+    ------
+    DataError
+        If the length of the normal is zero, the frame is not a pose, or `unknown` lists something
+        else.
+
+    Examples
+    --------
+    >>> from loopcal.geometry import make_pose, rotation_about_axis
+    >>> T = make_pose(rotation_about_axis(0.01, 1), np.zeros(3))
+    >>> Autocollimation().measure(T[None, None], noise=np.zeros((1, 1, 2))).round(6)
+    array([[[0.01, 0.  ]]])
+    """
+
+    normal: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    mirror: str = "mirror"
+
+    name: ClassVar[str] = "autocollimation"
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "mirror")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        set_fields(self, normal=check_direction(self.normal, "the normal of the mirror"))
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a mirror along z, and an unknown mirror in an unknown frame."""
+        return (cls(), cls(unknown=("frame", "mirror"), frame="collimator", mirror="face"))
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Two angles."""
+        return (Column("angle_x", Dimension.ANGLE), Column("angle_y", Dimension.ANGLE))
+
+    @property
+    def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
+        """Frame and mirror."""
+        return self.frame, self.T_base_frame[:3, :3], self.mirror, self.normal
+
+    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return both angles (.., 2) and their derivatives (.., 2, 3)."""
+        return predict_camera_angles(d)
+
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the normals of two angles, towards the instrument."""
+        return (convert_camera_angles(measured),)
+
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
+        """Return rows whose mirror faces away from the instrument."""
+        away = np.argwhere(np.abs(measured) >= np.pi / 2)
+        sentence = (
+            "has an angle of {:.6g} deg, at which the mirror faces away from the instrument; check "
+            "the unit"
+        )
+        return tuple((int(i), sentence.format(np.rad2deg(measured[i, j]))) for i, j in away)

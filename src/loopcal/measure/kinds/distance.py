@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `distance`: from a fixed point to points of the platform, by a wire, an interferometer or a
+ball bar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from loopcal.errors import DataError
+from loopcal.geometry import FLATNESS, solve_trilateration
+from loopcal.measure.array_checks import check_array, set_fields
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import Column, Evaluation
+from loopcal.measure.kinds.points import LengthKind, Prediction
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Distance(LengthKind):
+    """Distance to a fixed point c. Residual: `|x - c| + offset - measured`, with slope `(x - c) /
+    |x - c|`.
+
+    Setup parameters [m]: `anchor.x` to `anchor.z`, `target.x` to `target.z` of each target, and
+    `distance.offset`.
+
+    Parameters
+    ----------
+    anchor : (3,) [m]
+        The fixed point in the frame. If the anchor is unknown, its nominal value.
+    anchor_name : str
+        Name of the fixed point. Kinds that use the same name share its parameters.
+    Others: see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
+
+    Raises
+    ------
+    DataError
+        As `TargetKind`.
+
+    Examples
+    --------
+    >>> kind = Distance(anchor=np.array([0.0, 0.0, 2.0]), places=np.zeros((1, 3)))
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 1)))
+    array([[[2.]]])
+    """
+
+    anchor: FloatArray = field(default_factory=lambda: np.zeros(3))
+    anchor_name: str = "anchor"
+
+    name: ClassVar[str] = "distance"
+    per_target: ClassVar[tuple[Column, ...]] = (Column("distance", Dimension.LENGTH),)
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("anchor", "targets", "offset")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        set_fields(self, anchor=check_array(self.anchor, "the anchor", (3,)))
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known point, an unknown one with a wire of unknown zero, and two targets."""
+        far = np.array([1.5, -0.8, 1.1])
+        pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+        return (
+            cls(anchor=far),
+            cls(anchor=far, unknown=("anchor", "offset"), anchor_name="wire1"),
+            cls(targets=("a", "b"), places=pair, anchor=far, unknown=("targets", "anchor")),
+        )
+
+    @cached_property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Also the fixed point."""
+        anchor = setup.make_points_item((self.anchor_name,), self.anchor[None])
+        return {**super().possible_setup, "anchor": anchor}
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return distances (.., k, 1) and unit vectors."""
+        anchor = self.item_values(values, "anchor")
+        if anchor is None:
+            return super().predict(x - self.anchor, values)
+        distance, unit, by_item = super().predict(x - anchor[..., None, :], values)
+        return distance, unit, {**by_item, "anchor": -unit}
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the fixed point by trilateration, with the targets at their stated places.
+
+        Raises
+        ------
+        DataError
+            If all points are coplanar and the stated anchor does not say on which side it is.
+        """
+        _, _, points, distances = self.collect_points(T, measured)
+        if "anchor" not in self.unknown or len(distances) < 4 or self.is_of_base:
+            return self.nominal_values[None]
+        inside = self.to_frame(points)
+        with_offset = "offset" in self.unknown
+        solutions = [
+            solve_trilateration(inside, distances[:, 0], with_offset=flag)
+            for flag in {False, with_offset}
+        ]
+        centers, offsets = (np.concatenate(arrays) for arrays in zip(*solutions, strict=True))
+        side = self._is_on_stated_side(inside, centers)
+        return self.assemble_values({"anchor": centers[side], "offset": offsets[side, None]})
+
+    def _is_on_stated_side(self, points: FloatArray, centers: FloatArray) -> BoolArray:
+        """Return which centers (k,) are on the stated side of the plane of all points (q, 3); all
+        where the points are not coplanar.
+        """
+        middle = points.mean(axis=0)
+        _, s, axes = np.linalg.svd(points - middle, full_matrices=False)
+        if s[2] > FLATNESS * s[0] or "targets" in self.unknown:
+            return np.ones(len(centers), dtype=bool)
+        stated = (self.anchor - middle) @ axes[2]
+        if not self.anchor.any() or abs(stated) <= FLATNESS * s[0]:
+            raise DataError(
+                f"all distances to {self.anchor_name!r} were measured from points in one plane, so "
+                "it can be on either side of that plane; state an approximate 'anchor', or measure "
+                "poses off the plane"
+            )
+        return (centers - middle) @ axes[2] * stated >= 0.0
+
+
+# --- Kind `separation`: the distance between the places of a point at two poses, by a ball bar or
+# by calipers on a printed part.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Separation(LengthKind):
+    """Distance of each target between two poses. Residual: `|x_2 - x_1| + offset - measured`.
+
+    A row names two poses. The frame does not matter.
+
+    Setup parameters [m]: `target.x` to `target.z` of each target, and `separation.offset`.
+
+    Parameters
+    ----------
+    See `TargetKind`; "targets" and "offset" (the zero of the calipers, the width of a printed
+    line) may be unknown.
+
+    Examples
+    --------
+    >>> kind = Separation(places=np.zeros((1, 3)))
+    >>> T = np.tile(np.eye(4), (1, 1, 2, 1, 1))
+    >>> T[0, 0, 1, :3, 3] = 3.0, 4.0, 0.0
+    >>> kind.measure(T, noise=np.zeros((1, 1, 1)))
+    array([[[5.]]])
+    """
+
+    name: ClassVar[str] = "separation"
+    poses_per_row: ClassVar[int] = 2
+    description: ClassVar[str] = (
+        "distances between two poses (ball bar; calipers on a printed part)"
+    )
+    per_target: ClassVar[tuple[Column, ...]] = (Column("separation", Dimension.LENGTH),)
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("targets", "offset")
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return the tool's point, and an unknown point with an unknown zero."""
+        return (cls(), cls(targets=("nozzle",), unknown=("targets", "offset")))
+
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
+        x, rows = self.locate_targets(T, values[..., None, :])
+        predicted, unit, by_item = self.predict(x[..., 1, :, :] - x[..., 0, :, :], values)
+        by_pose = unit[..., None, :, :, :] @ rows * np.array([-1.0, 1.0])[:, None, None, None]
+        total = np.sum(by_pose, axis=-4) + self.join_columns(by_item, predicted.shape)
+        evaluation = self.split_columns(predicted[..., 0], total[..., 0, :])
+        return evaluation._replace(jacobian=by_pose[..., 0, :6])

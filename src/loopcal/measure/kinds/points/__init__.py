@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Kinds that measure points of the platform: positions, angles, distances."""

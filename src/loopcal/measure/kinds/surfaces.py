@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Base of the kinds that touch a surface with points of the platform.
+
+The columns are gaps between point and surface. A gap is 0 where a probe just touches, after
+correction for its ball and its deflection. Rows of one group share the parameters of the surface.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import DataError
+from loopcal.geometry import solve_least_squares, solve_trilateration
+from loopcal.measure.array_checks import check_array, check_direction, set_fields
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import Column
+from loopcal.measure.kinds.points import Prediction, TargetKind, measure_lengths
+from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension, Length
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class SurfaceKind(TargetKind):
+    """A kind that touches a surface, which is stated by a point and a direction.
+
+    Parameters
+    ----------
+    through : (3,) [m]
+        A point of the surface (of a sphere: its center) in the frame. If the surface is unknown,
+        its nominal value.
+    along : (3,)
+        Normal of a plane or direction of a line, in the frame; of any length.
+    surface : str
+        Name of the surface; its parameters begin with it. A plane and a line with the same name,
+        point and direction share `u` and `v`: the line is perpendicular to the plane.
+    Others: see `TargetKind`; "frame", "surface" and "targets" (the offsets of the probe) may be
+    unknown. Faces of a body with known dimensions, such as a datum cube, are known surfaces in one
+    unknown frame.
+
+    Raises
+    ------
+    DataError
+        As `TargetKind`, and if the length of a direction is zero.
+    """
+
+    through: FloatArray = field(default_factory=lambda: np.zeros(3))
+    along: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    surface: str = "surface"
+
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "surface", "targets")
+    changes_with_pose: ClassVar[bool] = False
+    measures_points: ClassVar[bool] = False
+    length_error: ClassVar[str] = "gap"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        through = check_array(self.through, "the point of the surface", (3,))
+        along = check_direction(self.along, "the direction of the surface")
+        set_fields(self, through=through, along=along)
+
+    @property
+    @abstractmethod
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters of the surface; rows of one group share them."""
+
+    @cached_property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Also the surface."""
+        stated = {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
+        return {
+            **super().possible_setup,
+            "surface": setup.SetupItem(self.surface_parameters, stated),
+        }
+
+    def make_parameters(
+        self, names: tuple[str, ...], dimension: Dimension, nominal: FloatArray | None = None
+    ) -> tuple[Parameter, ...]:
+        """Return parameters of the surface with these names."""
+        return setup.make_parameters(self.surface, names, dimension, nominal, "group")
+
+    def collect_contacts(
+        self, T: FloatArray, measured: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return points (q, 3) in the frame, for targets at their stated places, and gaps."""
+        _, _, points, gaps = self.collect_points(T, measured)
+        return self.to_frame(points), gaps
+
+
+# --- Kind `plane`: points of the platform on a plane, such as a probed bed or plate.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Plane(SurfaceKind):
+    """Points on a plane with normal n. Residual: `n'(x - through) - height - gap`.
+
+    An unknown plane has three parameters for each group of rows: two rotations u, v of the normal
+    and the height above the stated point.
+
+    Setup parameters: `plane.u`, `plane.v` [rad] and `plane.height` [m], and `target.x` to
+    `target.z` [m] of each target.
+
+    Parameters
+    ----------
+    See `SurfaceKind`.
+
+    Examples
+    --------
+    >>> kind = Plane(surface="bed", unknown=("surface",), places=np.zeros((1, 3)))
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['bed.u', 'bed.v', 'bed.height']
+    >>> height = np.array([[[0.0, 0.0, 0.002]]])
+    >>> kind.evaluate(np.eye(4)[None, None], np.zeros((1, 1, 1)), height).residual
+    array([[[-0.002]]])
+    """
+
+    surface: str = "plane"
+
+    name: ClassVar[str] = "plane"
+    per_target: ClassVar[tuple[Column, ...]] = (Column("gap", Dimension.LENGTH),)
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known plane, and an unknown one probed with an unknown offset."""
+        return (
+            cls(),
+            cls(
+                unknown=("surface", "targets"),
+                targets=("probe",),
+                along=np.array([0.6, 0.0, 0.8]),
+                surface="bed",
+            ),
+        )
+
+    @property
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """Two rotations and a height."""
+        return self.make_parameters(("u", "v"), Dimension.ANGLE) + self.make_parameters(
+            ("height",), Dimension.LENGTH
+        )
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return heights (.., k, 1) above the plane."""
+        surface = self.item_values(values, "surface")
+        lever = x - self.through
+        if surface is None:
+            return lever @ self.along[:, None], self.along[None], {}
+        normal = setup.place_direction(self.along, surface[..., :2])[..., None, None, :]
+        by_rotation = (
+            lever[..., None, :]
+            @ setup.linearize_direction(self.along, surface[..., :2])[..., None, :, :]
+        )
+        height = (normal @ lever[..., None])[..., 0] - surface[..., None, 2:]
+        by_surface = np.concatenate([by_rotation, -np.ones_like(by_rotation[..., :1])], axis=-1)
+        return height, normal, {"surface": by_surface}
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the planes of least scatter, and, where the gaps differ, the one that the gaps
+        determine.
+        """
+        x, gaps = self.collect_contacts(T, measured)
+        if "surface" not in self.unknown or len(x) < 3:
+            return self.nominal_values[None]
+        middle = x.mean(axis=0)
+        normals = [np.linalg.svd(x - middle, full_matrices=False)[2][2]]
+        gradient = solve_least_squares(x - middle, gaps[:, 0] - gaps.mean())
+        if np.linalg.norm(gradient) > 0.1:
+            normals.append(gradient / np.linalg.norm(gradient))
+        n = np.array([normal if normal @ self.along >= 0.0 else -normal for normal in normals])
+        height = n @ (middle - self.through) - gaps.mean()
+        values = np.concatenate([setup.encode_direction(self.along, n), height[:, None]], axis=-1)
+        return self.assemble_values({"surface": values})
+
+
+# --- Kind `line`: points of the platform on a straight line, such as a ruler, an edge or a beam.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Line(SurfaceKind):
+    """Points on a line. Residual: `B'R'(x - through) - shift - gap`, with B two unit vectors
+    perpendicular to the stated direction.
+
+    R rotates the stated direction to the true one. An unknown line has four parameters for each
+    group of rows: two rotations u, v and two shifts a, b along the rotated B.
+
+    Setup parameters: `line.u`, `line.v` [rad], `line.a` and `line.b` [m], and `target.x` to
+    `target.z` [m] of each target.
+
+    Parameters
+    ----------
+    See `SurfaceKind`.
+
+    Examples
+    --------
+    >>> kind = Line(surface="ruler", unknown=("surface",))
+    >>> [column.name for column in kind.columns]
+    ['gap_a', 'gap_b']
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['ruler.u', 'ruler.v', 'ruler.a', 'ruler.b']
+    """
+
+    surface: str = "line"
+
+    name: ClassVar[str] = "line"
+    mixes_components: ClassVar[bool] = True
+    per_target: ClassVar[tuple[Column, ...]] = (
+        Column("gap_a", Dimension.LENGTH),
+        Column("gap_b", Dimension.LENGTH),
+    )
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known line, and an unknown one."""
+        return (cls(), cls(unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"))
+
+    @property
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """Two rotations and two shifts."""
+        return self.make_parameters(("u", "v"), Dimension.ANGLE) + self.make_parameters(
+            ("a", "b"), Dimension.LENGTH
+        )
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return distances (.., k, 2) from the line along B."""
+        surface = self.item_values(values, "surface")
+        B, lever = setup.make_perpendicular_basis(self.along), x - self.through
+        if surface is None:
+            return lever @ B, B.T, {}
+        R, S = setup.rotate_basis(self.along, surface[..., :2])
+        rows = np.swapaxes(R @ B, -1, -2)[..., None, :, :]
+        # d (R b)'x = (w x R b)'x = (R b)'(x x w)
+        by_rotation = rows @ geometry.hat(lever) @ S[..., None, :, :]
+        by_shift = np.broadcast_to(-np.eye(2), (*by_rotation.shape[:-1], 2))
+        gaps = (rows @ lever[..., None])[..., 0] - surface[..., None, 2:]
+        return gaps, rows, {"surface": np.concatenate([by_rotation, by_shift], axis=-1)}
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the line of largest scatter of the points."""
+        x, gaps = self.collect_contacts(T, measured)
+        if "surface" not in self.unknown or len(x) < 2:
+            return self.nominal_values[None]
+        middle = x.mean(axis=0)
+        direction = np.linalg.svd(x - middle, full_matrices=False)[2][0]
+        rotations = setup.encode_direction(
+            self.along, direction if direction @ self.along >= 0.0 else -direction
+        )
+        R, _ = setup.rotate_basis(self.along, rotations)
+        across = R @ setup.make_perpendicular_basis(self.along)
+        shifts = (middle - self.through) @ across - gaps.mean(axis=0)
+        return self.assemble_values({"surface": np.concatenate([rotations, shifts])})
+
+
+# --- Kind `sphere`: points of the platform on a sphere, such as a probed master ball.
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Sphere(SurfaceKind):
+    """Points on a sphere about c. Residual: `|x - c| - radius - gap`.
+
+    An unknown sphere has four parameters for each group of rows: its center and its radius, which
+    includes that of the probe.
+
+    Setup parameters [m]: `sphere.x` to `sphere.z` and `sphere.radius`, and `target.x` to
+    `target.z` of each target.
+
+    Parameters
+    ----------
+    radius : float [m]
+        Sum of the radii of ball and probe. If the surface is unknown, its nominal value.
+    Others: see `SurfaceKind`; `through` is the center, and `along` does not matter.
+
+    Raises
+    ------
+    DataError
+        As `SurfaceKind`, and if the radius is not above zero.
+
+    Examples
+    --------
+    >>> kind = Sphere(through=np.array([0.0, 0.0, 0.5]), radius=0.1, places=np.zeros((1, 3)))
+    >>> kind.evaluate(np.eye(4)[None, None], np.zeros((1, 1, 1))).residual
+    array([[[0.4]]])
+    """
+
+    surface: str = "sphere"
+    radius: Length = 0.0125
+
+    name: ClassVar[str] = "sphere"
+    per_target: ClassVar[tuple[Column, ...]] = (Column("gap", Dimension.LENGTH),)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.radius > 0.0:
+            raise DataError(f"the radius of a sphere is {self.radius} m; give a length above 0")
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known sphere, and an unknown one."""
+        far = np.array([1.5, -0.8, 1.1])
+        return (cls(through=far), cls(unknown=("surface",), through=far, surface="ball"))
+
+    @property
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """Center and radius."""
+        nominal = np.array([*self.through, self.radius])
+        return self.make_parameters(("x", "y", "z", "radius"), Dimension.LENGTH, nominal)
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return distances (.., k, 1) from the sphere."""
+        surface = self.item_values(values, "surface")
+        if surface is None:
+            distance, unit = measure_lengths(x - self.through)
+            return distance - self.radius, unit[..., None, :], {}
+        distance, unit = measure_lengths(x - surface[..., None, :3])
+        unit = unit[..., None, :]
+        by_surface = -np.concatenate([unit, np.ones_like(unit[..., :1])], axis=-1)
+        return distance - surface[..., None, 3:], unit, {"surface": by_surface}
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return center and radius by trilateration: a distance from the center is a gap plus the
+        radius, which is a common offset.
+        """
+        x, gaps = self.collect_contacts(T, measured)
+        if "surface" not in self.unknown or len(x) < 4:
+            return self.nominal_values[None]
+        centers, offsets = solve_trilateration(x, gaps[:, 0], with_offset=True)
+        values = np.concatenate([centers, -offsets[:, None]], axis=-1)
+        return self.assemble_values({"surface": values})

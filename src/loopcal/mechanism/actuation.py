@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Driven joints: what parameter values and readings make of a robot before its loops are closed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.engine import Program, State
+from loopcal.mechanism.limb_rows import (
+    linearize_limbs,
+    name_passive_joints,
+    solve_passive_motion,
+    stack_driven_columns,
+    stack_platform_rows,
+)
+from loopcal.mechanism.model import Mechanism, ParameterUnits
+from loopcal.mechanism.states import driven_values
+from loopcal.mechanism.transmission import (
+    apply_weights,
+    differentiate_sums,
+    evaluate_sums,
+    invert_weights,
+    joint_slopes,
+    joints_from_readings,
+    readings_from_joints,
+    select_weights,
+)
+from loopcal.typing import FloatArray
+
+
+class DrivenJoints(NamedTuple):
+    """What values and readings make of a robot of one stage.
+
+    e : (t | 1, n_displacements) [m, rad]. tau : (t | 1, a, k) transmission terms.
+    joints : (t | 1, n, n_joints) values of the driven joints [m, rad].
+    """
+
+    e: FloatArray
+    tau: FloatArray
+    joints: FloatArray
+
+
+def drive_joints(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenJoints:
+    """Return displacements and driven joints for values (t | 1, p) and readings q (t | 1, n, a)."""
+    e, tau = robot.slots(values)
+    with np.errstate(invalid="ignore"):
+        # an infinite reading turns into NaN, and the engine marks its row
+        return DrivenJoints(e, tau, joints_from_readings(q, tau, robot.slots.frequency))
+
+
+class DrivenSums(NamedTuple):
+    """What values and readings make of a robot whose readings are fewer sums than its joints.
+
+    e : (t | 1, n_displacements) [m, rad]. sums : (t | 1, n, a) of joint values [m, rad].
+    weights : (t | 1, a, n_joints) of the joints in the sums.
+    """
+
+    e: FloatArray
+    sums: FloatArray
+    weights: FloatArray
+
+
+def drive_sums(robot: Mechanism, values: FloatArray, q: FloatArray) -> DrivenSums:
+    """Return displacements and sums for values (t | 1, p) and readings q (t | 1, n, a)."""
+    e, tau = robot.slots(values)
+    weights = select_weights(tau)
+    assert weights is not None
+    with np.errstate(invalid="ignore"):  # as in `drive_joints`
+        return DrivenSums(e, evaluate_sums(q, tau, robot.slots.frequency), weights)
+
+
+# --- Redundant actuation with a prescribed pose: readings and passive joints follow limb by limb.
+
+
+class PoseDrivenSensitivity(NamedTuple):
+    """Derivatives by parameters (.., p) at constant pose, and by the platform's freedoms (.., m).
+
+    Attributes
+    ----------
+    names : of the j passive joints.
+    readings : (t, n, a, p) and (t, n, a, m). passive : (t, n, j, p) and (t, n, j, m).
+    """
+
+    names: tuple[str, ...]
+    readings: tuple[FloatArray, FloatArray]
+    passive: tuple[FloatArray, FloatArray]
+
+
+def solve_at_pose(
+    robot: Mechanism, values: FloatArray, T: FloatArray, begin: State
+) -> tuple[State, FloatArray]:
+    """Close every limb with the platform at T (t, n, 4, 4); return states and readings (t, n, a).
+
+    Parameters
+    ----------
+    values : (t | 1, p). begin : (t, n), whose joints select the branch of each limb.
+    """
+    e, tau = robot.slots(values)
+    guess, limbs = driven_values(robot.program, begin), robot.program.with_fixed_platform
+    state = engine.solve(limbs, e, guess, replace(begin, T=T), free=True)
+    joints = driven_values(robot.program, state)
+    return state, readings_from_joints(joints, tau, robot.slots.frequency)
+
+
+def differentiate_at_pose(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> PoseDrivenSensitivity:
+    """Differentiate readings and passive joints of redundant actuators at states (t, n).
+
+    With summed drives the derivatives are those of the driven joints in place of readings.
+
+    Parameters
+    ----------
+    values : (t | 1, p). q : (t | 1, n, a) readings that close every limb; not used for sums.
+    """
+    t, n = state.T.shape[:2]
+    names = name_passive_joints(robot)
+    a, p, m = robot.program.n_joints, len(robot.parameters), len(robot.freedoms)
+    readings, passive = np.zeros((t, n, a, p + m)), np.zeros((t, n, len(names), p + m))
+    for rows, limbs in linearize_limbs(robot, values, q, state):
+        for limb in limbs.rows(limbs.blocks.closure):
+            both = np.concatenate([np.zeros((*limb.A.shape[:2], p)), limb.A[:, :, 0]], axis=-1)
+            both[..., :p][..., limb.parameters] += limb.by_parameter[:, :, 0]
+            with np.errstate(all="ignore"):
+                by_pose = -(both / limb.by_reading[:, :, 0])
+            readings[rows][:, :, limb.readings] = by_pose[:, :, None]
+        for places, U, limb in limbs.passive_joints(names):
+            moved = np.matmul(limb.by_reading, readings[rows][:, :, limb.readings])
+            moved[..., p:] += limb.A
+            moved[..., :p][..., limb.parameters] += limb.by_parameter
+            passive[rows][:, :, places] = solve_passive_motion(U, moved)
+        for place, column, by_values in limbs.turned_joints(names):
+            slope = limbs.joints_by_reading[:, :, column, None]
+            passive[rows][:, :, place] = slope * readings[rows][:, :, column]
+            passive[rows][:, :, place, :p] += by_values
+    return PoseDrivenSensitivity(
+        names, (readings[..., :p], readings[..., p:]), (passive[..., :p], passive[..., p:])
+    )
+
+
+# --- Summed drives: s(q) = W l, with l the values of the driven joints.
+
+ITERATIONS = 25
+"""Newton steps of a pose; those within reach need fewer than ten."""
+
+
+class Motion(NamedTuple):
+    """Derivatives by parameters (t, n, .., p) and by readings (t, n, .., a)."""
+
+    parameters: FloatArray
+    readings: FloatArray
+
+
+def solve_open_sums(
+    program: Program,
+    e: FloatArray,
+    weights: FloatArray,
+    sums: FloatArray,
+    begin: State,
+    max_iterations: int = ITERATIONS,
+) -> State:
+    """Return the states (t, n) at which the weighted sums of driven joints are given.
+
+    Parameters
+    ----------
+    e : (t | 1, d) displacements. weights : (t | 1, a, J). sums : (t | 1, n, a).
+    begin : (t | 1, n | 1) where Newton's method begins.
+    """
+    t = max(len(e), len(weights), len(sums), begin.T.shape[0])
+    n = max(sums.shape[1], begin.T.shape[1])
+    wanted = np.broadcast_to(sums, (t, n, sums.shape[2]))
+    units = _find_row_units(program, weights)
+
+    def compare(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        trial, pose = np.divmod(rows, n)
+        own = e if len(e) == 1 else e[trial]
+        start = begin.select((t, n), trial, pose)
+        platform = np.broadcast_to(np.eye(4), (len(rows), 1, 4, 4)).copy()
+        platform[:, 0, :3] = T
+        start = replace(start, T=platform)
+        guess = program.list_drives(start.joints)
+        closed = engine.solve(program.with_fixed_platform, own, guess, start, free=True)
+        W = weights if len(weights) == 1 else weights[trial]
+        lengths = program.list_drives(closed.joints)
+        residual = apply_weights(W, lengths)[:, 0] - wanted[trial, pose]
+        slopes = np.zeros((len(rows), residual.shape[1], 6))
+        by_freedoms = differentiate_lengths(program, own, replace(closed, T=platform))
+        slopes[..., list(program.freedoms)] = np.matmul(W, by_freedoms[:, 0])
+        return residual * units, slopes * units[:, None]
+
+    guess = np.broadcast_to(program.list_drives(begin.joints), (t, n, program.n_joints))
+    return engine.solve(program, e, guess, begin, compare, True, max_iterations)
+
+
+def differentiate_lengths(program: Program, e: FloatArray, state: State) -> FloatArray:
+    """Return the derivatives (t, n, J, m) of the driven joints by the platform's freedoms.
+
+    Each limb has one driven joint and one closure equation: dl = -A dy / Q.
+    """
+    blocks = engine.linearize(program, e, program.list_drives(state.joints), state)
+    A, Q = stack_platform_rows(blocks), stack_driven_columns(program, blocks)
+    columns = np.concatenate([g.actuator[g.actuator[:, 0] >= 0][0] for g in program.groups])
+    out = np.empty_like(A)
+    with np.errstate(all="ignore"):
+        out[:, :, columns] = -A / Q.sum(axis=-1, keepdims=True)
+    return out
+
+
+def differentiate_open_sums(
+    robot: Mechanism,
+    values: FloatArray,
+    q: FloatArray,
+    state: State,
+    columns: ParameterUnits | None = None,
+) -> Motion:
+    """Return the derivatives of the twist of the platform, (t, n, 6, p) and (t, n, 6, a).
+
+    columns : the parameters and their units; all parameters in SI without it.
+    """
+    chosen = robot.all_parameters if columns is None else columns
+    at_pose = differentiate_at_pose(robot, values, q, state).readings
+    by_parameters = at_pose[0][..., chosen.places] * chosen.units
+    weights, moved = _differentiate_sums(robot, values, q, state)
+    moved = Motion(moved.parameters[..., chosen.places] * chosen.units, moved.readings)
+    inverse = invert_weights(np.matmul(weights, at_pose[1]))
+    own = moved.parameters - np.matmul(weights, by_parameters)
+    shape, freedoms = state.T.shape[:2], list(robot.program.freedoms)
+    out = []
+    for right in (own, moved.readings):
+        twist = np.zeros((*shape, 6, right.shape[-1]))
+        twist[:, :, freedoms] = np.matmul(inverse, right)
+        out.append(twist)
+    return Motion(*out)
+
+
+def differentiate_driven_joints(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State, platform: Motion
+) -> Motion:
+    """Return the derivatives of the driven joints, (t, n, J, p) and (t, n, J, a).
+
+    platform : those of its twist, by all parameters in SI and by readings.
+    """
+    if robot.has_open_sums:
+        by_parameters, by_pose = differentiate_at_pose(robot, values, q, state).readings
+        freedoms = list(robot.program.freedoms)
+        follow = (np.matmul(by_pose, part[:, :, freedoms]) for part in platform)
+        moved, driven = follow
+        return Motion(moved + by_parameters, driven)
+    weights, moved = _differentiate_sums(robot, values, q, state)
+    inverse = invert_weights(weights)
+    return Motion(*(np.matmul(inverse, part) for part in moved))
+
+
+def differentiate_joints_by_readings(
+    robot: Mechanism, values: FloatArray, q: FloatArray
+) -> FloatArray:
+    """Return d joint / d reading (t | 1, n | 1, J, a) of as many readings as joints."""
+    _, tau = robot.slots(values)
+    weights = select_weights(tau)
+    assert weights is not None
+    slopes = joint_slopes(q, tau, robot.slots.frequency)
+    return invert_weights(weights)[:, None] * slopes[:, :, None]
+
+
+def _differentiate_sums(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[FloatArray, Motion]:
+    """Return the weights (t | 1, 1, a, J), and the derivatives of s - W l at constant lengths l."""
+    slots = robot.slots
+    _, tau = slots(values)
+    weights = select_weights(tau)
+    assert weights is not None
+    lengths = driven_values(robot.program, state)
+    by_terms = differentiate_sums(q, tau, slots.frequency, lengths)
+    of_terms = slots.jacobian(values)[:, slots.n_displacements :]
+    of_terms = of_terms.reshape(len(of_terms), *slots.terms.shape, -1)
+    by_parameters = np.moveaxis(np.matmul(np.moveaxis(by_terms, 2, 1), of_terms), 1, 2)
+    slopes = joint_slopes(q, tau, slots.frequency)
+    by_readings = slopes[..., None] * np.eye(slopes.shape[-1])
+    return weights[:, None], Motion(by_parameters, by_readings)
+
+
+def _find_row_units(program: Program, weights: FloatArray) -> FloatArray:
+    """Return what turns sums (a,) into lengths [m]: 1, or of angles the size of the robot."""
+    turns = np.zeros(program.n_joints, dtype=bool)
+    for group in program.groups:
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0:
+                turns[columns] = group.joints[j : j + 1] == "R"
+    is_angle = (weights[0] != 0.0)[:, turns].any(axis=1)
+    return np.where(is_angle, program.size, 1.0)

@@ -1,0 +1,677 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compilation of an assembly: groups of limbs, places of displacements, home position, mobility."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.engine import Group, Program, Slot, State
+from loopcal.errors import MechanismError
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings.wording import name_count
+from loopcal.mechanism.assembly import (
+    AXES,
+    BASE,
+    Address,
+    Assembly,
+    AttachedStage,
+    Limb,
+    select_rows,
+)
+from loopcal.mechanism.chains import (
+    ChainState,
+    PoseDerivative,
+    differentiate_end,
+    find_carrying_actuators,
+    join_stage_states,
+    solve_serial,
+)
+from loopcal.mechanism.kinematics import compute_closure_sign, forward_trials, inverse_trials
+from loopcal.mechanism.mobility import (
+    check_assembly,
+    check_mobility,
+    count_rank,
+    find_idle_joints,
+    refuse_singular_home,
+    refuse_uncontrolled,
+)
+from loopcal.mechanism.model import Mechanism, SlotMap, Stage
+from loopcal.mechanism.over_constraint import report_over_constraint
+from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.states import driven_values, is_closed, make_start
+from loopcal.mechanism.transmission import (
+    ALL_TERMS,
+    harmonic_frequencies,
+    name_terms,
+    nominal_terms,
+    readings_from_joints,
+)
+from loopcal.parameters import ParameterTable
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import DISPLAY_UNITS, LARGEST, SI_SYMBOLS, Dimension
+
+# --- Values of parameters that a machine can have: one rule for every family.
+
+
+def find_impossible_values(
+    robot: Mechanism, values: FloatArray
+) -> tuple[tuple[str | None, Finding], ...]:
+    """Return (parameter, finding) for values (p,) [SI] that no machine of this structure has.
+
+    The parameter is None where single values are possible, but the loops cannot be closed.
+    """
+    findings = tuple(_find_single_values(robot, values))
+    if findings:
+        return findings
+    state = _close_with_values(robot, values[None])
+    if is_closed(state.status).all():
+        return ()
+    deviation = np.abs(values - robot.parameters.nominal)
+    largest = int(np.argmax(deviation))
+    unit = robot.get_unit(robot.parameters.dimensions[largest])
+    gap = float(state.residual[0, 0])
+    finding = report_finding(
+        "mechanism.values-open-loops",
+        gap=Quantity(gap * 1e3, "mm") if np.isfinite(gap) else None,
+        name=robot.parameters.names[largest],
+        value=Quantity(float(values[largest]) / unit.factor_to_si, unit.symbol),
+        nominal=robot.to_quantity(
+            float(robot.parameters.nominal[largest]), robot.parameters.dimensions[largest]
+        ),
+    )
+    return ((None, finding),)
+
+
+def _close_with_values(robot: Mechanism, values: FloatArray) -> State:
+    """Return the state at the readings of the nominal home; of redundant actuators, at its pose.
+
+    Errors of the geometry make redundant readings contradict each other.
+    """
+    if robot.program.sigma is not None:
+        target = read_coordinates(robot.home_state.T, robot.controlled)
+        return inverse_trials(robot, values, target)
+    # nominal values displace nothing
+    joints, slots = driven_values(robot.program, robot.home_state), robot.slots
+    q = readings_from_joints(joints, slots.terms[None], slots.frequency)
+    return forward_trials(robot, values, q)
+
+
+def check_nominal_values(table: ParameterTable) -> None:
+    """Refuse nominal values that no machine has; raises MechanismError."""
+    for p in table.entries:
+        if not abs(p.nominal) <= LARGEST:
+            symbol = SI_SYMBOLS[p.dimension]
+            raise MechanismError(
+                f"the nominal value of {p.name} is {p.nominal:g} {symbol}; it must not be beyond "
+                f"{LARGEST:g} {symbol}"
+            )
+
+
+def _find_single_values(robot: Mechanism, values: FloatArray) -> Iterator[tuple[str, Finding]]:
+    """Yield parameters whose own value is impossible."""
+    table = robot.parameters
+    is_large = ~(np.abs(values) <= LARGEST)
+    for i in np.flatnonzero(is_large | (table.positive & ~(values > 0.0))):
+        p, value = table.entries[i], float(values[i])
+        number = robot.to_quantity(value, p.dimension)
+        if is_large[i]:
+            limit = robot.to_quantity(LARGEST, p.dimension)
+            yield (
+                p.name,
+                report_finding("mechanism.value-too-large", name=p.name, value=number, limit=limit),
+            )
+        else:
+            nominal = robot.to_quantity(p.nominal, p.dimension)
+            yield (
+                p.name,
+                report_finding(
+                    "mechanism.value-not-positive", name=p.name, value=number, nominal=nominal
+                ),
+            )
+
+
+DEFAULT_SIZE = 1.0
+"""Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one)."""
+POINT = 1e-9
+"""Ratio of size and longest link below which all limbs begin and end in one point."""
+
+
+def build(
+    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
+) -> Mechanism:
+    """Compile a mechanism for the engine and find its home position.
+
+    Parameters
+    ----------
+    assembly : as returned by the `expand` method of a family.
+    units : display units of the file. record : the family record, kept for writing the file.
+
+    Returns
+    -------
+    Mechanism at its nominal values.
+
+    Raises
+    ------
+    MechanismError
+        Duplicate or unknown names, loops that cannot be closed at home, wrong mobility (names the
+        freedoms that are too many or too few), coordinates that cannot be controlled.
+    """
+    check_assembly(assembly)
+    if assembly.stages:
+        return build_chain(assembly, units or {}, record, _build_stage, differentiate_pose)
+    return _compile(assembly, units, record)
+
+
+def _build_stage(stage: AttachedStage) -> Mechanism:
+    """Compile a stage of a chain; raises MechanismError."""
+    check_assembly(stage.assembly, is_stage=True)
+    return _compile(stage.assembly)
+
+
+def _compile(
+    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
+) -> Mechanism:
+    """Compile a checked mechanism of one stage; see `build`."""
+    robot = _close_at_home(assembly, units, record)
+    is_placed = robot.is_serial and not robot.controlled
+    return robot if is_placed else report_over_constraint(robot, _close_at_home)
+
+
+def _close_at_home(
+    assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None
+) -> Mechanism:
+    """Return a mechanism of one stage with its loops closed at home, and its mobility checked."""
+    table = ParameterTable(assembly.parameters, assembly.common_errors)
+    check_nominal_values(table)
+    slots = _find_slots(assembly)
+    freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
+    size, a = compute_characteristic_length(assembly), len(assembly.driven_joints)
+    groups, places, count = _group_limbs(assembly, slots, {})
+    guess = _make_first_guess(assembly, groups)
+    idle = find_idle_joints(Program(groups, freedoms, size, count, a), guess)
+    _check_drives(assembly, idle)
+    if idle:
+        groups, places, count = _group_limbs(assembly, slots, idle)
+        guess = _make_first_guess(assembly, groups)
+    _check_sums(assembly, groups, freedoms)
+    weights = _weigh_actuators(assembly, groups, freedoms)
+    robot = Mechanism(
+        assembly,
+        table,
+        table.nominal,
+        Program(groups, freedoms, size, count, a, weights),
+        _map_slots(assembly, table, places, count),
+        size,
+        guess,
+        {d: unit.symbol for d, unit in DISPLAY_UNITS.items()} | dict(units or {}),
+        tuple(_report_locked(assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]),
+        record,
+    )
+    if robot.is_serial and not robot.controlled:
+        return replace(robot, home_state=_place_at_start(robot))
+    robot = replace(robot, home_state=_find_home(robot))
+    check_mobility(robot)
+    return robot
+
+
+def compute_characteristic_length(assembly: Assembly) -> float:
+    """Return the root mean square distance [m] between base points, platform points and each other.
+
+    Base points are those where limbs leave the base, platform points those where they end. If all
+    coincide, the result is the root mean square of links and rods; DEFAULT_SIZE if every length is
+    zero.
+    """
+    home = assembly.home
+    gaps = [
+        (home @ limb.attachment.transform)[:3, 3] - limb.links[0].transform[:3, 3]
+        for limb in assembly.limbs
+    ]
+    reach = [limb.attachment.transform[:3, 3] for limb in assembly.limbs]
+    feet = [limb.links[0].transform[:3, 3] for limb in assembly.limbs]
+    spread = np.concatenate([gaps, reach, np.subtract(feet, np.mean(feet, axis=0))])
+    size = float(np.sqrt((spread**2).sum() / len(gaps)))
+    ends = [
+        link.transform[:3, 3] for limb in assembly.limbs for link in (*limb.links, limb.attachment)
+    ]
+    lengths = [*np.linalg.norm(ends, axis=1), *(limb.length for limb in assembly.limbs)]
+    if size > POINT * max(lengths):
+        return size
+    return float(np.sqrt(np.mean(np.square(lengths)))) or DEFAULT_SIZE
+
+
+def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
+    """Return the slots of the addresses that parameters change, limb by limb.
+
+    Refuses maps onto addresses that the mechanism does not have.
+    """
+    limbs = {limb.name: limb for limb in assembly.limbs}
+    actuators, terms = {a.name for a in assembly.actuators}, name_terms(assembly.actuators)
+    slots: dict[str, dict[Address, Slot]] = {name: {} for name in limbs}
+    addresses = dict.fromkeys(m.address for m in assembly.maps)
+    addresses |= dict.fromkeys(a for s in assembly.shared for a in s.outputs)
+    unknown = []
+    for address in addresses:
+        is_term = address.element == "transmission" and address.axis in terms
+        if is_term and address.owner in actuators:
+            continue
+        slot = _find_slot(limbs[address.owner], address) if address.owner in limbs else None
+        if slot is None:
+            unknown.append(str(address))
+        else:
+            slots[address.owner][address] = slot
+    if unknown:
+        raise MechanismError(
+            f"a parameter is mapped onto {min(unknown)}, which this mechanism does not have; "
+            "correct the map"
+        )
+    return slots
+
+
+def _find_slot(limb: Limb, address: Address) -> Slot | None:
+    """Return the slot of an address in a limb, None if the limb does not have it."""
+    joints = [j.name for j in limb.joints]
+    if address.axis == "length":
+        is_rod = limb.ending == "distance" and address.element == "rod"
+        return Slot(len(joints), engine.LENGTH) if is_rod else None
+    if address.axis == "pitch":
+        turning = [j.name if j.kind == "R" else None for j in limb.joints]
+        is_screw = address.element in turning
+        return Slot(turning.index(address.element), engine.PITCH) if is_screw else None
+    links = [*(link.name for link in limb.links), limb.attachment.name]
+    if address.element not in links or address.axis not in AXES:
+        return None
+    return Slot(links.index(address.element), AXES.index(address.axis))
+
+
+def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> None:
+    """Refuse a limb whose drive moves nothing but the limb itself."""
+    for i, limb in enumerate(assembly.limbs):
+        joints = len(limb.joints) + bool(limb.actuator) - len(idle.get(i, ()))
+        equations = len(select_rows(limb.ending, assembly.freedoms))
+        if limb.drives and joints > equations:
+            excess = name_count(joints - equations, "joint")
+            raise MechanismError(
+                f"limb {limb.name!r} has {joints} joints, but {equations} closure equations: its "
+                f"drive moves the limb and not the platform; leave out {excess}, "
+                "or let their axes spin the limb only"
+            )
+
+
+def _group_limbs(
+    assembly: Assembly,
+    slots_by_limb: Mapping[str, Mapping[Address, Slot]],
+    locked: Mapping[int, tuple[int, ...]],
+) -> tuple[tuple[Group, ...], dict[Address, int], int]:
+    """Group limbs of one structure and of the same locked joints; place displacements in e.
+
+    Returns the groups, the place of each address and the length of e.
+    """
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    for i, limb in enumerate(assembly.limbs):
+        structure = tuple((j.kind, bool(j.actuator)) for j in limb.joints), bool(limb.actuator)
+        alike.setdefault((limb.ending, structure, locked.get(i, ())), []).append(i)
+    groups, places, count = [], {}, 0
+    for members in alike.values():
+        limbs, fixed = [assembly.limbs[i] for i in members], locked.get(members[0], ())
+        kinds, ending = "".join(j.kind for j in limbs[0].joints), limbs[0].ending
+        used = {slot for m in limbs for slot in slots_by_limb[m.name].values()}
+        slots = tuple(sorted(used, key=lambda s: (s.element, s.axis)))
+        column = {slot: i for i, slot in enumerate(slots)}
+        first = count
+        for m in limbs:
+            places |= {a: count + column[slot] for a, slot in slots_by_limb[m.name].items()}
+            count += len(slots)
+        transforms = [[link.transform for link in (*m.links, m.attachment)] for m in limbs]
+        pitch = np.array([[j.pitch for j in m.joints] for m in limbs])
+        groups.append(
+            Group(
+                tuple(members),
+                kinds,
+                _number_actuators(assembly, limbs),
+                tuple(j in fixed for j in range(len(kinds))),
+                ending,
+                select_rows(ending, assembly.freedoms),
+                np.array(transforms),
+                pitch.reshape(len(limbs), len(kinds)),
+                np.array([m.length for m in limbs]),
+                slots,
+                slice(first, count),
+            )
+        )
+    return tuple(groups), places, count
+
+
+def _number_actuators(assembly: Assembly, limbs: list[Limb]) -> IntArray:
+    """Return the columns of q (J + 1, k) of each joint and rod of limbs, -1 for passive ones."""
+    column = {name: i for i, name in enumerate(assembly.driven_joints)}
+    drives = [
+        [column[name] if name else -1 for name in (*(j.actuator for j in m.joints), m.actuator)]
+        for m in limbs
+    ]
+    return np.array(drives, dtype=np.int64).T.reshape(len(limbs[0].joints) + 1, len(limbs))
+
+
+def _weigh_actuators(
+    assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]
+) -> tuple[float, ...] | None:
+    """Return relative standard deviations of redundant actuators, the largest one 1.
+
+    None without redundant actuators.
+    """
+    if len(assembly.actuators) <= len(freedoms):
+        return None
+    what = f"{len(assembly.actuators)} actuators for {len(freedoms)} freedoms"
+    _refuse_other_limbs(assembly, groups, what, "redundant actuation")
+    sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.actuators]
+    if len({a.sigma is None for a in assembly.actuators}) > 1 or min(sigma) <= 0:
+        raise MechanismError(
+            f"{assembly.name} has more actuators than freedoms; state a positive sigma for every "
+            "actuator, or for none"
+        )
+    return tuple(s / max(sigma) for s in sigma)
+
+
+def _check_sums(assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]) -> None:
+    """Refuse sums whose numbers of readings, joints and freedoms do not fit."""
+    if not any(a.weights for a in assembly.actuators):
+        return
+    a, joints, m = len(assembly.actuators), len(assembly.driven_joints), len(freedoms)
+    if a > m:
+        raise MechanismError(
+            f"{assembly.name} has {a} readings for {m} freedoms, and some of them are sums; leave "
+            "out readings, because redundant readings cannot be sums"
+        )
+    if a == joints:
+        return
+    if a < m:
+        raise MechanismError(
+            f"{assembly.name} has {a} readings of {joints} driven joints for {m} freedoms, so its "
+            "sums do not hold the platform; state one reading for every freedom"
+        )
+    what = f"{a} readings of {joints} driven joints"
+    _refuse_other_limbs(assembly, groups, what, "a sum of more joints than there are readings")
+
+
+def _refuse_other_limbs(
+    assembly: Assembly, groups: tuple[Group, ...], what: str, subject: str
+) -> None:
+    """Refuse limbs that have not one actuator and one closure equation each."""
+    for group in groups:
+        rows = len(group.rows) - len(group.unknown_joints(False))
+        driven = int((group.actuator[:, 0] >= 0).sum())
+        if rows != driven or driven != 1:
+            limb = assembly.limbs[group.limbs[0]].name
+            raise MechanismError(
+                f"{assembly.name} has {what}, and limb {limb!r} has {driven} of them and {rows} "
+                f"closure equations; {subject} needs limbs with one of each"
+            )
+
+
+def _report_locked(limb: Limb, place: int) -> Finding:
+    """Return the finding of a joint that moves nothing but its limb."""
+    joint = limb.joints[place]
+    turns = joint.dimension is Dimension.ANGLE
+    value = Quantity(joint.start, SI_SYMBOLS[joint.dimension])
+    return report_finding(
+        "mechanism.locked-joint", limb=limb.name, joint=joint.name, turns=turns, value=value
+    )
+
+
+def _map_slots(
+    assembly: Assembly, table: ParameterTable, places: dict[Address, int], count: int
+) -> SlotMap:
+    """Return the linear maps as one matrix and the shared maps with their places."""
+    actuators = {a.name: i for i, a in enumerate(assembly.actuators)}
+    names = name_terms(assembly.actuators)
+
+    def place(address: Address) -> int:
+        if address in places:
+            return places[address]
+        return count + terms.shape[1] * actuators[address.owner] + names.index(address.axis)
+
+    terms, w = nominal_terms(assembly.actuators), harmonic_frequencies(assembly.actuators)
+    matrix = np.zeros((count + terms.size, len(table)))
+    for entry in assembly.maps:
+        matrix[place(entry.address), table.index(entry.parameter)] += entry.coefficient
+    shared = tuple(
+        (s, tuple(table.index(name) for name in s.inputs), tuple(place(a) for a in s.outputs))
+        for s in assembly.shared
+    )
+    return SlotMap(matrix, shared, table.nominal, count, terms, w)
+
+
+def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
+    """Return the start of the search for home: the home pose with every joint at its `start`."""
+    joints = (
+        [[*(j.start for j in assembly.limbs[i].joints), 0.0] for i in group.limbs]
+        for group in groups
+    )
+    return make_start(assembly.home[None, None], tuple(np.array([[rows]]) for rows in joints))
+
+
+def _place_at_start(robot: Mechanism) -> State:
+    """Return the state of a serial stage with every joint at its `start`."""
+    e, _ = robot.slots(robot.values[None])
+    return solve_serial(robot, e, driven_values(robot.program, robot.home_state))
+
+
+def _find_home(robot: Mechanism) -> State:
+    """Return the closed state at the controlled coordinates of the home pose.
+
+    Raises
+    ------
+    MechanismError
+        Too few controlled coordinates, or loops that cannot be closed.
+    """
+    program, values = robot.program, robot.values[None]
+    shared = program.shared_drive_count
+    movable = len(program.freedoms) - program.count_equations(free=True) - shared
+    if len(robot.controlled) < movable:
+        raise MechanismError(
+            f"{robot.name} can be moved in {movable} freedoms or more, but names only "
+            f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
+            "one for every freedom, or state fewer `freedoms:`"
+        )
+    target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
+    state = inverse_trials(robot, values, target)
+    if state.status[0, 0] != engine.CONVERGED:
+        if not shared:
+            refuse_uncontrolled(robot, robot.home_state)
+        refuse_singular_home(robot, state)
+        raise MechanismError(
+            f"the loops of {robot.name} cannot be closed at its home pose: "
+            f"{state.residual[0, 0] * 1e3:.3g} mm stay open; check the joint centers, the lengths "
+            "and `home:`"
+        )
+    if shared:
+        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+    return state
+
+
+# --- Compilation of a chain: its stages one by one, then their structures one after the other.
+
+"""Characteristic length [m] of a chain whose platforms all coincide."""
+
+
+def build_chain(
+    assembly: Assembly,
+    units: Mapping[Dimension, str],
+    record: Any,
+    build: Callable[[AttachedStage], Mechanism],
+    differentiate: PoseDerivative,
+) -> Mechanism:
+    """Return the mechanism of a chain; `build` compiles a stage, `differentiate` is that of one.
+
+    Raises
+    ------
+    MechanismError
+        A stage cannot be built (names it), or the actuators cannot set the controlled coordinates.
+    """
+    stages = _build_stages(assembly.stages, build)
+    table = ParameterTable(assembly.parameters, assembly.common_errors)
+    size = compute_chain_size(stages)
+    program = _join_programs(stages, size)
+    robot = Mechanism(
+        assembly,
+        table,
+        table.nominal,
+        program,
+        _join_slots(stages, table.nominal),
+        size,
+        stages[-1].robot.home_state,
+        {d: unit.symbol for d, unit in DISPLAY_UNITS.items()} | dict(units),
+        tuple(finding for stage in stages for finding in stage.robot.findings),
+        record,
+        stages,
+    )
+    home = join_stage_states(robot, [stage.robot.home_state for stage in stages])
+    robot = replace(robot, home_state=home, assembly=replace(assembly, home=np.array(home.T[0, 0])))
+    _check_mobility(robot, home, differentiate)
+    return robot
+
+
+def _build_stages(
+    attached: Sequence[AttachedStage], build: Callable[[AttachedStage], Mechanism]
+) -> tuple[Stage, ...]:
+    """Return the compiled stages; an error names its stage."""
+    stages: list[Stage] = []
+    places = {BASE: -1}
+    p = a = g = 0
+    for stage in attached:
+        try:
+            robot = build(stage)
+        except MechanismError as error:
+            raise MechanismError(f"stage {stage.name!r}: {error}") from None
+        if robot.program.sigma is not None:
+            raise MechanismError(
+                f"stage {stage.name!r} has {len(robot.actuators)} actuators for "
+                f"{len(robot.freedoms)} freedoms; a stage of a chain must have one actuator for "
+                "each coordinate that it sets"
+            )
+        counts = len(robot.parameters), len(robot.actuators), len(robot.program.groups)
+        stages.append(
+            Stage(
+                stage.name,
+                places[stage.on],
+                stage.mount,
+                robot,
+                *(slice(i, i + n) for i, n in zip((p, a, g), counts, strict=True)),
+            )
+        )
+        places[stage.name] = len(stages) - 1
+        p, a, g = (i + n for i, n in zip((p, a, g), counts, strict=True))
+    return tuple(stages)
+
+
+def compute_chain_size(stages: Sequence[Stage]) -> float:
+    """Return the characteristic length [m] of a chain.
+
+    It is the root mean square distance of the end platform from the bases of the stages at home, or
+    the size of the largest stage with a loop, if that is larger.
+    """
+    bases: list[FloatArray] = []
+    platforms: list[FloatArray] = []
+    for stage in stages:
+        base = stage.mount if stage.parent < 0 else platforms[stage.parent] @ stage.mount
+        bases.append(base)
+        platforms.append(base @ stage.robot.home)
+    arms = np.array([platforms[-1][:3, 3] - base[:3, 3] for base in bases])
+    reach = float(np.sqrt((arms**2).sum() / len(arms)))
+    loops = [stage.robot.size for stage in stages if not stage.robot.is_serial]
+    return max([reach, *loops]) or DEFAULT_SIZE
+
+
+def _join_programs(stages: Sequence[Stage], size: float) -> Program:
+    """Return the structure of all stages, with the platform's six freedoms."""
+    groups, limbs, first, joints = [], 0, 0, 0
+    for stage in stages:
+        own = stage.robot.program
+        for group in own.groups:
+            driven = np.where(group.actuator >= 0, group.actuator + joints, -1)
+            groups.append(
+                replace(
+                    group,
+                    limbs=tuple(limbs + i for i in group.limbs),
+                    actuator=driven,
+                    columns=slice(first + group.columns.start, first + group.columns.stop),
+                )
+            )
+        limbs += len(stage.robot.assembly.limbs)
+        first, joints = first + own.n_displacements, joints + own.n_joints
+    return Program(tuple(groups), tuple(range(len(AXES))), size, first, joints)
+
+
+def _join_slots(stages: Sequence[Stage], nominal: FloatArray) -> SlotMap:
+    """Return the maps of all stages: first the displacements of all, then their transmissions."""
+    maps = [stage.robot.slots for stage in stages]
+    displacements = sum(own.n_displacements for own in maps)
+    actuators = sum(len(own.terms) for own in maps)
+    k = max(own.terms.shape[1] for own in maps)
+    has_sums = any(stage.robot.has_sums for stage in stages)
+    if has_sums:
+        k = len(ALL_TERMS) + sum(stage.robot.program.n_joints for stage in stages)
+    matrix = np.zeros((displacements + actuators * k, len(nominal)))
+    shared, first, term, joint = [], 0, displacements, 0
+    terms = np.zeros((actuators, k))
+    for stage, own in zip(stages, maps, strict=True):
+        d = own.n_displacements
+        a, width = own.terms.shape
+        columns = np.arange(width)
+        columns[len(ALL_TERMS) :] += joint  # the weights of its own joints
+        terms[stage.actuators, columns] = own.terms
+        if has_sums and width <= len(ALL_TERMS):
+            terms[stage.actuators, len(ALL_TERMS) + joint + np.arange(a)] = np.eye(a)
+        joint += stage.robot.program.n_joints
+        of_terms = (np.arange(a)[:, None] * k + columns).ravel()
+        places = np.concatenate([np.arange(d) + first, of_terms + term])
+        matrix[places, stage.parameters] = own.matrix
+        for function, inputs, outputs in own.shared:
+            values = tuple(i + stage.parameters.start for i in inputs)
+            shared.append((function, values, tuple(int(places[o]) for o in outputs)))
+        first, term = first + d, term + a * k
+    frequency = np.concatenate([own.frequency for own in maps])
+    return SlotMap(matrix, tuple(shared), nominal, displacements, terms, frequency)
+
+
+def _check_mobility(robot: Mechanism, home: ChainState, differentiate: PoseDerivative) -> None:
+    """Refuse a chain whose actuators do not set the controlled coordinates one by one.
+
+    The freedoms of the end platform are the rank of its derivatives by the readings.
+    """
+    moving = find_carrying_actuators(robot)
+    values = robot.values[None]
+    _, tau = robot.slots(values)
+    q = readings_from_joints(driven_values(robot.program, home), tau, robot.slots.frequency)
+    D = differentiate_end(robot, values, q, home, differentiate).readings[0, 0]
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    scaled = D * robot.twist_scale[:, None] / np.where(turning, robot.size, 1.0)
+    freedoms = count_rank(np.linalg.svd(scaled, compute_uv=False))
+    c, a = len(robot.controlled), len(moving)
+    if c != a:
+        raise MechanismError(
+            report_finding(
+                "mechanism.chain-controlled",
+                name=robot.name,
+                named=c,
+                actuators=a,
+                freedoms=freedoms,
+            )
+        )
+    target = read_coordinates(home.T[0], robot.controlled)
+    _, slope = compare_coordinates(home.T[0], target, robot.controlled, robot.size)
+    rates = slope[0] / robot.twist_scale @ scaled
+    independent = count_rank(np.linalg.svd(rates, compute_uv=False))
+    if independent < c:
+        finding = report_finding(
+            "mechanism.chain-singular-home",
+            name=robot.name,
+            controlled=robot.controlled,
+            independent=independent,
+        )
+        raise MechanismError(finding)

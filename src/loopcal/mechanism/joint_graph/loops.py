@@ -1,0 +1,573 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A mechanism as bodies and joints: a tree of joints from the base, and joints that close loops.
+
+With q the values of the tree, joint by joint, every joint of the tree places a body, T_b = T_a J(q)
+(frames of both bodies on the joint). A joint that closes a loop adds equations between two bodies
+that the tree has placed already: a ball joint p_a = p_b for its centers, a rotary joint also a_a =
+a_b for its axes, and a slide equal orientations and (p_a - p_b) x a = 0. Their derivatives by q are
+those of the two points and directions, which only the joints below each body move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import MechanismError
+from loopcal.findings import Quantity, report_finding
+from loopcal.mechanism.joint_graph.graph import GraphJoint, turn_between
+from loopcal.numerics.decomposition import are_nonzero
+from loopcal.typing import BoolArray, FloatArray
+
+CLOSURE_RANK_TOLERANCE = 1e-8
+"""Singular value of the scaled closures, relative to the largest, that counts as zero [1]."""
+
+CLOSED = 1e-13
+"""Largest closure residual of a home pose, lengths as a share of the largest one [1]."""
+
+STEPS, LARGEST_STEP = 40, 0.6
+"""Newton steps, and the largest change of a joint value in one of them [rad, sizes]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Places of a tree at n joint values.
+
+    Attributes
+    ----------
+    T : (n, bodies, 4, 4) T_base_body [m]. axes, points : (n, j, 3) axis and a point of each joint.
+    """
+
+    T: FloatArray
+    axes: FloatArray
+    points: FloatArray
+
+
+@dataclass(frozen=True)
+class JointGraph:
+    """A mechanism.
+
+    Attributes
+    ----------
+    base : the root body. tree : joints, each after the one that carries its first body.
+    closing : joints that close loops. motors : names of driven joints, all in the tree.
+    """
+
+    base: str
+    tree: tuple[GraphJoint, ...]
+    closing: tuple[GraphJoint, ...]
+    motors: tuple[str, ...]
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """All bodies, the base first."""
+        return (self.base, *(joint.body_b for joint in self.tree))
+
+    @property
+    def joints(self) -> tuple[GraphJoint, ...]:
+        """All joints."""
+        return self.tree + self.closing
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints of the tree."""
+        return tuple(joint.name for joint in self.tree)
+
+    @cached_property
+    def is_driven(self) -> BoolArray:
+        """Which joints of the tree are driven (j,)."""
+        return np.array([name in self.motors for name in self.names], dtype=bool)
+
+    @cached_property
+    def turns(self) -> BoolArray:
+        """Which joints of the tree are rotary (j,)."""
+        return np.array([joint.kind == "R" for joint in self.tree], dtype=bool)
+
+    @cached_property
+    def size(self) -> float:
+        """Largest distance of a joint from the frame of its body [m]; 1 where all are zero."""
+        places = [T[:3, 3] for joint in self.joints for T in (joint.T_a, joint.T_b)]
+        return float(np.linalg.norm(places, axis=-1).max(initial=0.0)) or 1.0
+
+    @cached_property
+    def _columns(self) -> FloatArray:
+        """Unit of each joint value in the scaled closures (j,) [rad, m]."""
+        return np.where(self.turns, 1.0, self.size)
+
+    @cached_property
+    def _index(self) -> Mapping[str, int]:
+        return {body: i for i, body in enumerate(self.bodies)}
+
+    @cached_property
+    def _carriers(self) -> list[int]:
+        """Return the number of the first body of each joint of the tree."""
+        return [self._index[joint.body_a] for joint in self.tree]
+
+    @cached_property
+    def _axes(self) -> FloatArray:
+        """Axes (j, 3) of the joints of the tree in their frames."""
+        return np.reshape([joint.axis for joint in self.tree], (-1, 3))
+
+    @cached_property
+    def _frames(self) -> FloatArray:
+        """Frames (j, 4, 4) of the joints of the tree in their first bodies."""
+        return np.reshape([joint.T_a for joint in self.tree], (-1, 4, 4))
+
+    @cached_property
+    def _back(self) -> FloatArray:
+        """Second bodies (j, 4, 4) of the joints of the tree in the frames of the joints."""
+        return geometry.invert_pose(np.reshape([joint.T_b for joint in self.tree], (-1, 4, 4)))
+
+    @cached_property
+    def _is_below(self) -> BoolArray:
+        """Which joints (j,) of the tree move each body (bodies, j)."""
+        below = np.zeros((len(self.bodies), len(self.tree)), dtype=bool)
+        for i, joint in enumerate(self.tree):
+            below[i + 1] = below[self._index[joint.body_a]]
+            below[i + 1, i] = True
+        return below
+
+    def place(self, q: FloatArray) -> Placement:
+        """Return the places of all bodies and joints at joint values (n, j)."""
+        n, j = q.shape
+        T = np.tile(np.eye(4), (n, j + 1, 1, 1))
+        moves = self._move_all(q)
+        for i, carrier in enumerate(self._carriers):
+            T[:, i + 1] = T[:, carrier] @ moves[:, i] @ self._back[i]
+        frames = T[:, self._carriers] @ self._frames
+        axes = (frames[..., :3, :3] @ self._axes[:, :, None])[..., 0]
+        points = frames[..., :3, 3]
+        return Placement(T, axes, points)
+
+    def _move_all(self, q: FloatArray) -> FloatArray:
+        """Return the frames (n, j, 4, 4) of the second bodies of the joints in the first ones."""
+        vectors = q[..., None] * self._axes
+        turns = np.where(self.turns[:, None], vectors, 0.0)
+        shifts = np.where(self.turns[:, None], 0.0, vectors)
+        return self._frames @ geometry.make_pose(geometry.exp_so3(turns), shifts)
+
+    def get_place(self, placement: Placement, body: str) -> FloatArray:
+        """Return the places (n, 4, 4) of a body."""
+        return placement.T[:, self._index[body]]
+
+    def differentiate(
+        self, placement: Placement, body: str, point: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return turn and velocity (n, 3, j) of a point (n, 3) [m] of a body by joint values."""
+        below = self._is_below[self._index[body]][:, None]
+        turns = self.turns[:, None]
+        arms = np.cross(placement.axes, point[:, None] - placement.points)
+        velocity = np.where(turns, arms, placement.axes) * below
+        return (
+            np.where(turns & below, placement.axes, 0.0).swapaxes(-1, -2),
+            velocity.swapaxes(-1, -2),
+        )
+
+    def linearize(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (n, e) of the closures at joint values (n, j), and derivatives by them.
+
+        Lengths are divided by `size`, and a slide's value is counted in it.
+        """
+        placement = self.place(q)
+        residual, rows = [np.zeros((len(q), 0))], [np.zeros((len(q), 0, len(self.tree)))]
+        for joint in self.closing:
+            r, J = self._linearize_joint(placement, joint)
+            residual.append(r)
+            rows.append(J * self._columns)
+        return np.concatenate(residual, axis=1), np.concatenate(rows, axis=1)
+
+    def _linearize_joint(
+        self, placement: Placement, joint: GraphJoint
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return residuals and derivatives of one closure."""
+        P = self.get_place(placement, joint.body_a) @ joint.T_a
+        Q = self.get_place(placement, joint.body_b) @ joint.T_b
+        p, q = P[:, :3, 3], Q[:, :3, 3]
+        turn_p, speed_p = self.differentiate(placement, joint.body_a, p)
+        turn_q, speed_q = self.differentiate(placement, joint.body_b, q)
+        gap, gap_rows = (p - q) / self.size, (speed_p - speed_q) / self.size
+        if joint.kind == "S":
+            return gap, gap_rows
+        # directions that the joint keeps equal on both bodies
+        kept = [joint.axis] if joint.kind == "R" else list(np.eye(3))
+        u = [P[:, :3, :3] @ v for v in kept]
+        w = [Q[:, :3, :3] @ v for v in kept]
+        apart = np.concatenate([a - b for a, b in zip(u, w, strict=True)], axis=1)
+        turned = [
+            geometry.hat(b) @ turn_q - geometry.hat(a) @ turn_p for a, b in zip(u, w, strict=True)
+        ]
+        if joint.kind == "P":
+            axis = P[:, :3, :3] @ joint.axis
+            # d (axis x gap) = axis x d gap - gap x (turn x axis)
+            swing = geometry.hat(gap) @ geometry.hat(axis) @ turn_p
+            gap, gap_rows = np.cross(axis, gap), geometry.hat(axis) @ gap_rows + swing
+        return (np.concatenate([gap, apart], axis=1), np.concatenate([gap_rows, *turned], axis=1))
+
+    def close(self, starts: FloatArray, fixed: BoolArray | None = None) -> FloatArray:
+        """Close the loops by Newton's method from joint values (n, j); NaN where it diverges.
+
+        `fixed` (j,) are joints that keep their values. Steps are of least norm.
+        """
+        q, is_closed = starts.copy(), np.zeros(len(starts), dtype=bool)
+        free = np.ones(len(self.tree), dtype=bool) if fixed is None else ~fixed
+        for _ in range(STEPS):
+            left = np.flatnonzero(~is_closed)
+            if not left.size:
+                break
+            residual, rows = self.linearize(q[left])
+            is_closed[left] = np.abs(residual).max(axis=1, initial=0.0) < CLOSED
+            active = ~is_closed[left]
+            step = np.zeros((int(active.sum()), len(free)))
+            inverse = np.linalg.pinv(rows[active][:, :, free], rcond=CLOSURE_RANK_TOLERANCE)
+            step[:, free] = -(inverse @ residual[active][:, :, None])[:, :, 0]
+            largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
+            q[left[active]] += step * np.minimum(1.0, LARGEST_STEP / largest) * self._columns
+        q[~is_closed] = np.nan
+        return q
+
+    def find_motions(self, q: FloatArray) -> FloatArray:
+        """Return rates (j, m) that keep the loops closed at joint values (j,); m is the mobility.
+
+        Rates are orthonormal in the scaled values.
+        """
+        rows = self.linearize(q[None])[1][0]
+        if not len(rows):
+            return np.diag(self._columns)
+        _, s, V = np.linalg.svd(rows)
+        null = V[int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum()) :]
+        return self._columns[:, None] * null.T
+
+    def find_twists(self, q: FloatArray, body: str, frame: FloatArray) -> FloatArray:
+        """Return the twist (6, j) of a frame (4, 4) of a body by joint values (j,), about its
+        origin in base axes, as (turn, velocity) [rad, m].
+        """
+        placement = self.place(q[None])
+        point = (self.get_place(placement, body) @ frame)[:, :3, 3]
+        return np.concatenate(self.differentiate(placement, body, point), axis=1)[0]
+
+    def without(self, bodies: frozenset[str]) -> JointGraph:
+        """Return the mechanism without bodies that carry no others, and without their joints."""
+        ends = lambda joint: bodies & {joint.body_a, joint.body_b}  # noqa: E731
+        return replace(
+            self,
+            tree=tuple(joint for joint in self.tree if not ends(joint)),
+            closing=tuple(joint for joint in self.closing if not ends(joint)),
+        )
+
+
+# --- Poses at which the loops of a mechanism close, and which of them is a good home.
+
+STARTS, SPREAD = 24, 0.6
+"""Tries to close the loops, and range of their first joint values [rad, sizes]."""
+
+SAME = 1e-6
+"""Difference of joint values of poses that count as one [rad, sizes]."""
+
+DRAWN = 1e-3
+"""Largest joint value of a pose that counts as the drawn one [rad, sizes]."""
+
+WEAK = 1e-3
+"""Singular value of the closures, relative to the largest, below which a step leaves it out [1]."""
+
+NEAR, NEAR_RANGE = 4, 0.15
+"""Number of poses near a pose, and range of their motors [rad, sizes]."""
+
+IDLE = 1e-9
+"""Largest part of a motion, scaled, in which neither motors nor platform move [1]."""
+
+
+@dataclass(frozen=True)
+class Freedoms:
+    """What a mechanism can do at a pose.
+
+    Attributes
+    ----------
+    mobility : freedoms of motors and platform. idle : motions in which only passive joints move.
+    moved : joints that move in these. firmness : how well the motors hold the passive joints and
+        move the platform [1]; zero at a singular pose.
+    """
+
+    mobility: int
+    idle: int
+    moved: tuple[str, ...]
+    firmness: float
+
+
+def find_homes(graph: JointGraph) -> tuple[FloatArray, ...]:
+    """Return joint values (j,) that close the loops, those within their limits and nearest to zero
+    first.
+
+    Poses of larger mobility, from which a link could move either way, are left out.
+
+    Raises
+    ------
+    MechanismError : the loops do not close; names the closure that remains open.
+    """
+    sizes = np.where(graph.turns, 1.0, graph.size)
+    low, high = _list_limits(graph)
+    rest = np.clip(np.zeros(len(low)), low, high)
+    starts = np.stack([rest + _draw(graph, seed) * sizes for seed in range(STARTS)])
+    closed = [q for q in graph.close(starts) if np.isfinite(q).all()]
+    if not closed:
+        raise MechanismError(_describe_gap(graph, starts))
+    mobilities = [graph.find_motions(q).shape[1] for q in closed]
+    regular = [q for q, m in zip(closed, mobilities, strict=True) if m == min(mobilities)]
+    inside = [bool(((low - SAME <= q) & (q <= high + SAME)).all()) for q in regular]
+    distances = [float((((q - rest) / sizes) ** 2).sum()) for q in regular]
+    order = sorted(range(len(regular)), key=lambda i: (not inside[i], distances[i]))
+    homes: list[FloatArray] = []
+    for q in (regular[i] for i in order):
+        if all(np.abs((q - other) / sizes).max(initial=0.0) > SAME for other in homes):
+            homes.append(q)
+    return tuple(homes)
+
+
+def is_drawn_pose(graph: JointGraph, q: FloatArray) -> bool:
+    """Return whether a pose (j,) is the one that all joints have at zero, or at a limit near it."""
+    rest = np.clip(np.zeros(len(q)), *_list_limits(graph))
+    sizes = np.where(graph.turns, 1.0, graph.size)
+    return bool(np.abs((q - rest) / sizes).max(initial=0.0) < DRAWN)
+
+
+def find_freedoms(graph: JointGraph, q: FloatArray, platform: str) -> Freedoms:
+    """Return the freedoms of a mechanism at a home pose (j,).
+
+    The firmness is the product of two smallest singular values: of the closures by the passive
+    joints, idle motions left out, and of the platform's twist by the joint rates.
+    """
+    sizes, passive = np.where(graph.turns, 1.0, graph.size), ~graph.is_driven
+    rates = graph.find_motions(q) / sizes[:, None]
+    place = graph.get_place(graph.place(q[None]), platform)[0]
+    twists = graph.find_twists(q, platform, np.eye(4)) * sizes
+    twists[3:] /= max(graph.size, float(np.linalg.norm(place[:3, 3])))
+    outputs = np.concatenate([rates[graph.is_driven], twists @ rates])
+    _, s, V = np.linalg.svd(outputs)
+    mobility = int((s > IDLE * s.max(initial=1.0)).sum())
+    idle = rates @ V[mobility:].T
+    moved = np.abs(idle).max(axis=1, initial=0.0) > IDLE
+    rows = graph.linearize(q[None])[1][0][:, passive]
+    n_held = int(passive.sum()) - idle.shape[1]
+    hold = np.linalg.svd(rows, compute_uv=False) if rows.size else np.ones(0)
+    firmness = 1.0 if n_held == 0 else 0.0 if n_held > len(hold) else float(hold[n_held - 1])
+    moves = np.linalg.svd(twists @ rates @ V[:mobility].T, compute_uv=False)
+    firmness *= float(moves[-1]) if len(moves) else 0.0
+    names = tuple(name for name, is_moved in zip(graph.names, moved, strict=True) if is_moved)
+    return Freedoms(mobility, idle.shape[1], names, firmness)
+
+
+def list_nearby(graph: JointGraph, home: FloatArray) -> FloatArray:
+    """Return a pose (j,), and others (n, j) with the motors moved a little."""
+    sizes = np.where(graph.turns, 1.0, graph.size) * graph.is_driven
+    shifts = [np.zeros(len(home))]
+    for seed in range(NEAR):
+        rng = np.random.default_rng(seed)
+        shifts.append(rng.uniform(-NEAR_RANGE, NEAR_RANGE, len(home)) * sizes)
+    near = graph.close(home + np.stack(shifts), graph.is_driven)
+    near[0] = home
+    return near[np.isfinite(near).all(axis=1)]
+
+
+def measure_rotation(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> FloatArray:
+    """Return the rotation (3, 3) of a joint that closes a loop, at joint values (j,)."""
+    placement = graph.place(q[None])
+    A, B = (
+        (graph.get_place(placement, body) @ T)[0, :3, :3]
+        for body, T in ((joint.body_a, joint.T_a), (joint.body_b, joint.T_b))
+    )
+    return A.T @ B
+
+
+def get_value(graph: JointGraph, q: FloatArray, joint: GraphJoint) -> float:
+    """Return the value of a rotary joint or slide [rad, m], also of one that closes a loop."""
+    for i, other in enumerate(graph.tree):
+        if joint.name in (other.name, other.origin_a, other.origin_b):
+            return float(q[i])
+    if joint.kind == "R":
+        return float(geometry.log_so3(measure_rotation(graph, q, joint)) @ joint.axis)
+    placement = graph.place(q[None])
+    A = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
+    B = (graph.get_place(placement, joint.body_b) @ joint.T_b)[0]
+    return float((geometry.invert_pose(A) @ B)[:3, 3] @ joint.axis)
+
+
+def count_repeated_closures(graph: JointGraph, q: FloatArray) -> int:
+    """Return how many closure equations repeat others at a pose (j,)."""
+    rows = graph.linearize(q[None])[1][0]
+    rank = sum({"R": 5, "P": 5, "S": 3}[joint.kind] for joint in graph.closing)
+    s = np.linalg.svd(rows, compute_uv=False) if rows.size else np.zeros(0)
+    return rank - int(are_nonzero(s, CLOSURE_RANK_TOLERANCE).sum())
+
+
+def _draw(graph: JointGraph, seed: int) -> FloatArray:
+    """Return the differences of a start from zero (j,) [rad, sizes]; none for the first seed."""
+    spread = 0.0 if seed == 0 else SPREAD
+    return np.random.default_rng(seed).uniform(-spread, spread, len(graph.tree))
+
+
+def _list_limits(graph: JointGraph) -> tuple[FloatArray, FloatArray]:
+    """Return lower and upper limits (j,) of the joints of the tree, infinite without limits."""
+    limits = [joint.limits or (-np.inf, np.inf) for joint in graph.tree]
+    low, high = np.array(limits, dtype=float).reshape(-1, 2).T
+    return low, high
+
+
+def approach_closure(graph: JointGraph, starts: FloatArray) -> FloatArray:
+    """Return joint values (n, j) near starts (n, j) at which the loops are open the least.
+
+    Directions that hardly change the closures are left out of the steps.
+    """
+    sizes = np.where(graph.turns, 1.0, graph.size)
+    q = starts
+    for _ in range(STARTS):
+        residual, rows = graph.linearize(q)
+        step = -(np.linalg.pinv(rows, rcond=WEAK) @ residual[:, :, None])[:, :, 0]
+        largest = np.abs(step).max(axis=1, initial=1e-300, keepdims=True)
+        q = q + step * np.minimum(1.0, 0.3 / largest) * sizes
+    return q
+
+
+def measure_gap(graph: JointGraph, placement: Placement, joint: GraphJoint) -> tuple[float, float]:
+    """Return the distance [m] and angle [rad] between both sides of a closing joint."""
+    A = (graph.get_place(placement, joint.body_a) @ joint.T_a)[0]
+    B = (graph.get_place(placement, joint.body_b) @ joint.T_b)[0]
+    gap = B[:3, 3] - A[:3, 3]
+    if joint.kind == "S":
+        return float(np.linalg.norm(gap)), 0.0
+    a, b = A[:3, :3] @ joint.axis, B[:3, :3] @ joint.axis
+    if joint.kind == "P":
+        gap = gap - a * (a @ gap)
+    angle = float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+    return float(np.linalg.norm(gap)), angle
+
+
+def _describe_gap(graph: JointGraph, starts: FloatArray) -> object:
+    """Return the finding of loops that do not close: the worst closure of the best pose."""
+    q = approach_closure(graph, starts)
+    best = q[[int(np.argmin((graph.linearize(q)[0] ** 2).sum(axis=1)))]]
+    placement = graph.place(best)
+    gaps = [(measure_gap(graph, placement, joint), joint) for joint in graph.closing]
+    (gap, angle), joint = max(gaps, key=lambda entry: entry[0])
+    return report_finding(
+        "files.loops-open",
+        closure=joint.name,
+        body_a=joint.body_a,
+        body_b=joint.body_b,
+        gap=Quantity(gap * 1e3, "mm"),
+        angle=Quantity(angle, "rad"),
+    )
+
+
+# --- Loops that close but for the rounded digits of their file.
+
+
+@dataclass(frozen=True)
+class Repair:
+    """A mechanism whose loops close exactly.
+
+    Attributes
+    ----------
+    graph : with closed loops. gap, angle : largest gap of a closure before the repair [m, rad].
+    turn : largest rotation of an axis [rad].
+    """
+
+    graph: JointGraph
+    gap: float = 0.0
+    angle: float = 0.0
+    turn: float = 0.0
+
+
+def repair_rounded_loops(graph: JointGraph, rounding: tuple[float, float]) -> Repair:
+    """Return a mechanism with loops that close; as it is where they do, or where no repair helps.
+
+    Parameters
+    ----------
+    rounding : error of its lengths [m] and angles [rad] by the rounding of their numbers.
+    """
+    unchanged = Repair(graph)
+    limit = rounding[1] + rounding[0] / graph.size
+    start = np.zeros((1, len(graph.tree)))
+    if limit == 0.0 or _can_move(graph, graph.close(start)[0]):
+        return unchanged
+    q = approach_closure(graph, start)[0]
+    if np.abs(graph.linearize(q[None])[0]).max(initial=0.0) > limit:
+        return unchanged
+    repaired, turn = _align_axes(graph, q, limit)
+    if not _can_move(repaired, repaired.close(q[None])[0]):
+        return unchanged
+    placement = graph.place(q[None])
+    gaps = [measure_gap(graph, placement, joint) for joint in graph.closing]
+    return Repair(repaired, max(gap for gap, _ in gaps), max(angle for _, angle in gaps), turn)
+
+
+def _can_move(graph: JointGraph, q: FloatArray) -> bool:
+    """Return whether the loops are closed at joint values (j,) and let all motors move."""
+    if not np.isfinite(q).all() or graph.find_motions(q).shape[1] < len(graph.motors):
+        return False
+    return len(list_nearby(graph, q)) > 1
+
+
+def _align_axes(graph: JointGraph, q: FloatArray, limit: float) -> tuple[JointGraph, float]:
+    """Return the mechanism with axes parallel and closures without gaps at joint values (j,).
+
+    Bodies stay in their places. Also returns the largest rotation of an axis [rad].
+    """
+    placement = graph.place(q[None])
+    frames = {
+        joint: (graph.get_place(placement, joint.body_a) @ joint.T_a)[0] for joint in graph.joints
+    }
+    moving = [joint for joint in graph.joints if joint.kind != "S"]
+    axes = {joint: frames[joint][:3, :3] @ joint.axis for joint in moving}
+    known = list(np.eye(3))
+    aligned = {}
+    for joint in sorted(moving, key=lambda joint: joint.kind == "P"):
+        normals = [aligned[other] for other in aligned if other.kind == "R"]
+        aligned[joint] = _align(axes[joint], known, normals if joint.kind == "P" else [], limit)
+        known.append(aligned[joint])
+    tree = {joint.name: float(value) for joint, value in zip(graph.tree, q, strict=True)}
+
+    def move(joint: GraphJoint) -> GraphJoint:
+        A, B = (graph.get_place(placement, body)[0] for body in (joint.body_a, joint.body_b))
+        frame, far = frames[joint].copy(), B @ joint.T_b
+        if joint.kind == "S":
+            far[:3, 3] = frame[:3, 3]
+            return replace(joint, T_b=geometry.invert_pose(B) @ far)
+        frame[:3, :3] = turn_between(axes[joint], aligned[joint]) @ frame[:3, :3]
+        near = replace(joint, T_a=geometry.invert_pose(A) @ frame, T_b=np.eye(4))
+        if joint in graph.tree:
+            value = tree[joint.name]
+        elif joint.kind == "R":
+            value = float(geometry.log_so3(frame[:3, :3].T @ far[:3, :3]) @ joint.axis)
+        else:
+            value = float((far[:3, 3] - frame[:3, 3]) @ aligned[joint])
+        # the far frame is where the joint moves the near one
+        far = A @ near.move(np.array(value))
+        return replace(near, T_b=geometry.invert_pose(B) @ far)
+
+    turned = replace(
+        graph,
+        tree=tuple(move(joint) for joint in graph.tree),
+        closing=tuple(move(joint) for joint in graph.closing),
+    )
+    turns = [np.linalg.norm(np.cross(axes[joint], aligned[joint])) for joint in moving]
+    return turned, float(max(turns, default=0.0))
+
+
+def _align(
+    axis: FloatArray, known: list[FloatArray], normals: list[FloatArray], limit: float
+) -> FloatArray:
+    """Return the known direction (3,) that an axis is parallel to within a limit [rad], or itself.
+
+    Else it is put across the first of the normals that it is almost across.
+    """
+    for other in known:
+        if np.linalg.norm(np.cross(axis, other)) <= limit:
+            return other if axis @ other > 0 else -other
+    for normal in normals:
+        if abs(axis @ normal) <= limit:
+            across = axis - normal * (normal @ axis)
+            return np.asarray(across / np.linalg.norm(across), dtype=np.float64)
+    return axis

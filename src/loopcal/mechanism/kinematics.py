@@ -1,0 +1,524 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics of many trials: forward and inverse solutions as engine states (t, n).
+
+Arrays are (t, n, ..), where t or n may be 1 and then broadcast. The layers above compute with these
+functions; `loopcal.forward` and `loopcal.inverse` wrap them for a single robot.
+
+Where one actuator drives joints of several limbs, as a carriage with two rods does, the inverse
+solution cannot free each joint: they would part. It solves for the readings instead, as that of
+chains does. Source: docs/theory/kinematics.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import engine
+from loopcal.engine import Program, State
+from loopcal.mechanism import actuation
+from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums
+from loopcal.mechanism.chains import (
+    compute_stage_limb_frames,
+    multiply_signs,
+    solve_readings,
+    solve_serial,
+    solve_stages,
+)
+from loopcal.mechanism.limb_rows import follow_limb
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import (
+    compare_coordinates,
+    pose_from_coordinates,
+    read_coordinates,
+)
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.states import Status, driven_values, replace_rows, select_rows, without_poses
+from loopcal.mechanism.transmission import (
+    ALL_TERMS,
+    TERMS,
+    apply_weights,
+    find_triangles,
+    measure_excess,
+    readings_from_joints,
+    select_weights,
+    turn_head,
+)
+from loopcal.numerics.trial_batch import map_arrays
+from loopcal.typing import BoolArray, FloatArray
+
+# --- Loops closed at joint values or their sums, and along straight paths of these from a start.
+
+PATH_STEPS = (8, 64)
+"""Steps of the path from the start's readings, tried in turn where the direct solution fails."""
+WIDE = 1e-2
+"""Gap, relative to the robot's size, that the errors of redundant readings do not explain.
+
+A pose that they leave open by more is a wrong minimum.
+"""
+
+
+def is_square(robot: Mechanism) -> bool:
+    """Return whether closure with locked actuators has as many equations as freedoms."""
+    if robot.stages:
+        return all(is_square(stage.robot) for stage in robot.stages)
+    return robot.program.is_square or robot.has_open_sums
+
+
+def clear_sign(robot: Mechanism, state: State) -> State:
+    """Return the state with sign 0 if closure is not square: the sign means nothing there."""
+    if is_square(robot):
+        return state
+    return replace(state, closure_sign=np.zeros_like(state.closure_sign))
+
+
+def _find_open_rows(robot: Mechanism, state: State) -> BoolArray:
+    """Return the rows that failed or left a wide gap."""
+    return (state.status != Status.CONVERGED.value) | (state.residual > WIDE * robot.size)
+
+
+def find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
+    """Return the rows that failed, ended beyond a singularity or left a wide gap."""
+    closed = state.status == Status.CONVERGED.value
+    beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
+    failed = (
+        ~closed & (state.status != Status.NOT_FINITE.value) & (state.status != engine.NEAR_GOAL)
+    )
+    return failed | closed & beyond
+
+
+class Loops(NamedTuple):
+    """The loops of trials, closed at values of driven joints, or with `weights` at their sums.
+
+    e : (t | 1, d). weights : (t | 1, a, n_joints).
+    """
+
+    robot: Mechanism
+    e: FloatArray
+    weights: FloatArray | None
+
+    def solve(self, values: FloatArray, begin: State, goal: State | None = None) -> State:
+        """Return states (t, n) at joint values or sums (t | 1, n, a)."""
+        program = self.robot.program
+        if self.weights is not None:
+            return actuation.solve_open_sums(program, self.e, self.weights, values, begin)
+        return clear_sign(self.robot, engine.solve(program, self.e, values, begin, goal=goal))
+
+    def read(self, state: State) -> FloatArray:
+        """Return the joint values or sums (t, n, a) of a state."""
+        joints = driven_values(self.robot.program, state)
+        return joints if self.weights is None else apply_weights(self.weights, joints)
+
+    def select(self, trials: np.ndarray, count: int | None = None) -> Loops:
+        """Return the loops of these trials, of `count` that may have arrays in common."""
+
+        def take(array: FloatArray) -> FloatArray:
+            shape = array.shape if count is None else (count, *array.shape[1:])
+            return np.broadcast_to(array, shape)[trials]
+
+        weights = None if self.weights is None else take(self.weights)
+        return Loops(self.robot, take(self.e), weights)
+
+
+def follow_path(
+    loops: Loops, joints: FloatArray, begin: State, state: State, wrong: BoolArray
+) -> State:
+    """Solve the wrong rows along the straight path of joint values from the start.
+
+    The steps become smaller until a row arrives.
+    """
+    robot, shape = loops.robot, (state.T.shape[0], state.T.shape[1])
+    trial, pose = np.nonzero(wrong)
+    loops = loops.select(trial, shape[0])
+    target = np.broadcast_to(joints, (*shape, joints.shape[2]))[trial, pose][:, None]
+    first, result = select_rows(begin, shape, trial, pose), select_rows(state, shape, trial, pose)
+    origin = loops.read(first)
+    alive = np.arange(len(trial))
+    for count in PATH_STEPS:
+        zero = np.zeros(len(alive), int)
+        begun = select_rows(first, (len(trial), 1), alive, zero)
+        path = origin[alive], target[alive]
+        leave = count == PATH_STEPS[-1]
+        current = _take_steps(loops.select(alive), path, begun, count, leave)
+        result = replace_rows(result, alive, zero, current)
+        alive = alive[find_wrong_rows(robot, current, begun)[:, 0]]
+        if not len(alive):
+            break
+    closed = result.status == Status.CONVERGED.value
+    status = np.where(
+        closed & (result.residual > WIDE * robot.size), np.int8(Status.UNREACHABLE), result.status
+    )
+    other = closed & (result.closure_sign != first.closure_sign)
+    status = np.where(other, np.int8(Status.OTHER_MODE), status)
+    return replace_rows(state, trial, pose, replace(result, status=status))
+
+
+def _take_steps(
+    loops: Loops, path: tuple[FloatArray, FloatArray], begin: State, count: int, leave: bool
+) -> State:
+    """Solve rows (r, 1) in equal steps of the joint values between the ends of a path (r, 1, a).
+
+    With `leave`, a row that fails or opens wide on the way goes to the end at once: there the path
+    leaves the reach of the robot, and each further step would use many iterations for nothing.
+    """
+    robot, (origin, target) = loops.robot, path
+    current, moving = begin, np.arange(len(target))
+    for step in range(1, count + 1):
+        zero = np.zeros(len(moving), int)
+        q = origin[moving] + (target[moving] - origin[moving]) * (step / count)
+        begun = select_rows(current, (len(target), 1), moving, zero)
+        solved = loops.select(moving).solve(q, begun)
+        current = replace_rows(current, moving, zero, solved)
+        if leave and step < count:
+            failed = moving[_find_open_rows(robot, current)[moving, 0]]
+            if len(failed):
+                zero = np.zeros(len(failed), int)
+                state = select_rows(current, (len(target), 1), failed, zero)
+                solved = loops.select(failed).solve(target[failed], state)
+                current = replace_rows(current, failed, zero, solved)
+                moving = np.setdiff1d(moving, failed)
+                if not len(moving):
+                    break
+    return current
+
+
+ITERATIONS = 60
+"""Newton steps of an inverse solution, each at most half of the robot's size."""
+ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
+
+
+def forward_trials(
+    robot: Mechanism,
+    values: FloatArray,
+    q: FloatArray,
+    start: State | None = None,
+    follow: bool = True,
+    goal: State | None = None,
+    driven: DrivenJoints | None = None,
+) -> State:
+    """Solve forward kinematics for readings q (t | 1, n, a) and values (t | 1, p).
+
+    Newton's method begins at `start` (default: home). A row that fails, or ends beyond a
+    singularity, is solved again along the straight path from the start's readings. Rows that still
+    fail are marked, see `Status`. Redundant readings contradict each other by their errors; a row
+    that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
+    these rows are marked at once, in a fraction of the time. With a `goal` (t, n), a row that comes
+    close to it ends there as `engine.NEAR_GOAL`. `driven` is that of `drive_joints`, where it is
+    known.
+    """
+    if not q.shape[1]:
+        return without_poses(robot.home_state, max(len(values), len(q)))
+    if robot.stages:
+        return solve_stages(robot, values, q, start, partial(forward_trials, follow=follow))
+    if robot.has_open_sums:
+        e, sums, weights = drive_sums(robot, values, q)
+        return close_at_joints(robot, e, sums, start, follow, weights=weights)
+    e, tau, joints = driven or drive_joints(robot, values, q)
+    state = close_at_joints(robot, e, joints, start, follow, goal)
+    return _mark_out_of_reach(robot, state, q, tau) if len(find_triangles(tau)) else state
+
+
+def _mark_out_of_reach(robot: Mechanism, state: State, q: FloatArray, tau: FloatArray) -> State:
+    """Return a state (t, n) whose rows with a length that no angle reaches are unreachable."""
+    excess = np.broadcast_to(measure_excess(q, tau, robot.slots.frequency), state.status.shape)
+    is_beyond = (state.status == Status.NOT_FINITE.value) & (excess > 0.0) & np.isfinite(excess)
+    return replace(
+        state,
+        status=np.where(is_beyond, np.int8(Status.UNREACHABLE), state.status),
+        residual=np.where(is_beyond, excess, state.residual),
+    )
+
+
+def close_at_joints(
+    robot: Mechanism,
+    e: FloatArray,
+    joints: FloatArray,
+    start: State | None = None,
+    follow: bool = True,
+    goal: State | None = None,
+    weights: FloatArray | None = None,
+) -> State:
+    """Solve forward kinematics like `forward_trials`, for displacements and joint values.
+
+    e : (t | 1, n_displacements). joints : (t | 1, n, n_joints) values of the driven joints, n > 0.
+    With `weights` (t | 1, a, n_joints) they are their sums (t | 1, n, a).
+    """
+    begin = clear_sign(robot, start or robot.home_state)
+    if robot.is_serial:
+        return solve_serial(robot, e, joints, begin.T.shape[:2])
+    loops = Loops(robot, e, weights)
+    state = loops.solve(joints, begin, goal)
+    wrong = find_wrong_rows(robot, state, begin)
+    if not wrong.any():
+        return state
+    if not follow:
+        beyond = wrong & (state.status == Status.CONVERGED.value)
+        return replace(state, status=np.where(beyond, np.int8(Status.OTHER_MODE), state.status))
+    return follow_path(loops, joints, begin, state, wrong)
+
+
+def step_towards_closure(
+    robot: Mechanism, values: FloatArray, q: FloatArray, begin: State
+) -> State:
+    """Return the states (t, n) one Newton step from `begin` at readings q (t | 1, n, a).
+
+    For robots without stages.
+    """
+    if robot.has_open_sums:
+        e, sums, weights = drive_sums(robot, values, q)
+        return actuation.solve_open_sums(robot.program, e, weights, sums, begin, 1)
+    e, _, joints = drive_joints(robot, values, q)
+    return engine.solve(robot.program, e, joints, begin, max_iterations=1)
+
+
+def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:
+    """Return which readings q (t | 1, n, a) are solved from home without following a path, (t, n).
+
+    These solutions lie on home's side of every singularity. The test takes a fraction of the time
+    of following.
+    """
+    return forward_trials(robot, values, q, follow=False).status == Status.CONVERGED.value
+
+
+def inverse_trials(
+    robot: Mechanism, values: FloatArray, target: FloatArray, start: State | None = None
+) -> State:
+    """Solve inverse kinematics for controlled coordinates (t | 1, n, c), every actuator free.
+
+    `compute_readings` gives the readings of the states.
+    """
+    state = close_at_coordinates(robot, values, target, start)
+    if needs_readings(robot.program):
+        return state
+    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+
+
+def close_at_coordinates(
+    robot: Mechanism,
+    values: FloatArray,
+    target: FloatArray,
+    start: State | None = None,
+    follow: bool = True,
+    max_iterations: int = ITERATIONS,
+) -> State:
+    """Solve inverse kinematics like `inverse_trials`, without the closure sign of the states.
+
+    Without `follow`, and with few iterations, rows that fail cost less.
+    """
+    begin = start or robot.home_state
+    if not target.shape[1]:
+        return without_poses(robot.home_state, max(len(values), len(target)))
+    if robot.stages:
+        functions = forward_trials, differentiate_pose
+        return solve_readings(robot, values, target, begin, *functions, follow=follow)
+    if needs_readings(robot.program):
+        return _inverse_by_readings(robot, values, target, begin, follow)
+    return _close_with_free_actuators(robot, values, target, begin, start, max_iterations)
+
+
+def _close_with_free_actuators(
+    robot: Mechanism,
+    values: FloatArray,
+    target: FloatArray,
+    begin: State,
+    start: State | None,
+    max_iterations: int = ITERATIONS,
+) -> State:
+    """Return states (t, n) at controlled coordinates, with every actuated joint free.
+
+    start : as given; without it the platform begins as commanded, where its coordinates state it.
+    """
+    e, _ = robot.slots(values)
+    names, size = robot.controlled, robot.size
+    T, guess = pose_from_coordinates(target, names, robot.home), driven_values(robot.program, begin)
+    if determine_platform(robot):
+        limbs = robot.program.with_fixed_platform
+        start = replace(begin, T=T)
+        return engine.solve(limbs, e, guess, start, free=True, max_iterations=max_iterations)
+    t, n = max(len(values), len(target)), target.shape[1]
+    flat = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
+
+    def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        return compare_coordinates(T, flat[rows], names, size)
+
+    guess = np.broadcast_to(guess, (t, n, len(robot.actuators)))
+    T = np.broadcast_to(T if start is None else start.T, (t, n, 4, 4))
+    begin = replace(begin, T=T)
+    return engine.solve(robot.program, e, guess, begin, command, True, max_iterations)
+
+
+def determine_platform(robot: Mechanism) -> bool:
+    """Return whether the controlled coordinates state the whole pose and no limb adds a condition.
+
+    They are all freedoms of the platform, of which the others keep their values at home, and each
+    limb has as many unknown joints as equations.
+    """
+    if not robot.program.has_square_limbs:
+        return False
+    if len(robot.controlled) == 6:
+        return True
+    if set(robot.controlled) != {ANGLES.get(freedom, freedom) for freedom in robot.freedoms}:
+        return False
+    at_home = read_coordinates(robot.home, robot.controlled)
+    same = pose_from_coordinates(at_home, robot.controlled, robot.home)
+    return bool(np.abs(same - robot.home).max() < 1e-12)
+
+
+def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> NDArray[np.int8]:
+    """Return the sign of the determinant of closure with locked actuators (t, n).
+
+    It changes only at a singularity. A state with free actuators has another sign. With more
+    equations than freedoms the sign is 0. The sign of a chain is the product of those of its
+    stages.
+    """
+    if robot.stages:
+        return multiply_signs(robot, values, state, compute_closure_sign)
+    if robot.is_serial:
+        return np.ones(state.status.shape, np.int8)
+    if not is_square(robot):
+        return np.zeros(state.status.shape, np.int8)
+    e, tau = robot.slots(values)
+    joints = driven_values(robot.program, state)
+    if robot.has_open_sums:
+        weights = select_weights(tau)
+        assert weights is not None
+        sums = apply_weights(weights, joints)
+        return actuation.solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
+    return engine.solve(robot.program, e, joints, state, max_iterations=0).closure_sign
+
+
+def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
+    """Return the readings (t, n, a) of a state."""
+    _, tau = robot.slots(values)
+    joints = driven_values(robot.program, state)
+    return readings_from_joints(joints, tau, robot.slots.frequency)
+
+
+def needs_readings(program: Program) -> bool:
+    """Return whether the inverse solution is one for readings: joints with a shared drive would
+    part, and where loops may stay open, a free actuator would take a part of the gap.
+    """
+    return program.may_stay_open or program.shared_drive_count > 0
+
+
+def _inverse_by_readings(
+    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State, follow: bool
+) -> State:
+    """Return states (t, n) at controlled coordinates (t | 1, n, c) by their readings.
+
+    Newton's method begins with each joint free, which is almost right where loops may stay open.
+    With shared drives the platform is then as commanded in all its freedoms, which the limbs of
+    many machines can reach one by one; elsewhere, such as where the platform's orientation follows
+    its position, the method begins at the start.
+    """
+    if not begin.closure_sign.any():
+        # the guess of a home that is searched for has no sign yet
+        t, n = max(len(values), len(begin.T)), begin.T.shape[1]
+        whole = map_arrays(lambda a: np.broadcast_to(a, (t, n, *a.shape[2:])), begin)
+        begin = replace(whole, closure_sign=compute_closure_sign(robot, values, whole))
+    return solve_readings(
+        robot,
+        values,
+        target,
+        begin,
+        forward_trials,
+        differentiate_pose,
+        partial(_propose_state, robot),
+        follow,
+    )
+
+
+def _propose_state(robot: Mechanism, values: FloatArray, target: FloatArray, start: State) -> State:
+    """Return states with every joint free at targets (R, c); all are (1, R) or (R, 1).
+
+    With shared drives, coordinates that are not controlled are those of the start.
+    """
+    if not robot.program.shared_drive_count:
+        shaped = target.reshape(*start.T.shape[:2], -1)
+        return _close_with_free_actuators(robot, values, shaped, start, start)
+    e, _ = robot.slots(values)
+    names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
+    T = pose_from_coordinates(target, robot.controlled, start.T.reshape(-1, 4, 4))
+    whole = read_coordinates(T, names)
+
+    def command(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        return compare_coordinates(current, whole[rows], names, robot.size)
+
+    begin = replace(start, T=T.reshape(start.T.shape))
+    return engine.solve(
+        robot.program, e, driven_values(robot.program, begin), begin, command, free=True
+    )
+
+
+# --- Frames of the links along each limb, for limits of joints and for pictures.
+
+
+def compute_limb_frames(
+    robot: Mechanism, values: FloatArray, state: State
+) -> tuple[FloatArray, ...]:
+    """Return the frames along each limb, for limits and pictures.
+
+    Parameters
+    ----------
+    values : (t, p). state : (t, n).
+
+    Returns
+    -------
+    For each limb of the mechanism, in its order, an array (t, n, J + 2, 4, 4): T_base_link behind
+    each link 0..J (the last one is the tip), then the attachment.
+    """
+    if robot.stages:
+        return compute_stage_limb_frames(robot, values, state, compute_limb_frames)
+    e, _ = robot.slots(values)
+    frames: dict[int, FloatArray] = {}
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
+        for k, limb in enumerate(group.limbs):
+            chain, attachment = follow_limb(group, k, displacements[:, k], joints[:, :, k])
+            frames[limb] = np.stack(
+                [*(np.broadcast_to(f, state.T.shape) for f in chain), state.T @ attachment], axis=2
+            )
+    return tuple(frames[i] for i in sorted(frames))
+
+
+# --- Where the anchors of triangle drives are, for pictures and lists.
+
+
+@dataclass(frozen=True, eq=False)
+class Anchors:
+    """The anchors of a triangle drive at n poses.
+
+    limb : number of the limb whose joint it turns. actuator : its name.
+    points : (n, 2, 3) foot and head in the base [m]. pin : (n, 3) [m] on the axis of the joint.
+    """
+
+    limb: int
+    actuator: str
+    points: FloatArray
+    pin: FloatArray
+
+
+def locate_anchors(robot: Mechanism, state: State) -> tuple[Anchors, ...]:
+    """Return the anchors of all triangle drives at a state (1, n)."""
+    column = {a.name: i for i, a in enumerate(robot.actuators) if a.is_triangle}
+    place = {name: i for i, name in enumerate(robot.assembly.driven_joints)}
+    if not column:
+        return ()
+    _, tau = robot.slots(robot.values[None])
+    angles = driven_values(robot.program, state)[0]
+    frames = compute_limb_frames(robot, robot.values[None], state)
+    located = []
+    for i, limb in enumerate(robot.assembly.limbs):
+        for j, joint in enumerate(limb.joints):
+            if joint.actuator in column:
+                triangle = tau[0, column[joint.actuator], len(TERMS) : len(ALL_TERMS)]
+                head = turn_head(angles[:, place[joint.actuator]], triangle)
+                foot = np.broadcast_to(triangle[:3], head.shape)
+                own, T = np.stack([foot, head], axis=1), frames[i][0, :, j]
+                points = own @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3]
+                located.append(Anchors(i, joint.actuator, points, T[:, :3, 3]))
+    return tuple(located)

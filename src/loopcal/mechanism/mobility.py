@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mobility at home: whether the actuators can move and hold the platform, and which joints idle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import engine
+from loopcal.engine import ENDINGS
+from loopcal.errors import MechanismError
+from loopcal.findings import report_finding
+from loopcal.mechanism import actuation
+from loopcal.mechanism.assembly import (
+    AXES,
+    MOST_ACTUATORS,
+    MOST_JOINTS,
+    MOST_LIMBS,
+    MOST_PARAMETERS,
+    Assembly,
+    Limb,
+    is_serial,
+    refuse_more,
+    select_rows,
+)
+from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import (
+    COORDINATES,
+    check_coordinates,
+    compare_coordinates,
+    read_coordinates,
+)
+from loopcal.mechanism.states import driven_values
+from loopcal.mechanism.transmission import select_weights
+from loopcal.numerics.decomposition import are_nonzero
+from loopcal.typing import FloatArray
+from loopcal.units import SI_SYMBOLS
+
+RANK = 1e-9
+"""Relative size below which a singular value of closure equations counts as zero.
+
+Real margins are above 1e-4, rounding is below 1e-13.
+"""
+CLOSED = 1e-9
+"""Gap of the loops, as a share of the robot's size, below which they are closed."""
+STRETCHED = 1e-5
+"""Motion of a loop's closure by an actuator, as a share of the robot's size or per unit of stroke,
+below which the actuator does not move it. An iteration ends this far from a singular position.
+"""
+MAIN_SHARE = 0.3
+"""Components below this share of the largest one are left out of the description of a motion."""
+
+
+def check_mobility(robot: Mechanism) -> None:
+    """Refuse actuators that cannot move and hold the platform at home.
+
+    Raises
+    ------
+    MechanismError
+        The actuators leave the platform free to move, or the limbs constrain it too much; names
+        the freedoms.
+    """
+    program, home = robot.program, robot.home_state
+    e = robot.slots(robot.values[None])[0]
+    blocks = engine.linearize(program, e, driven_values(program, home), home)
+    scale = 1 / robot.twist_scale[list(program.freedoms)]
+    A, Q = stack_platform_rows(blocks)[0, 0] * scale, stack_driven_columns(program, blocks)[0, 0]
+    names = [AXES[f] for f in program.freedoms]
+    _, s, V = np.linalg.svd(A, full_matrices=True)
+    m, a = len(names), program.n_joints
+    rank = count_rank(s)
+    if rank < m:
+        finding = report_finding(
+            "mechanism.free-platform",
+            name=robot.name,
+            motion=tuple(list_main_freedoms(names, V[rank])),
+            equations=len(A),
+            rank=rank,
+            freedoms=m,
+        )
+        raise MechanismError(finding)
+    _, both, W = np.linalg.svd(np.concatenate([A, Q], axis=1), full_matrices=True)
+    # motions with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
+    independent = count_rank(both)
+    motions = W[independent:, :m]
+    movable = len(motions)
+    if movable < min(a, m):
+        fixed = np.linalg.svd(motions, full_matrices=True)[2][movable:] if movable else np.eye(m)
+        finding = report_finding(
+            "mechanism.over-constrained",
+            name=robot.name,
+            actuators=a,
+            movable=movable,
+            freedoms=m,
+            motions=tuple(tuple(list_main_freedoms(names, y)) for y in fixed),
+        )
+        raise MechanismError(finding)
+    if len(robot.controlled) != movable:
+        raise MechanismError(
+            f"{robot.name} can be moved in {movable} freedoms, but names "
+            f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
+            f"{movable}"
+        )
+    _check_controlled(robot, movable, scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0])
+    if robot.has_open_sums:
+        _check_open_sums(robot, scale)
+
+
+def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
+    """Refuse sums that leave the platform free at home; scale : (m,) of its freedoms."""
+    e, tau = robot.slots(robot.values[None])
+    weights = select_weights(tau)
+    assert weights is not None
+    slope = actuation.differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
+    if count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
+        raise MechanismError(
+            f"{robot.name}: the sums of its readings do not hold the platform at home, where it "
+            "can move while all sums are constant; correct the weights of `sum:`, or state another "
+            "`home:`"
+        )
+
+
+def _check_controlled(robot: Mechanism, movable: int, D: FloatArray) -> None:
+    """Refuse controlled coordinates that the actuators cannot set independently.
+
+    D : (m, a) freedoms per actuated joint.
+    """
+    columns = _differentiate_controlled(robot, robot.home)
+    s = np.linalg.svd(columns @ D, compute_uv=False)
+    if count_rank(s) < movable:
+        raise MechanismError(_word_dependent(robot, movable))
+
+
+def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
+    """Refuse coordinates that do not determine the platform where its limbs let it move.
+
+    state : (1, 1). Raises MechanismError.
+    """
+    program = robot.program
+    e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
+    rows = stack_platform_rows(engine.linearize(program, e, q, state, free=True))[0, 0]
+    columns = _differentiate_controlled(robot, state.T[0, 0])
+    scale = 1 / robot.twist_scale[list(program.freedoms)]
+    s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
+    if count_rank(s) < len(scale):
+        raise MechanismError(_word_dependent(robot, len(robot.controlled)))
+
+
+def refuse_singular_home(robot: Mechanism, state: engine.State) -> None:
+    """Refuse a home pose at which the loops are closed, but the iteration does not converge.
+
+    state : (1, 1). Raises MechanismError, which names the actuators that move nothing there.
+    """
+    if not state.residual[0, 0] < CLOSED * robot.size:
+        return
+    program, e = robot.program, robot.slots(robot.values[None])[0]
+    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    motion = np.linalg.norm(stack_driven_columns(program, blocks)[0, 0], axis=0)
+    names = robot.assembly.driven_joints
+    turning = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
+    turns = np.array([name in turning for name in names])
+    is_idle = motion < STRETCHED * np.where(turns, robot.size, 1.0)
+    finding = report_finding(
+        "mechanism.singular-home",
+        name=robot.name,
+        actuators=tuple(name for name, idle in zip(names, is_idle, strict=True) if idle),
+    )
+    raise MechanismError(finding)
+
+
+def _differentiate_controlled(robot: Mechanism, T: FloatArray) -> FloatArray:
+    """Return d controlled coordinates / d freedoms (c, m) at a pose (4, 4)."""
+    target = read_coordinates(T[None], robot.controlled)
+    _, columns = compare_coordinates(T[None], target, robot.controlled, robot.size)
+    return columns[0][:, list(robot.program.freedoms)]
+
+
+def _word_dependent(robot: Mechanism, count: int) -> str:
+    """Return the sentence for controlled coordinates that depend on each other."""
+    return (
+        f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot be set independently "
+        f"at home; name {count} that the actuators move independently, of {', '.join(COORDINATES)}"
+    )
+
+
+def find_idle_joints(program: engine.Program, guess: engine.State) -> dict[int, tuple[int, ...]]:
+    """Return the joints to lock of each limb that can move while tip and platform rest.
+
+    An S-P-S leg, for example, can spin about its axis. One joint is locked for each such motion.
+    The passive twists of a limb are ranked by the singular values of their triangular factor, at
+    joint values away from any special position; of the joints in a null combination the one with
+    the largest component is chosen. Every limb is judged by its own geometry, independently of
+    other limbs of the same structure and of the order of limbs.
+    """
+    # the same disturbance in every limb: the result must not depend on the order of the limbs
+    shifts = [np.random.default_rng(0).uniform(-0.3, 0.3, j.shape[-1]) for j in guess.joints]
+    shaken = replace(
+        guess, joints=tuple(j + shift for j, shift in zip(guess.joints, shifts, strict=True))
+    )
+    # driven joints are disturbed too: with a slide at zero the lower joint of a leg would seem to
+    # spin it only
+    e, q = np.zeros((1, program.n_displacements)), driven_values(program, shaken)
+    blocks = engine.linearize(program, e, q, shaken)
+    idle = {}
+    for group, block, joints in zip(program.groups, blocks.passive, blocks.joints, strict=True):
+        for k, limb in enumerate(group.limbs):
+            chosen = _find_dependent_columns(block.U[0, 0, k]) if joints else []
+            if chosen:
+                idle[limb] = tuple(joints[c] for c in chosen)
+    return idle
+
+
+def _find_dependent_columns(U: FloatArray) -> list[int]:
+    """Return the columns without which the others are independent, one for each null direction."""
+    chosen: list[int] = []
+    while True:
+        rest = [c for c in range(U.shape[1]) if c not in chosen]
+        _, s, V = np.linalg.svd(U[:, rest])
+        if count_rank(s) == len(rest):
+            return chosen
+        part = np.abs(V[-1])
+        # of equal components the first, whatever their rounding errors
+        chosen.append(rest[int(np.argmax(part > (1 - 1e-6) * part.max()))])
+
+
+def count_rank(s: NDArray[np.floating[Any]]) -> int:
+    """Return how many singular values of closure equations are above RANK times the largest."""
+    return int(are_nonzero(s, RANK).sum())
+
+
+def list_main_freedoms(names: Sequence[str], direction: FloatArray) -> list[str]:
+    """Return the freedoms with a large component in a motion (m,), the largest one first."""
+    size = np.abs(direction)
+    return [str(names[i]) for i in np.argsort(-size) if size[i] > MAIN_SHARE * size.max()]
+
+
+# --- Checks of an assembly: names, limbs, freedoms and ranges that fit together.
+
+
+def check_assembly(assembly: Assembly, *, is_stage: bool = False) -> None:
+    """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError.
+
+    A stage that is a serial joint needs no controlled coordinates, because its joint is commanded.
+    """
+    _check_size(assembly)
+    _check_names(assembly)
+    for limb in assembly.limbs:
+        _check_limb(limb)
+    _check_freedoms(assembly, is_stage)
+    _check_ranges(assembly)
+
+
+def _check_size(assembly: Assembly) -> None:
+    """Refuse more limbs, joints, actuators or parameters than a mechanism may have."""
+    refuse_more(MOST_LIMBS, len(assembly.limbs), f"{assembly.name} has", "limbs")
+    for limb in assembly.limbs:
+        refuse_more(MOST_JOINTS, len(limb.joints), f"limb {limb.name!r} has", "joints")
+    refuse_more(MOST_ACTUATORS, len(assembly.actuators), f"{assembly.name} has", "actuators")
+    refuse_more(MOST_PARAMETERS, len(assembly.parameters), f"{assembly.name} has", "parameters")
+
+
+def _check_names(assembly: Assembly) -> None:
+    """Refuse duplicate names, and drives or actuators without their counterpart."""
+    limbs, actuators = [limb.name for limb in assembly.limbs], [a.name for a in assembly.actuators]
+    for kind, names in (("limb", limbs), ("actuator", actuators)):
+        for name in names:
+            if names.count(name) > 1:
+                raise MechanismError(f"two {kind}s are called {name!r}; give each its own name")
+    driven = [name for limb in assembly.limbs for name in limb.drives]
+    read = assembly.driven_joints
+    for name in read:
+        if name not in driven:
+            raise MechanismError(
+                f"actuator {name!r} drives 0 joints; let it drive one joint, or one in each of "
+                "several limbs"
+            )
+    unknown = sorted(set(driven) - set(read))
+    if unknown:
+        raise MechanismError(
+            f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or "
+            "correct the name"
+        )
+
+
+def _check_limb(limb: Limb) -> None:
+    """Refuse duplicate names, two joints on a drive, an unknown ending or missing links."""
+    joints = [joint.name for joint in limb.joints]
+    if len(set(joints)) < len(joints):
+        raise MechanismError(
+            f"two joints of limb {limb.name!r} have the same name ({', '.join(joints)}); give each "
+            "its own name"
+        )
+    if len(set(limb.drives)) < len(limb.drives):
+        raise MechanismError(
+            f"actuator {limb.drives[0]!r} drives two joints of limb {limb.name!r}; an actuator "
+            "may drive one joint of a limb"
+        )
+    if limb.ending not in ENDINGS:
+        raise MechanismError(
+            f"limb {limb.name!r} ends in {limb.ending!r}; allowed endings are {', '.join(ENDINGS)}"
+        )
+    if len(limb.links) != len(limb.joints) + 1:
+        raise MechanismError(
+            f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; give "
+            "one link more than joints"
+        )
+
+
+def _check_freedoms(assembly: Assembly, is_stage: bool) -> None:
+    """Refuse missing, unknown or duplicate freedoms and controlled coordinates."""
+    freedoms = assembly.freedoms
+    unknown = [f for f in freedoms if f not in AXES]
+    if unknown:
+        raise MechanismError(
+            f"{unknown[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}"
+        )
+    if not freedoms:
+        raise MechanismError(
+            f"{assembly.name} has no freedoms; state those of its platform, of {', '.join(AXES)}"
+        )
+    duplicates = [f for f in freedoms if freedoms.count(f) > 1]
+    if duplicates:
+        raise MechanismError(
+            f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}; name each once"
+        )
+    balls = [limb.name for limb in assembly.limbs if not select_rows(limb.ending, freedoms)]
+    if balls:
+        raise MechanismError(
+            f"limb {balls[0]!r} ends in a ball, whose closure equations are shifts, but the "
+            f"freedoms of the platform are {', '.join(freedoms)}; state the shifts of its origin, "
+            "too, or leave out `freedoms:`"
+        )
+    rotations = [f for f in freedoms if f.startswith("r")]
+    if len(rotations) == 2:
+        raise MechanismError(
+            f"{assembly.name} has the freedoms {' and '.join(rotations)}, which define no pose: "
+            "the same two rotations in another order lead to another one. Let the platform have "
+            "all freedoms, and add a limb with the joint that holds it, such as {joint: U, axes: "
+            "[x, y]} with the ending rigid"
+        )
+    if is_stage and is_serial(assembly):
+        return
+    if not assembly.controlled:
+        raise MechanismError(
+            f"{assembly.name} names no controlled coordinate; state one for each freedom, of "
+            f"{', '.join(COORDINATES)}"
+        )
+    check_coordinates(assembly.controlled)
+
+
+def _check_ranges(assembly: Assembly) -> None:
+    """Refuse strokes and limits whose low end is not below the high one."""
+    ranges = [(f"stroke of {a.name} runs", a.stroke, a.dimension) for a in assembly.actuators]
+    ranges += [
+        (f"limits of {limb.name}.{joint.name} run", joint.limits, joint.dimension)
+        for limb in assembly.limbs
+        for joint in limb.joints
+    ]
+    for what, bounds, dimension in ranges:
+        if bounds and not bounds[0] < bounds[1]:
+            raise MechanismError(
+                f"the {what} from {bounds[0]:g} to {bounds[1]:g} {SI_SYMBOLS[dimension]}; the "
+                "first value must be smaller"
+            )

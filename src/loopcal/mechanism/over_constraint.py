@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Over-constrained machines: which closure equations repeat others, and what would break them.
+
+With every actuator free, linearized closure reads A y + Q dq = 0. Combinations w of its rows with
+w'A = 0 and w'Q = 0 are equations that repeat others. In statics w is a force that the limbs exert
+on each other through the platform while the actuators are free (self-stress); limb k exerts the
+wrench A_k'w_k. A change of a parameter that changes w'E de opens the loops by this much: no pose
+and no reading can close them again. Derivation: docs/theory/over-constraint.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.engine import State
+from loopcal.errors import MechanismError
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.assembly import AXES, Assembly
+from loopcal.mechanism.kinematics import compute_readings, forward_trials
+from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.mobility import RANK, check_assembly, count_rank
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+SAME = 1e-6
+"""Largest component, relative to the whole, by which a vector may differ from a named direction,
+or from the equations of other limbs, and still count as one of them.
+"""
+BREAKS = 1e-7
+"""Share of a parameter's effect on the equations above which it opens the loops.
+
+Rounding is below 1e-11.
+"""
+NEARBY, DISTANCE = 4, 0.03
+"""Number of poses near home that are examined with it, and the change of their driven joints: a
+share of the robot's size, or this many radians. Home alone may be a special position.
+"""
+
+
+class RepeatedDirection(NamedTuple):
+    """A direction that a limb constrains although other limbs do.
+
+    turns : whether it is a rotation about `axis`, else a translation along it. axis : (3,) in base
+    axes at home.
+    """
+
+    turns: bool
+    axis: tuple[float, float, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the direction for a finding; an axis of the base by its name."""
+        size = np.abs(self.axis)
+        name = "xyz"[int(size.argmax())] if size.max() > 1 - SAME else ""
+        vector = tuple(round(float(v), 3) + 0.0 for v in self.axis)
+        return {"turns": self.turns, "name": name, "vector": () if name else vector}
+
+
+class _Rows(NamedTuple):
+    """The closure equations at one pose with the passive joints eliminated.
+
+    A : (c, m) by the platform's freedoms, rotations over the robot's size. Q : (c, a) by driven
+    joints. E : (c, d) by displacements. limb : (c,) the limb of each equation. absorbed : (j, d) by
+    displacements, the equations that determine the j passive joints.
+    """
+
+    A: FloatArray
+    Q: FloatArray
+    E: FloatArray
+    limb: IntArray
+    absorbed: FloatArray
+
+    def find_repeated(self, limbs: IntArray) -> FloatArray:
+        """Return orthonormal combinations (r, c) of the rows of some limbs that repeat others."""
+        own = np.isin(self.limb, limbs)
+        both = np.concatenate([self.A, self.Q], axis=1)[own]
+        left, s, _ = np.linalg.svd(both, full_matrices=True)
+        out = np.zeros((len(both) - count_rank(s), len(own)))
+        out[:, own] = left[:, len(both) - len(out) :].T
+        return out
+
+    def constrain(self, limb: int) -> FloatArray:
+        """Return an orthonormal basis (r, m) of what a limb constrains with its drives free."""
+        own = self.limb == limb
+        left, s, _ = np.linalg.svd(self.Q[own], full_matrices=True)
+        undriven = left[:, count_rank(s) :]
+        return _find_basis(undriven.T @ self.A[own])
+
+
+def _find_basis(vectors: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (r, m) of vectors (k, m) whose size is about 1 or 0."""
+    _, s, V = np.linalg.svd(vectors, full_matrices=False)
+    return V[: int((s > SAME * s.max(initial=1.0)).sum())]
+
+
+def _linearize(robot: Mechanism, state: State) -> list[_Rows]:
+    """Return the equations at the poses of a state (1, n), at the nominal values."""
+    program, e = robot.program, robot.slots(robot.parameters.nominal[None])[0]
+    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    scale = 1 / robot.twist_scale[list(program.freedoms)]
+    A, Q = stack_platform_rows(blocks)[0] * scale, stack_driven_columns(program, blocks)[0]
+    E, limb = _stack_displacements(program, blocks.closure)
+    absorbed, _ = _stack_displacements(program, blocks.passive)
+    n = state.T.shape[1]
+    return [_Rows(A[i], Q[i], E[i], limb, absorbed[i]) for i in range(n)]
+
+
+def _stack_displacements(
+    program: engine.Program, blocks: tuple[engine.Block, ...]
+) -> tuple[FloatArray, IntArray]:
+    """Return rows of all limbs by all displacements (n, c, d), and the limb of each row (c,)."""
+    rows, limb = [], []
+    for group, block in zip(program.groups, blocks, strict=True):
+        width = len(group.slots)
+        for k, number in enumerate(group.limbs):
+            E = np.zeros((*block.E.shape[1:2], block.E.shape[3], program.n_displacements))
+            first = group.columns.start + k * width
+            E[..., first : first + width] = block.E[0, :, k]
+            rows.append(E)
+            limb += [number] * E.shape[1]
+    return np.concatenate(rows, axis=1), np.array(limb)
+
+
+def report_over_constraint(
+    robot: Mechanism, close_at_home: Callable[[Assembly], Mechanism]
+) -> Mechanism:
+    """Return the robot with a finding of its closure equations that repeat others, if any do, and
+    with loops that may stay open where its file asks for the least-squares closure.
+
+    close_at_home : returns the robot of an assembly, to try fewer freedoms.
+    """
+    asks = robot.assembly.closure == "least-squares"
+    rows = _linearize(robot, robot.home_state)[0]
+    count = _count_repeated(robot, rows)
+    if not count:
+        without = (report_finding("mechanism.closure-without-effect"),) if asks else ()
+        return replace(robot, findings=(*robot.findings, *without))
+    finding = report_finding(
+        "mechanism.repeated-equations",
+        count=count,
+        tolerance=RANK,
+        closes=asks,
+        repeated=_list_repeated(robot, rows),
+        freedoms=_find_sufficient_freedoms(robot, close_at_home),
+    )
+    program = replace(robot.program, may_stay_open=asks)
+    return replace(robot, program=program, findings=(*robot.findings, finding))
+
+
+def _count_repeated(robot: Mechanism, rows: _Rows) -> int:
+    """Return how many closure equations repeat others."""
+    return len(rows.find_repeated(np.arange(len(robot.assembly.limbs))))
+
+
+def _list_repeated(robot: Mechanism, rows: _Rows) -> tuple[dict[str, Any], ...]:
+    """Return, for each limb that repeats limbs before it in the file, the directions by limbs."""
+    names, out = [limb.name for limb in robot.assembly.limbs], []
+    for last in range(len(names)):
+        stresses = rows.find_repeated(np.arange(last + 1))[:, rows.limb == last]
+        wrenches = _find_basis(stresses @ rows.A[rows.limb == last])
+        by_others: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+        for wrench, direction in _name_directions(wrenches, robot.program.freedoms):
+            others = tuple(names[i] for i in _find_others(rows, last, wrench))
+            by_others.setdefault(others, []).append(direction.to_dict())
+        out += [
+            {"limb": names[last], "others": others, "directions": tuple(directions)}
+            for others, directions in by_others.items()
+        ]
+    return tuple(out)
+
+
+def _find_others(rows: _Rows, last: int, wrench: FloatArray) -> list[int]:
+    """Return limbs before `last` that together constrain a direction: the first that does alone,
+    else a set from which none can be left out.
+    """
+
+    def is_constrained(limbs: list[int]) -> bool:
+        basis = _find_basis(np.concatenate([rows.constrain(i) for i in limbs]))
+        return float(np.linalg.norm(wrench - basis.T @ (basis @ wrench))) < SAME
+
+    for limb in range(last):
+        if is_constrained([limb]):
+            return [limb]
+    needed = list(range(last))
+    for limb in range(last):
+        rest = [i for i in needed if i != limb]
+        if rest and is_constrained(rest):
+            needed = rest
+    return needed
+
+
+def _name_directions(
+    wrenches: FloatArray, freedoms: tuple[int, ...]
+) -> list[tuple[FloatArray, RepeatedDirection]]:
+    """Return a basis of the wrenches (r, m), each (m,) with the direction that it constrains.
+
+    A wrench without force constrains a rotation, any other one the translation along its force.
+    Axes of the base are chosen where they can be.
+    """
+    whole = np.zeros((len(wrenches), 6))
+    whole[:, list(freedoms)] = wrenches
+    _, s, V = np.linalg.svd(whole[:, 3:].T, full_matrices=True)
+    forces = int((s > SAME).sum())
+    couples = V[forces:] @ whole
+    moving = V[:forces] @ whole
+    named = [(couples, slice(0, 3), True), (moving, slice(3, 6), False)]
+    out = []
+    for basis, part, turns in reversed(named):
+        for axis in _choose_axes(basis[:, part]):
+            weights = np.linalg.lstsq(basis[:, part].T, axis, rcond=None)[0]
+            wrench = weights @ basis
+            unit = wrench[list(freedoms)] / np.linalg.norm(wrench)
+            x, y, z = (float(v) for v in axis)
+            out.append((unit, RepeatedDirection(turns, (x, y, z))))
+    return out
+
+
+def _choose_axes(vectors: FloatArray) -> FloatArray:
+    """Return orthonormal vectors that span the same space as vectors (r, 3): axes of the base that
+    it contains, then others, whose largest component is positive.
+    """
+    basis = _find_basis(vectors) if len(vectors) else vectors
+    chosen = [axis for axis in np.eye(3) if np.linalg.norm(axis - basis.T @ (basis @ axis)) < SAME]
+    if len(chosen) < len(basis):
+        known = np.array(chosen).reshape(-1, 3)
+        rest = basis - basis @ known.T @ known
+        chosen += list(_find_basis(rest))
+    signed = [axis * np.sign(axis[np.abs(axis).argmax()]) for axis in chosen]
+    return np.array(signed).reshape(-1, 3)
+
+
+def _find_sufficient_freedoms(
+    robot: Mechanism, close_at_home: Callable[[Assembly], Mechanism]
+) -> tuple[str, ...]:
+    """Return the most freedoms with which no equation repeats another; none where there are none.
+
+    Those in which the platform moves, home and near it, are among them. A freedom that is left out
+    hides the errors that move the platform in it, so that as few as possible are.
+    """
+    freedoms = robot.program.freedoms
+    used = np.zeros(len(freedoms), bool)
+    for rows in _linearize(robot, find_nearby_states(robot)):
+        _, s, W = np.linalg.svd(np.concatenate([rows.A, rows.Q], axis=1), full_matrices=True)
+        motions = W[count_rank(s) :, : len(freedoms)]
+        largest = np.abs(motions).max(axis=0, initial=0.0)
+        used |= largest > SAME * largest.max(initial=1e-300)
+    still = np.flatnonzero(~used)
+    for left_out in range(1, len(still) + 1):
+        for dropped in combinations(still.tolist(), left_out):
+            names = tuple(AXES[f] for i, f in enumerate(freedoms) if i not in dropped)
+            if _is_exact_with(robot, names, close_at_home):
+                return names
+    return ()
+
+
+def _is_exact_with(
+    robot: Mechanism, freedoms: tuple[str, ...], close_at_home: Callable[[Assembly], Mechanism]
+) -> bool:
+    """Return whether the robot can have these freedoms, and then no equation repeats another."""
+    narrow = replace(robot.assembly, freedoms=freedoms, closure="exact")
+    try:
+        check_assembly(narrow)
+        flat = close_at_home(narrow)
+    except MechanismError:
+        return False
+    return not _count_repeated(flat, _linearize(flat, flat.home_state)[0])
+
+
+def find_self_stress(robot: Mechanism) -> FloatArray:
+    """Return wrenches (r, limbs, m) that limbs exert in r self-stresses at home, by the freedoms of
+    the platform with rotations over the robot's size.
+    """
+    rows = _linearize(robot, robot.home_state)[0]
+    numbers = np.arange(len(robot.assembly.limbs))
+    stresses = rows.find_repeated(numbers)
+    own = [stresses[:, rows.limb == i] @ rows.A[rows.limb == i] for i in numbers]
+    return np.stack(own, axis=1)
+
+
+def find_nearby_states(robot: Mechanism) -> State:
+    """Return home and closed poses near it (1, n), at the nominal values."""
+    home, rng = robot.home_state, np.random.default_rng(0)
+    nominal = robot.parameters.nominal[None]
+    q = compute_readings(robot, nominal, home)
+    turns = {j.actuator for limb in robot.assembly.limbs for j in limb.joints if j.kind == "R"}
+    unit = np.array([1.0 if a.name in turns else robot.size for a in robot.actuators])
+    shifts = DISTANCE * unit * rng.uniform(-1.0, 1.0, (NEARBY, len(unit)))
+    near = forward_trials(robot, nominal, q + shifts[None], follow=False)
+    return join_states(home, select_poses(near, near.status[0] == Status.CONVERGED.value))
+
+
+def find_over_constraint(robot: Mechanism) -> Finding | None:
+    """Return the finding of closure equations that repeat others, None where none does."""
+    code = "mechanism.repeated-equations"
+    return next((finding for finding in robot.findings if finding.code == code), None)
+
+
+def is_over_constrained(robot: Mechanism) -> bool:
+    """Return whether closure equations repeat others, so that only exact geometry closes."""
+    return find_over_constraint(robot) is not None
+
+
+def refuse_free_breaking_parameters(robot: Mechanism) -> None:
+    """Refuse to vary free parameters that open the loops of an over-constrained robot.
+
+    Raises
+    ------
+    MechanismError
+        `mechanism.free-parameters-open-loops`.
+    """
+    if names := find_breaking_parameters(robot):
+        raise MechanismError(_report_breaking("mechanism.free-parameters-open-loops", robot, names))
+
+
+def refuse_drawn_errors(robot: Mechanism) -> None:
+    """Refuse to draw errors of an over-constrained robot that open its loops.
+
+    Raises
+    ------
+    MechanismError
+        `mechanism.drawn-errors-open-loops`.
+    """
+    table = robot.parameters
+    drawn = {p.name for p in table.entries if p.tolerance}
+    if names := tuple(name for name in find_breaking_parameters(robot) if name in drawn):
+        raise MechanismError(_report_breaking("mechanism.drawn-errors-open-loops", robot, names))
+
+
+def _report_breaking(code: str, robot: Mechanism, names: tuple[str, ...]) -> Finding:
+    """Return the finding of parameters that open loops."""
+    finding = find_over_constraint(robot)
+    assert finding is not None
+    return report_finding(code, name=robot.name, names=names, repeated=finding.data["repeated"])
+
+
+def find_breaking_parameters(robot: Mechanism) -> tuple[str, ...]:
+    """Return the free parameters any change of which opens the loops."""
+    names, free = robot.parameters.names, robot.parameters.free
+    return tuple(names[i] for i in np.flatnonzero(_detect_breaking(robot) & free))
+
+
+def fix_breaking_parameters(robot: Mechanism) -> Mechanism:
+    """Return the robot without the free parameters any change of which opens the loops."""
+    breaking = set(find_breaking_parameters(robot))
+    if not breaking:
+        return robot
+    kept = [p.name for p in robot.parameters.entries if p.free and p.name not in breaking]
+    return replace(robot, parameters=robot.parameters.with_free(kept))
+
+
+def _detect_breaking(robot: Mechanism) -> BoolArray:
+    """Return which parameters (p,) open the loops of an over-constrained robot.
+
+    At the poses of `find_nearby_states`, with the repeated equations w, it compares
+    w'E de/dp with E de/dp, of which passive joints absorb a part.
+    """
+    breaks = np.zeros(len(robot.parameters), bool)
+    for stage in robot.stages:
+        breaks[stage.parameters] = _detect_breaking(stage.robot)
+    if robot.stages or robot.program.may_stay_open or not is_over_constrained(robot):
+        return breaks
+    numbers, d = np.arange(len(robot.assembly.limbs)), robot.program.n_displacements
+    slopes = robot.slots.jacobian(robot.parameters.nominal[None])[0, :d]
+    for rows in _linearize(robot, find_nearby_states(robot)):
+        opened = np.linalg.norm(rows.find_repeated(numbers) @ rows.E @ slopes, axis=0)
+        effect = np.linalg.norm(np.concatenate([rows.E, rows.absorbed]) @ slopes, axis=0)
+        breaks |= opened > BREAKS * effect
+    return breaks

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Distance of poses from singularities, and warnings along a path.
+
+Closure without passive joints reads A y + Q dq = 0: rows in meters, columns of A for a translation
+in meters and for a rotation in radians times the robot's size, so that the singular values of A
+are meters per meter. The smallest one, the margin, is zero where the platform can move although
+every actuator is locked (a parallel singularity). The smallest one of Q, columns of rotary
+actuators per size too, is zero where an actuator moves nothing (a serial singularity). A margin has
+no absolute scale, so it is compared with its median over the workspace. A chain of stages is
+singular where a stage is, and where its readings do not move the controlled coordinates
+independently. Derivation: docs/theory/kinematics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal import engine
+from loopcal.engine import State
+from loopcal.errors import DataError
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.actuation import differentiate_lengths
+from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.chains import find_carrying_actuators, split_stage_states, transport_to_end
+from loopcal.mechanism.kinematics import compute_closure_sign, compute_readings
+from loopcal.mechanism.limb_rows import stack_driven_columns, stack_platform_rows
+from loopcal.mechanism.mobility import list_main_freedoms
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.solutions import Solution, forward, inverse, make_solution
+from loopcal.mechanism.states import driven_values, join_states
+from loopcal.mechanism.transmission import invert_weights, select_weights
+from loopcal.mechanism.workspace import sample_workspace
+from loopcal.presentation import HtmlResult
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
+
+NEAR_SHARE = 0.1
+"""Share of the median margin below which a pose is close to a singularity (rule of thumb)."""
+SAMPLE_SIZE = 400
+"""Positions of the workspace from which the median margins are taken."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Singularity(HtmlResult):
+    """Distance of n poses from singularities.
+
+    Attributes
+    ----------
+    closure_sign : (n,) sign of the determinant of A; it changes only at a singularity. 0 if A is
+        not square.
+    margin : (n,) smallest singular value of A [m/m]; NaN where the pose was not reached.
+    direction : (n, m) least constrained motion: unit vector over the freedoms, angles times size.
+    drive_margin : (n,) smallest singular value of Q [m/m]. drive : (n,) the actuator that moves the
+        platform least.
+    median, drive_median : of margin and drive_margin over the workspace, or their values at home if
+        no workspace is stated.
+    freedoms, actuators : names of the columns. solution : the poses.
+    warnings : along a path, (step, finding) in its order.
+    """
+
+    closure_sign: NDArray[np.int8]
+    margin: FloatArray
+    direction: FloatArray
+    drive_margin: FloatArray
+    drive: IntArray
+    median: float
+    drive_median: float
+    freedoms: tuple[str, ...]
+    actuators: tuple[str, ...]
+    solution: Solution
+    warnings: tuple[tuple[int, Finding], ...] = ()
+
+    def __repr__(self) -> str:
+        text = f"<Singularity of {len(self.margin)} poses, {int(self.is_near.sum())} near or lost"
+        if np.isfinite(self.margin).any():
+            row = int(np.nanargmin(np.fmin(self.ratio, self.drive_ratio)))
+            text += f"; smallest margin at row {row}: {self.explain(row)}"
+        return text + ">"
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Margin (n,) in units of the workspace's median."""
+        return self.margin / self.median
+
+    @property
+    def drive_ratio(self) -> FloatArray:
+        """Drive margin (n,) in units of the workspace's median."""
+        return self.drive_margin / self.drive_median
+
+    @property
+    def is_near(self) -> BoolArray:
+        """Poses (n,) with a margin below NEAR_SHARE of its median, or not reached."""
+        return ~((self.ratio >= NEAR_SHARE) & (self.drive_ratio >= NEAR_SHARE))
+
+    def motion(self, row: int) -> tuple[str, ...]:
+        """Return the freedoms of the least constrained motion, the largest component first."""
+        return tuple(list_main_freedoms(self.freedoms, self.direction[row]))
+
+    def explain(self, row: int) -> Finding:
+        """Return the distance of a row from a singularity."""
+        if not np.isfinite(self.margin[row]):
+            reason = str(self.solution.explain(row))
+            return report_finding("singularity.not-reached", row=row, reason=reason)
+        weak = self.drive_ratio[row] < NEAR_SHARE
+        code = "singularity.weak-actuator" if weak else "singularity.distance"
+        return report_finding(code, **self._describe(row))
+
+    def _describe(self, row: int) -> dict[str, Any]:
+        """Return the numbers and names of a row that its findings state."""
+        described: dict[str, Any] = {
+            "row": row,
+            "margin": float(self.margin[row]),
+            "ratio": float(self.ratio[row]),
+            "motion": self.motion(row),
+            "actuator": None,
+        }
+        if self.drive_ratio[row] < NEAR_SHARE:
+            described["actuator"] = self.actuators[self.drive[row]]
+            described["drive_margin"] = float(self.drive_margin[row])
+            described["drive_ratio"] = float(self.drive_ratio[row])
+        return described
+
+    def list_path_warnings(self) -> Iterator[tuple[int, Finding]]:
+        """Yield steps not reached, sign changes and stretches close to a singularity."""
+        closed = np.isfinite(self.margin)
+        sign, near = self.closure_sign.astype(int), self.is_near & closed
+        for i in range(len(sign)):
+            before = sign[:i][closed[:i]][-1:]
+            if closed[i] and before.size and sign[i] * before[0] < 0:
+                yield i, report_finding("singularity.path-crosses", row=i)
+            if not closed[i] and (i == 0 or closed[i - 1]):
+                reason = str(self.solution.explain(i))
+                yield i, report_finding("singularity.path-not-reached", row=i, reason=reason)
+            if near[i] and not (i and near[i - 1]):
+                beyond = np.flatnonzero(~near[i:])
+                stretch = np.arange(i, i + int(beyond[0]) if beyond.size else len(sign))
+                ratio = np.fmin(self.ratio, self.drive_ratio)[stretch]
+                nearest = self._describe(int(stretch[np.argmin(ratio)]))
+                last = int(stretch[-1])
+                yield i, report_finding("singularity.path-near", first=i, last=last, **nearest)
+
+
+def analyze_singularity(
+    robot: Mechanism, poses: ArrayLike | Solution, medians: tuple[float, float] | None = None
+) -> Singularity:
+    """Return the distance of poses from singularities.
+
+    Parameters
+    ----------
+    poses : a Solution, or poses (n, 4, 4) or controlled coordinates (n, c) for `inverse`.
+    medians : of margin and drive margin, to compare with (default: over the workspace).
+    """
+    solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
+    margin, direction, drive_margin, drive = _compute_margins(robot, solution.state)
+    closed = solution.closed
+    sign = compute_closure_sign(robot, robot.values[None], solution.state)[0]
+    return Singularity(
+        np.where(closed, sign, 0).astype(np.int8),
+        np.where(closed, margin, np.nan),
+        direction,
+        np.where(closed, drive_margin, np.nan),
+        drive,
+        *(compute_median_margins(robot) if medians is None else medians),
+        tuple(AXES[f] for f in robot.program.freedoms),
+        tuple(a.name for a in robot.actuators),
+        solution,
+    )
+
+
+def trace_singularity(
+    robot: Mechanism,
+    *,
+    readings: ArrayLike | None = None,
+    coordinates: ArrayLike | None = None,
+    medians: tuple[float, float] | None = None,
+) -> Singularity:
+    """Return the distance from singularities along a path, with warnings.
+
+    Each step is solved from the step before, the first one from home.
+
+    Parameters
+    ----------
+    readings : (n, a) [m or rad], or coordinates : (n, c) controlled coordinates [m, rad]; one of
+        the two.
+    medians : as in `analyze_singularity`.
+
+    Raises
+    ------
+    DataError
+        Both or neither are given.
+    """
+    if (readings is None) == (coordinates is None):
+        raise DataError("give a path by its readings or by its coordinates, not both or neither")
+    solve, points = (forward, readings) if coordinates is None else (inverse, coordinates)
+    steps: list[Solution] = []
+    last: Solution | None = None
+    # along a path a row depends on the row before
+    for point in np.atleast_2d(np.asarray(points, dtype=float)):
+        step = solve(robot, point[None], start=last)
+        steps.append(step)
+        last = step if step.closed[0] else last
+    state = join_states(*(step.state for step in steps))
+    path = make_solution(robot, state, np.concatenate([step.q for step in steps]))
+    result = analyze_singularity(robot, path, medians)
+    return replace(result, warnings=tuple(result.list_path_warnings()))
+
+
+def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
+    """Return the median margin and drive margin over the workspace.
+
+    Without a stated workspace they are those of home.
+    """
+    state, stated = robot.home_state, set(robot.assembly.workspace)
+    if "theta" in stated:
+        stated.add("phi")
+    if set(robot.controlled) <= stated:
+        state = sample_workspace(robot, SAMPLE_SIZE).solution.state
+    margin, _, drive_margin, _ = _compute_margins(robot, state)
+    return float(np.median(margin)), float(np.median(drive_margin))
+
+
+def _compute_margins(
+    robot: Mechanism, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Return margin (n,), least constrained motion (n, m), drive margin (n,), weakest drive (n,).
+
+    The state is (1, n).
+    """
+    if robot.stages:
+        return _compute_chain_margins(robot, state)
+    program = robot.program
+    e, _ = robot.slots(robot.values[None])
+    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    A, Q = stack_platform_rows(blocks)[0], stack_driven_columns(program, blocks)[0]
+    if robot.has_sums:
+        A, Q = _sum_rows(robot, state, A, Q)
+    A = A / robot.twist_scale[list(program.freedoms)]
+    Q = Q / np.where(turning, robot.size, 1.0)
+    good = np.asarray(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
+    A, Q = np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0)
+    _, s, V = np.linalg.svd(A)
+    _, r, W = np.linalg.svd(Q)
+    margin, drive_margin = (np.where(good, x[:, -1], np.nan) for x in (s, r))
+    return margin, V[:, -1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
+
+
+def _sum_rows(
+    robot: Mechanism, state: State, A: FloatArray, Q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return closure rows against freedoms (n, c, m) and against sums (n, c, a) of a state (1, n).
+
+    A, Q : against freedoms and joints. The rows of open sums are W L_y dy - ds = 0.
+    """
+    e, tau = robot.slots(robot.values[None])
+    weights = select_weights(tau)
+    assert weights is not None
+    if robot.has_open_sums:
+        rows = np.matmul(weights, differentiate_lengths(robot.program, e, state)[0])
+        return rows, np.tile(-np.eye(len(robot.actuators)), (len(rows), 1, 1))
+    return A, np.matmul(Q, invert_weights(weights))
+
+
+def _compute_chain_margins(
+    robot: Mechanism, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Return the margins of a chain: the least margin of its loops, and that of C D.
+
+    C D are the derivatives of the controlled coordinates by the readings. A chain of serial joints
+    alone has the margin 1: locked joints hold the platform in every direction alike.
+    """
+    n, values = state.T.shape[1], robot.values[None]
+    margin, direction = np.ones(n), np.tile(np.eye(6)[0], (n, 1))
+    transports = dict(transport_to_end(robot, state, len(robot.stages) - 1))
+    for i, own in enumerate(split_stage_states(robot, state)):
+        stage = robot.stages[i].robot
+        if stage.is_serial or i not in transports:
+            continue
+        least, motion, *_ = _compute_margins(stage, own)
+        twist = np.zeros((n, 6))
+        freedoms = list(stage.program.freedoms)
+        twist[:, freedoms] = motion / stage.twist_scale[freedoms]
+        twist = np.matmul(transports[i][0], twist[..., None])[..., 0] * robot.twist_scale
+        length = np.linalg.norm(twist, axis=1, keepdims=True)
+        is_less = ~(margin <= least)
+        margin = np.where(is_less, least, margin)
+        direction = np.where(is_less[:, None], twist / np.maximum(length, 1e-300), direction)
+    q = compute_readings(robot, values, state)
+    D = differentiate_pose(robot, values, q, state).readings[0]
+    T, names = state.T[0], robot.controlled
+    _, columns = compare_coordinates(T, read_coordinates(T, names), names, robot.size)
+    moving = find_carrying_actuators(robot)
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])[moving]
+    slope = np.matmul(columns, D[..., moving]) / np.where(turning, robot.size, 1.0)
+    good = np.isfinite(slope).all(axis=(1, 2))
+    _, r, W = np.linalg.svd(np.where(good[:, None, None], slope, 0.0))
+    drive_margin = np.where(good, r[:, -1], np.nan)
+    return margin, direction, drive_margin, moving[np.abs(W[:, -1]).argmax(axis=1)]

@@ -1,0 +1,855 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forward and inverse kinematics and the Jacobian of a robot, with a status for every row.
+
+A full pose that a machine with fewer freedoms cannot take is projected (`nearest_pose`). Source:
+docs/theory/kinematics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal import engine, geometry
+from loopcal.engine import NEAR_GOAL, State
+from loopcal.errors import DataError
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.chains import judge_stage_modes
+from loopcal.mechanism.kinematics import (
+    clear_sign,
+    close_at_coordinates,
+    close_at_joints,
+    compute_closure_sign,
+    compute_readings,
+    determine_platform,
+    forward_trials,
+    needs_readings,
+)
+from loopcal.mechanism.limb_rows import name_passive_joints, stack_platform_rows
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import (
+    compare_coordinates,
+    read_coordinates,
+    state_target,
+)
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.states import (
+    Status,
+    driven_values,
+    is_closed,
+    replace_rows,
+    reshape_rows,
+    select_poses,
+)
+from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
+from loopcal.numerics.trial_batch import map_arrays
+from loopcal.presentation import TableResult
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import SI_SYMBOLS
+
+# --- Tell whether a motion of the actuators leads from one state to another, by small steps.
+
+CONTRACTION = {1: 1 / 2, 3: 1 / 8}
+"""Number of Newton steps -> largest distance that they leave, per distance of the start."""
+FIRST_STEP, GROWTH, SHORTEST = 0.25, 2.0, 1 / 500
+"""First step of a path as a share of it, its growth after a safe step, and the shortest step.
+
+A step that is not safe is divided by the square of the growth.
+"""
+TRIALS = 80
+"""Most steps of a path, safe or not."""
+ITERATIONS = 12
+"""Newton steps of a step of a path: a safe one needs fewer."""
+SAME_JOINTS = 1e-6
+"""Largest difference of equal joints and poses: lengths per size of the robot, angles [rad]."""
+
+Step = Callable[[IntArray, FloatArray, State], State]
+"""Returns states (1, j) at shares (j,) of the paths of rows (j,), from states on these paths."""
+
+
+def connect_by_readings(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
+    """Follow the straight paths of joint values from states `first` (1, k | 1) to `last` (1, k).
+
+    Returns
+    -------
+    state : (1, k) the last states, with the passive joints at the end of a path.
+    connected : (k,) rows that a single safe step or a path without a singularity leads to.
+    """
+    return _connect(robot, first, last, contracts(robot, first, last), _move_readings)
+
+
+def connect_by_poses(robot: Mechanism, first: State, last: State) -> tuple[State, BoolArray]:
+    """Follow the straight paths of poses, and return what `connect_by_readings` returns."""
+    return _connect(robot, first, last, np.zeros(last.T.shape[1], bool), _move_poses)
+
+
+def _connect(
+    robot: Mechanism,
+    first: State,
+    last: State,
+    connected: BoolArray,
+    path: Callable[[Mechanism, State, State], Step],
+) -> tuple[State, BoolArray]:
+    """Return the last states and which are connected by a kind of path, if not already."""
+    rows = np.flatnonzero(~connected)
+    if not len(rows):
+        return last, connected
+    start = select_poses(repeat_poses(first, len(connected)), rows)
+    goal = select_poses(last, rows)
+    end, arrived = _follow_path(robot, start, path(robot, start, goal))
+    arrived &= _is_same_pose(robot, end, goal)
+    connected = connected.copy()
+    connected[rows] = arrived
+    return _take_joints(robot, last, rows[arrived], select_poses(end, arrived)), connected
+
+
+def contracts(robot: Mechanism, start: State, end: State) -> BoolArray:
+    """Return which steps (n,) between states (1, n | 1) and (1, n) Newton's method makes safely."""
+    e, _ = robot.slots(robot.values[None])
+    joints, whole = driven_values(robot.program, end), measure_distance(robot, start, end)
+    rows, done = np.arange(len(whole)), 0
+    safe, current = np.zeros(len(whole), bool), start
+    for steps, share in CONTRACTION.items():
+        if not len(rows):
+            break
+        q, count = joints[:, rows], steps - done
+        current, done = engine.solve(robot.program, e, q, current, max_iterations=count), steps
+        left = measure_distance(robot, current, select_poses(end, rows))
+        near = left <= share * whole[rows] + SAME_JOINTS
+        safe[rows[near]] = True
+        rows, current = rows[~near], select_poses(current, ~near)
+    return safe
+
+
+def measure_distance(robot: Mechanism, a: State, b: State) -> FloatArray:
+    """Return the largest difference (n,) of poses and joints of states (1, n | 1).
+
+    Lengths count per size of the robot, angles in radians.
+    """
+    twist = np.abs(geometry.pose_difference(*np.broadcast_arrays(a.T[0], b.T[0])))
+    largest = np.maximum(twist[:, :3].max(axis=1), twist[:, 3:].max(axis=1) / robot.size)
+    for group, mine, other in zip(robot.program.groups, a.joints, b.joints, strict=True):
+        unit = np.array([1.0 if kind == "R" else robot.size for kind in f"{group.joints}P"])
+        gap = np.abs(mine - other)[0] / unit
+        largest = np.maximum(largest, gap.max(axis=(1, 2), initial=0.0))
+    return largest
+
+
+def repeat_poses(state: State, n: int) -> State:
+    """Return a state (1, 1) or (1, n) as (1, n)."""
+    return map_arrays(lambda a: np.broadcast_to(a, (1, n, *a.shape[2:])), state)
+
+
+def _move_readings(robot: Mechanism, first: State, last: State) -> Step:
+    """Return the steps along straight paths of joint values between states (1, k)."""
+    e, _ = robot.slots(robot.values[None])
+    origin, target = driven_values(robot.program, first), driven_values(robot.program, last)
+
+    def step(rows: IntArray, share: FloatArray, current: State) -> State:
+        q = origin[:, rows] + (target - origin)[:, rows] * share[:, None]
+        return engine.solve(robot.program, e, q, current, max_iterations=ITERATIONS)
+
+    return step
+
+
+def _move_poses(robot: Mechanism, first: State, last: State) -> Step:
+    """Return the steps along straight paths of poses between states (1, k)."""
+    values = robot.values[None]
+    twist = geometry.pose_difference(last.T[0], first.T[0])
+
+    def step(rows: IntArray, share: FloatArray, current: State) -> State:
+        via = geometry.apply_twist(first.T[0, rows], share[:, None] * twist[rows])
+        target = read_coordinates(via, robot.controlled)
+        cheap = {"follow": False, "max_iterations": ITERATIONS}
+        return close_at_coordinates(robot, values, target[None], current, **cheap)
+
+    return step
+
+
+def _follow_path(robot: Mechanism, first: State, step: Step) -> tuple[State, BoolArray]:
+    """Return the states (1, k) that paths from `first` end at, and which (k,) are their ends.
+
+    The length of a step adapts to each row.
+    """
+    current, n = first, first.T.shape[1]
+    share, length = np.zeros(n), np.full(n, FIRST_STEP)
+    for _ in range(TRIALS):
+        rows = np.flatnonzero((share < 1.0) & (length >= SHORTEST))
+        if not len(rows):
+            break
+        present, wanted = select_poses(current, rows), np.minimum(1.0, share[rows] + length[rows])
+        following = step(rows, wanted, present)
+        safe = following.status[0] == Status.CONVERGED
+        safe[safe] = contracts(robot, select_poses(present, safe), select_poses(following, safe))
+        share[rows] = np.where(safe, wanted, share[rows])
+        length[rows] *= np.where(safe, GROWTH, GROWTH**-2)
+        done, kept = rows[safe], select_poses(following, safe)
+        current = replace_rows(current, np.zeros_like(done), done, reshape_rows(kept, len(done), 1))
+    return current, share >= 1.0
+
+
+def _take_joints(robot: Mechanism, state: State, rows: IntArray, end: State) -> State:
+    """Return states (1, n) with the joints of the ends (1, j) of paths where they differ."""
+    differs = measure_distance(robot, select_poses(state, rows), end) > SAME_JOINTS
+    rows, end = rows[differs], select_poses(end, differs)
+    old = select_poses(state, rows)
+    new = replace(old, T=end.T, joints=end.joints)
+    return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+
+
+def _is_same_pose(robot: Mechanism, a: State, b: State) -> BoolArray:
+    """Return which platforms (n,) are equal."""
+    gap = np.abs(geometry.pose_difference(a.T[0], b.T[0])) * robot.twist_scale
+    return gap.max(axis=1, initial=0.0) <= SAME_JOINTS * robot.size
+
+
+# --- Inverse solutions in the mode of their start: those whose readings lead from there to the
+# target.
+
+SAME_POSE = 1e-7
+"""Largest difference of equal poses: lengths relative to the robot's size, angles in radians.
+
+Rounding grows close to a singularity, up to the square root of the machine precision.
+"""
+STEPS = 8
+"""Steps of the path from the start's pose to a target."""
+
+Solver = Callable[[FloatArray, State | None], tuple[State, BoolArray | None]]
+"""Solves inverse kinematics for targets (n, ..) from a start: states (1, n), and where the engine
+tells, which of them their readings are known to lead to, see `reach_coordinates`."""
+
+
+def solve_in_mode(
+    robot: Mechanism, solve: Solver, target: FloatArray, start: State | None
+) -> State:
+    """Return inverse solutions (1, n) for targets (n, ..) in the mode of `start` (default: home).
+
+    A row whose loops close in another mode only is marked `OTHER_MODE`.
+    """
+    begin = start or robot.home_state
+    state, arrives = solve(target, start)
+    state, is_other = judge_modes(robot, state, begin, arrives)
+    rows = np.flatnonzero(is_other)
+    if not len(rows):
+        return state
+    state = _mark_other(state, is_other)
+    if has_one_solution(robot):
+        return state
+    first = select_poses(repeat_poses(begin, len(is_other)), rows)
+    near, arrived = _follow_poses(robot, first, state.T[0, rows])
+    near, rows = _select_new(robot, near, state, rows[arrived])
+    if not len(rows):
+        return state
+    again, rows = _select_new(robot, solve(target[rows], near)[0], state, rows)
+    if not len(rows):
+        return state
+    first = select_poses(repeat_poses(begin, len(is_other)), rows)
+    again, still_other = judge_modes(robot, again, first)
+    good = (again.status[0] == Status.CONVERGED) & ~still_other
+    rows, new = rows[good], select_poses(again, good)
+    return replace_rows(state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+
+
+def _select_new(
+    robot: Mechanism, again: State, state: State, rows: IntArray
+) -> tuple[State, IntArray]:
+    """Return the solutions (1, k) of rows (k,) that are not those of a state, and their rows.
+
+    What was judged is not judged again.
+    """
+    if robot.stages or not len(rows):
+        return again, rows
+    is_new = measure_distance(robot, again, select_poses(state, rows)) > SAME_JOINTS
+    return select_poses(again, is_new), rows[is_new]
+
+
+def _mark_other(state: State, is_other: BoolArray) -> State:
+    """Return a state (1, n) with the status of another mode in some rows (n,)."""
+    return replace(state, status=np.where(is_other, np.int8(Status.OTHER_MODE), state.status))
+
+
+def has_one_solution(robot: Mechanism) -> bool:
+    """Return whether a pose has one set of readings, whatever the start: those of driven rods."""
+    if robot.stages or not determine_platform(robot):
+        return False
+    return all(g.ending == "distance" and g.actuator[-1, 0] >= 0 for g in robot.program.groups)
+
+
+def has_bends(robot: Mechanism) -> bool:
+    """Return whether limbs that are closed one by one at a pose may have several readings there."""
+    if robot.stages or robot.is_serial or needs_readings(robot.program):
+        return False
+    return determine_platform(robot) and not has_one_solution(robot)
+
+
+def compute_bend(robot: Mechanism, state: State) -> NDArray[np.int8]:
+    """Return the sign (n,) of the determinant of the limbs at their platform, every joint free.
+
+    It changes where a limb is stretched or folded: there its readings have two solutions that
+    coincide, and the machine passes from one working mode to another.
+    """
+    e, _ = robot.slots(robot.values[None])
+    limbs, joints = robot.program.with_fixed_platform, driven_values(robot.program, state)
+    return engine.solve(limbs, e, joints, state, free=True, max_iterations=0).closure_sign[0]
+
+
+def reach_coordinates(
+    robot: Mechanism, target: FloatArray, start: State | None = None
+) -> tuple[State, BoolArray | None]:
+    """Solve inverse kinematics like `close_at_coordinates`, for coordinates (n, c).
+
+    Returns
+    -------
+    state : (1, n), also with the closure signs of `inverse_trials` where the next is not None.
+    arrives : (n,) rows whose readings are known to lead from the start to their pose.
+    """
+    values, target = robot.values[None], target[None]
+    is_plain = not (robot.stages or robot.is_serial or needs_readings(robot.program))
+    is_plain &= not robot.program.idle_groups
+    if not (is_plain and robot.program.is_square and target.shape[1] and determine_platform(robot)):
+        return close_at_coordinates(robot, values, target, start), None
+    e, _ = robot.slots(values)
+    goal = state_target(target, robot.controlled, robot.home)
+    reached = engine.reach(robot.program, e, goal, start or robot.home_state)
+    return reached.state, reached.arrives[0]
+
+
+def judge_modes(
+    robot: Mechanism, state: State, begin: State, arrives: BoolArray | None = None
+) -> tuple[State, BoolArray]:
+    """Return a state (1, n) with closure signs, and its closed rows that `begin` does not lead to.
+
+    arrives : as of `reach_coordinates`, where the state has its closure signs already.
+
+    The engine proves for most rows that their readings lead to their pose, which gives their sign,
+    too. For the others the sign is computed. Forward kinematics accepts no solution of another
+    sign, so rows of another sign are not solved. It ends where it comes close to the pose of the
+    state, to which it would converge. A chain is in another mode where a stage is; a serial limb
+    has one pose for its readings.
+    """
+    if robot.stages:
+        return judge_stage_modes(robot, state, begin, judge_modes)
+    if robot.is_serial:
+        return state, np.zeros(state.T.shape[1], bool)
+    if robot.has_open_sums:
+        return _judge_by_readings(robot, state, begin)
+    begin, n = clear_sign(robot, begin), state.T.shape[1]
+    closed = state.status[0] == Status.CONVERGED
+    if arrives is not None:
+        sign, is_sure = state.closure_sign[0], arrives
+    else:
+        e, _ = robot.slots(robot.values[None])
+        sign = engine.certify(robot.program, e, begin, state)[0]
+        is_sure = sign != 0
+        if not is_sure.all():
+            unsure = select_poses(state, ~is_sure)
+            sign[~is_sure] = compute_closure_sign(robot, robot.values[None], unsure)[0]
+        state = replace(state, closure_sign=sign[None])
+    is_other = closed & (sign != begin.closure_sign[0])
+    if has_bends(robot) and closed.any():
+        is_other |= closed & (compute_bend(robot, state) != compute_bend(robot, begin))
+    rows = np.flatnonzero(closed & ~is_other & ~is_sure)
+    if not len(rows):
+        return state, is_other
+    first = select_poses(begin, rows) if begin.T.shape[1] == n > 1 else begin
+    judged, is_other[rows] = _judge_paths(robot, first, select_poses(state, rows))
+    new = reshape_rows(judged, len(rows), 1)
+    return replace_rows(state, np.zeros_like(rows), rows, new), is_other
+
+
+def _judge_by_readings(robot: Mechanism, state: State, begin: State) -> tuple[State, BoolArray]:
+    """Return what `judge_modes` returns, by forward kinematics from `begin` at the readings."""
+    values = robot.values[None]
+    if not state.T.shape[1]:
+        return state, np.zeros(0, bool)
+    state = replace(state, closure_sign=compute_closure_sign(robot, values, state))
+    closed = state.status[0] == Status.CONVERGED
+    is_other = closed & (state.closure_sign[0] != begin.closure_sign[0])
+    rows = np.flatnonzero(closed & ~is_other)
+    if not len(rows):
+        return state, is_other
+    goal = select_poses(state, rows)
+    start = select_poses(begin, rows) if begin.T.shape[1] == len(closed) > 1 else begin
+    back = forward_trials(robot, values, compute_readings(robot, values, goal), start)
+    is_other[rows] = ~((back.status[0] == Status.CONVERGED) & _is_near(robot, back, goal))
+    return state, is_other
+
+
+def _is_near(robot: Mechanism, a: State, b: State) -> BoolArray:
+    """Return which poses (k,) of states (1, k) are the same."""
+    gap = np.abs(geometry.pose_difference(a.T[0], b.T[0]) * robot.twist_scale).max(axis=1)
+    return np.asarray(gap <= SAME_POSE * robot.size)
+
+
+def _judge_paths(robot: Mechanism, first: State, goal: State) -> tuple[State, BoolArray]:
+    """Return goals (1, k) of the right sign, and which of them `first` (1, k | 1) does not lead to.
+
+    Newton's method must lead to the pose of a goal from its readings, and a safe path too. A path
+    of readings is both. Where it ends before its goal, forward kinematics may still return along
+    larger steps, and a path of poses exist.
+    """
+    returns, needs_path = _solve_from(robot, first, goal)
+    start, is_other = repeat_poses(first, len(returns)), np.ones(len(returns), bool)
+    rows = np.flatnonzero(returns | needs_path)
+    for connect in (connect_by_readings, connect_by_poses):
+        if not len(rows):
+            break
+        solutions, connected = connect(robot, *_select_both(start, goal, rows))
+        goal = replace_rows(goal, np.zeros_like(rows), rows, reshape_rows(solutions, len(rows), 1))
+        is_other[rows] = ~connected
+        rows = rows[~connected]
+        unsure = rows[needs_path[rows]]
+        if connect is connect_by_readings and len(unsure):
+            ends = _select_both(start, goal, unsure)
+            returns[unsure] = _solve_from(robot, *ends, follow=True)[0]
+            rows = rows[returns[rows]]
+    return goal, is_other
+
+
+def _select_both(first: State, goal: State, rows: IntArray) -> tuple[State, State]:
+    """Return rows of two states (1, n)."""
+    return select_poses(first, rows), select_poses(goal, rows)
+
+
+def _solve_from(
+    robot: Mechanism, first: State, goal: State, follow: bool = False
+) -> tuple[BoolArray, BoolArray]:
+    """Return which readings of goals (1, k) lead to their poses from `first`, and which to none."""
+    e, _ = robot.slots(robot.values[None])
+    joints = driven_values(robot.program, goal)
+    back = close_at_joints(robot, e, joints, first, follow, goal)
+    closed = back.status[0] == Status.CONVERGED
+    is_near = back.status[0] == NEAR_GOAL
+    return is_near | closed & _is_near(robot, back, goal), ~(is_near | closed)
+
+
+def _follow_poses(robot: Mechanism, first: State, T: FloatArray) -> tuple[State, IntArray]:
+    """Return solutions (1, k) close to poses T (n, 4, 4), and which of these rows arrived (k,).
+
+    They are reached from the start `first` (1, n) in equal steps.
+    """
+    values, alive, current = robot.values[None], np.arange(len(T)), first
+    twist = geometry.pose_difference(T, first.T[0])
+    for i in range(1, STEPS + 1):
+        via = geometry.apply_twist(first.T[0, alive], (i / STEPS) * twist[alive])
+        target = read_coordinates(via, robot.controlled)
+        cheap = {"follow": False, "max_iterations": ITERATIONS}
+        current = close_at_coordinates(robot, values, target[None], current, **cheap)
+        closed = current.status[0] == Status.CONVERGED
+        current, alive = select_poses(current, closed), alive[closed]
+        if not len(alive):
+            break
+    return current, alive
+
+
+COMPROMISE = 1e-9
+"""Residual [m] of a converged row above which its redundant readings contradict each other."""
+ROTATION = 1e-6
+"""Largest deviation of R'R from the identity: the rounding of a file with seven digits."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution(TableResult):
+    """Poses and joints of n rows.
+
+    Attributes
+    ----------
+    T : (n, 4, 4) platform in base [m]. q : (n, a) readings [m or rad].
+    passive : (n, j) passive joint values, limb by limb [m or rad]; `passive_names` names them.
+    status : (n,) members of Status. residual : (n,) closure residual [m]. iterations : (n,) Newton
+        steps. state : the same rows for the engine.
+    """
+
+    T: FloatArray
+    q: FloatArray
+    passive: FloatArray
+    passive_names: tuple[str, ...]
+    status: NDArray[np.int8]
+    residual: FloatArray
+    iterations: IntArray
+    state: State
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __repr__(self) -> str:
+        """Return counts, the largest residual and the reason of the first failure."""
+        failed = np.flatnonzero(~self.converged)
+        gap = self.residual[self.converged].max(initial=0.0)
+        text = f"<Solution: {len(self) - len(failed)} of {len(self)} rows closed"
+        if len(failed) < len(self):
+            text += f", residual at most {Quantity(float(gap) * 1e3, 'mm')}"
+        if len(failed):
+            text += f"; row {failed[0]}: {self.explain(int(failed[0]))}"
+        return text + ">"
+
+    @property
+    def converged(self) -> BoolArray:
+        """Rows (n,) that are closed in the mode of the start."""
+        return self.status == Status.CONVERGED
+
+    @property
+    def closed(self) -> BoolArray:
+        """Rows (n,) that are closed in whatever mode."""
+        return is_closed(self.status)
+
+    def take(self, rows: NDArray[Any]) -> Solution:
+        """Return these rows, by position or by a mask (n,)."""
+        chosen = {
+            name: getattr(self, name)[rows]
+            for name in ("T", "q", "passive", "status", "residual", "iterations")
+        }
+        return replace(self, **chosen, state=select_poses(self.state, rows))
+
+    def explain(self, row: int) -> Finding:
+        """Return how a row ended."""
+        status, gap = Status(int(self.status[row])), float(self.residual[row])
+        code = status.code
+        if status == Status.CONVERGED and gap > COMPROMISE:
+            code = "kinematics.compromise"
+        elif status == Status.NOT_CONVERGED and gap <= COMPROMISE:
+            code = "kinematics.not-nearest"
+        return report_finding(
+            code, row=row, gap=Quantity(gap * 1e3, "mm"), iterations=int(self.iterations[row])
+        )
+
+
+def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:
+    """Solve forward kinematics by Newton's method on the loop closure, beginning at `start`.
+
+    Parameters
+    ----------
+    q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0
+        unknown) behind them.
+    start : a solution of one row or n rows that selects the assembly mode (default: home).
+
+    Returns
+    -------
+    Solution; rows that fail are marked in `status`, never raised.
+
+    Raises
+    ------
+    DataError
+        Another number of columns than the robot has actuators.
+    """
+    a = len(robot.actuators)
+    readings = np.atleast_2d(np.asarray(q, dtype=float))
+    if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
+        raise DataError(
+            f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "
+            f"({', '.join(actuator.name for actuator in robot.actuators)}); give one reading for "
+            "each"
+        )
+    state = forward_trials(
+        robot, robot.values[None], readings[None], None if start is None else start.state
+    )
+    return make_solution(robot, state, readings[:, :a])
+
+
+def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:
+    """Solve inverse kinematics: return the readings that lead to poses.
+
+    Parameters
+    ----------
+    target : (n, 4, 4) platform in base, or (n, c) controlled coordinates in the order of
+        `robot.controlled` [m, rad]. A pose that the machine has too few freedoms for is projected
+        to the reachable pose that minimizes |log(R R_target')|^2 size^2 + |t - t_target|^2, with
+        `robot.size`. The search begins at the controlled coordinates of the target; where no pose
+        has these, the row is `UNREACHABLE`.
+    start : solution that selects the working mode (default: home).
+
+    Returns
+    -------
+    Solution; rows that fail are marked in `status`, never raised. A row is marked `OTHER_MODE`
+    where the loops close at the target, but the readings lead from the start to another pose.
+
+    Raises
+    ------
+    DataError
+        Another shape, or a matrix that is not a pose.
+    """
+    begin = None if start is None else start.state
+    c = len(robot.controlled)
+    shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
+    wanted = np.asarray(target, dtype=float)
+    values = robot.values[None]
+    is_pose = wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4)
+    if wanted.ndim == 2 and c == 4 and is_pose:
+        # one pose, or four targets in four coordinates
+        is_pose = bool(np.array_equal(wanted[3], np.eye(4)[3]))
+    if is_pose:
+        T = wanted.reshape(-1, 4, 4)
+        _check_poses(T)
+        state = solve_in_mode(robot, partial(_reach_pose, robot), T, begin)
+    elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
+        coordinates = np.atleast_2d(wanted)
+        state = solve_in_mode(robot, partial(reach_coordinates, robot), coordinates, begin)
+    else:
+        raise DataError(f"a target of shape {wanted.shape} was given; allowed are {shapes}")
+    return make_solution(robot, state, compute_readings(robot, values, state)[0])
+
+
+def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
+    """Return the solution of a state (1, n) with readings (n, a)."""
+    names = name_passive_joints(robot)
+    place, passive = {name: i for i, name in enumerate(names)}, np.zeros((len(q), len(names)))
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        for k, limb in enumerate(robot.assembly.limbs[i] for i in group.limbs):
+            for j, joint in enumerate(limb.joints):
+                column = place.get(f"{limb.name}.{joint.name}")
+                if column is not None:
+                    passive[:, column] = joints[0, :, k, j]
+    return Solution(
+        state.T[0],
+        q,
+        passive,
+        names,
+        state.status[0],
+        state.residual[0],
+        state.iterations[0],
+        state,
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Jacobian(TableResult):
+    """Derivatives of n poses in parameters and readings, labeled.
+
+    The platform's twist has the rows `components`: rotation (rx, ry, rz) [rad] about base axes,
+    then the translation (x, y, z) [m] of its origin.
+
+    Attributes
+    ----------
+    parameters : (n, 6, p) per unit of each parameter. parameter_names : (p,) parameter_units : (p,)
+        SI units, m, rad or 1.
+    readings : (n, 6, a) per unit of each reading. reading_names : (a,) reading_units : (a,).
+    solution : the poses.
+    """
+
+    parameters: FloatArray
+    parameter_names: tuple[str, ...]
+    parameter_units: tuple[str, ...]
+    readings: FloatArray
+    reading_names: tuple[str, ...]
+    reading_units: tuple[str, ...]
+    solution: Solution
+
+    components = AXES
+
+    def __repr__(self) -> str:
+        n, p, a = len(self.parameters), len(self.parameter_names), len(self.reading_names)
+        return (
+            f"<Jacobian of {n} poses: parameters {(n, 6, p)}, readings {(n, 6, a)}; rows "
+            f"{', '.join(self.components)} [rad, m] per unit of parameter or reading>"
+        )
+
+    def of(self, name: str) -> FloatArray:
+        """Return the columns (n, 6) of one parameter or reading, by name."""
+        for names, columns in (
+            (self.parameter_names, self.parameters),
+            (self.reading_names, self.readings),
+        ):
+            if name in names:
+                return columns[..., names.index(name)]
+        raise DataError(
+            f"the Jacobian has no column {name!r}; its columns are the parameters of the robot and "
+            f"the readings {', '.join(self.reading_names)}"
+        )
+
+
+def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = None) -> Jacobian:
+    """Differentiate the poses at readings (n, a) in every parameter and reading.
+
+    Parameters and raised errors as for `forward`. Rows that fail have NaN.
+    """
+    solution = forward(robot, readings, start)
+    values, q = robot.values[None], np.atleast_2d(np.asarray(readings, dtype=np.float64))
+    derivatives = differentiate_pose(robot, values, q[None], solution.state)  # with directions
+    return Jacobian(
+        derivatives.parameters[0],
+        robot.parameters.names,
+        tuple(SI_SYMBOLS[d] for d in robot.parameters.dimensions),
+        derivatives.readings[0],
+        tuple(a.name for a in robot.actuators),
+        tuple(SI_SYMBOLS[a.dimension] for a in robot.actuators),
+        solution,
+    )
+
+
+def _reach_pose(
+    robot: Mechanism, T: FloatArray, start: State | None
+) -> tuple[State, BoolArray | None]:
+    """Return what `reach_coordinates` returns, for poses (n, 4, 4)."""
+    if controls_all(robot):
+        return reach_coordinates(robot, read_coordinates(T, robot.controlled), start)
+    return find_nearest_reachable(robot, robot.values[None], T[None], start), None
+
+
+def _check_poses(T: FloatArray) -> None:
+    """Refuse matrices that are not poses: name the first bad row and the reason."""
+    # a row of NaN is marked in the solution, like readings that are NaN
+    with np.errstate(invalid="ignore"):
+        bent = geometry.measure_rotation_error(T[:, :3, :3]) > ROTATION
+        bottom = np.abs(T[:, 3] - np.eye(4)[3]).max(axis=1) > ROTATION
+    wrong = np.flatnonzero(np.isfinite(T).all(axis=(1, 2)) & (bent | bottom))
+    if len(wrong):
+        row = int(wrong[0])
+        reason = (
+            "its last row is not 0 0 0 1"
+            if bottom[row]
+            else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
+        )
+        raise DataError(
+            f"target {row} is not a valid pose: {reason}; give T_base_platform as (n, 4, 4) "
+            "homogeneous matrices"
+        )
+
+
+# --- The reachable pose nearest to a full pose that a machine with fewer freedoms cannot take.
+
+PROJECTION_STEPS, PROJECTION_ITERATIONS = 20, 12
+"""Gauss-Newton steps of a projection, and Newton steps of each: it begins close to its solution."""
+ATTEMPTS = 5
+"""Lengths that are tried for a step, the shortest 1/16 of it: a row ends where none of them lowers
+its distance, as at the end of the reach."""
+LONGEST_STEP, SHORT_STEP = 0.5, 1e-12
+"""The longest step, which is half a radian, and the one after which a row ends, relative to the
+robot's size."""
+SHORT_SHARE = 1e-9
+"""The last step changes the distance from the target by this share to first order."""
+STATIONARY = 1e-6
+"""A pose is the nearest one where a step changes the distance by at most this share to first order,
+or by this share of `REACHED`, where the target itself is reachable."""
+REACHED = 1e-3
+"""Distance below which a target counts as reachable, relative to the robot's size."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """States (1, n), their differences (n, 6) from the targets in lengths [m], and the sums of
+    their squares (n,) [m^2], infinite where the loops are open.
+    """
+
+    state: State
+    gap: FloatArray
+    cost: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Twists (n, 6) [rad, m], their squared change (n,) of the differences to first order [m^2],
+    and the share (n, 1) that is no longer than the longest step.
+    """
+
+    twist: FloatArray
+    change: FloatArray
+    share: FloatArray
+
+
+def find_nearest_reachable(
+    robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
+) -> State:
+    """Return states (1, n) with the reachable poses nearest to T (1, n, 4, 4), without signs.
+
+    values : (1, p). A row whose search ends before the distance is stationary, at the end of the
+    reach or after too many steps, is `NOT_CONVERGED`.
+    """
+    state = close_at_coordinates(robot, values, read_coordinates(T, robot.controlled), start)
+    if controls_all(robot) or not state.T.size:
+        return state
+    control = Halving(
+        steps=PROJECTION_STEPS,
+        attempts=ATTEMPTS,
+        relative=SHORT_SHARE,
+        absolute=SHORT_STEP * robot.size,
+    )
+    propose = partial(_propose, robot, values)
+    point, _ = minimize_by_halving(
+        _measure(robot, state, T), propose, partial(_move, robot, values, T), control
+    )
+    smallest = np.maximum(point.cost, (REACHED * robot.size) ** 2)
+    is_nearest = propose(point).change <= STATIONARY**2 * smallest
+    ended_early = is_closed(point.state.status) & ~is_nearest
+    unfinished = np.int8(Status.NOT_CONVERGED)
+    status = np.where(ended_early, unfinished, point.state.status)
+    return replace(point.state, status=status)
+
+
+def _measure(robot: Mechanism, state: State, T: FloatArray) -> _Point:
+    """Return states (1, n) with their differences from poses T (1, n, 4, 4)."""
+    gap = (geometry.pose_difference(state.T, T) * robot.twist_scale)[0]
+    cost = np.where(is_closed(state.status[0]), (gap**2).sum(axis=1), np.inf)
+    return _Point(state, gap, cost)
+
+
+def _propose(robot: Mechanism, values: FloatArray, point: _Point) -> _Step:
+    """Return the Gauss-Newton steps of all rows; zero where the loops are open."""
+    slope = differentiate_by_coordinates(robot, values, point.state)[0]
+    slope = np.where(np.isfinite(point.cost)[:, None, None], np.nan_to_num(slope), 0.0)
+    scaled = slope * robot.twist_scale[:, None]
+    step = np.linalg.pinv(scaled) @ np.nan_to_num(-point.gap)[..., None]
+    change = np.matmul(scaled, step)[..., 0]
+    limit = LONGEST_STEP * robot.size
+    share = limit / np.maximum(np.abs(step[..., 0]).max(axis=1, keepdims=True), limit)
+    return _Step(np.matmul(slope, step)[..., 0], (change**2).sum(axis=1), share)
+
+
+def _move(
+    robot: Mechanism,
+    values: FloatArray,
+    T: FloatArray,
+    point: _Point,
+    step: _Step,
+    share: FloatArray,
+) -> _Point:
+    """Return the rows after shares (n, 1) of their steps; the others stay as they are."""
+    rows = np.flatnonzero(share[:, 0])
+    if not len(rows):
+        return point
+    begin = select_poses(point.state, rows)
+    moved = geometry.apply_twist(begin.T, (share * step.twist)[None, rows])
+    target = read_coordinates(moved, robot.controlled)
+    new = close_at_coordinates(robot, values, target, begin, False, PROJECTION_ITERATIONS)
+    measured = _measure(robot, new, T[:, rows])
+    gap, cost = point.gap.copy(), point.cost.copy()
+    gap[rows], cost[rows] = measured.gap, measured.cost
+    state = replace_rows(point.state, np.zeros_like(rows), rows, reshape_rows(new, len(rows), 1))
+    return _Point(state, gap, cost)
+
+
+def controls_all(robot: Mechanism) -> bool:
+    """Return whether the controlled coordinates state each freedom of the platform."""
+    return len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms)
+
+
+def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
+    """Return d twist / d coordinate (t, n, 6, c), every actuator free [1/m, 1].
+
+    Coordinates are in the units of `compare_coordinates`.
+    """
+    names, freedoms = robot.controlled, list(robot.program.freedoms)
+    t, n = state.T.shape[:2]
+    flat = state.T.reshape(-1, 4, 4)
+    _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
+    columns = columns.reshape(t, n, len(names), 6)
+    if robot.stages or needs_readings(robot.program):
+        q = compute_readings(robot, values, state)
+        D = differentiate_pose(robot, values, q, state).readings
+        return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))
+    e, _ = robot.slots(values)
+    unused = np.zeros((1, n, robot.program.n_joints))
+    rows = stack_platform_rows(engine.linearize(robot.program, e, unused, state, free=True))
+    both = np.concatenate([rows, columns[..., freedoms]], axis=2)
+    right = np.zeros((*both.shape[:3], len(names)))
+    right[:, :, rows.shape[2] :] = np.eye(len(names))
+    out = np.zeros((t, n, 6, len(names)))
+    good = np.asarray(np.isfinite(both).all(axis=(-1, -2)))
+    solved = np.matmul(np.linalg.pinv(both[good]), right[good])
+    out[good[..., None] & np.isin(np.arange(6), freedoms)] = solved.reshape(-1, len(names))
+    return out

@@ -1,0 +1,403 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Transmissions: the value of a joint from the reading of its actuator, and back.
+
+    joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r)
+            + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2
+
+with w = 2 pi / period and d = +1 or -1 the direction from which the reading was approached (0 if
+unknown). A gear ratio or a spool radius is a gain. A spool whose radius changes with the line on it
+is a curve: radius r0 - b phi / (2 pi) pays out r0 phi - b phi^2 / (4 pi). Derivation:
+docs/theory/parameters.md. Of a triangle drive this is the length of the actuator, from which the
+joint's angle follows.
+
+Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them. Terms tau are
+(t, a, 8), or (t, a, 18) with those of triangles behind them, all zero for any other drive. Where a
+drive reads a sum of joint values, the weights W of the J driven joints follow, (t, a, 18 + J), and
+the formula gives the sums s = W joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import MechanismError
+from loopcal.mechanism.assembly import Actuator
+from loopcal.numerics.decomposition import are_nonzero
+from loopcal.typing import FloatArray, IntArray
+
+# --- Sums of joint values: s = W joints, with a weight for each reading and driven joint.
+
+SINGULAR = 1e-9
+"""Ratio of singular values of weights, each row divided by its largest weight, below which they are
+singular."""
+
+
+def apply_weights(weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Return W values (t, n, a) of values (t | 1, n, J)."""
+    return np.matmul(values, np.swapaxes(weights, -1, -2))
+
+
+def invert_weights(weights: FloatArray) -> FloatArray:
+    """Return the inverses of matrices (.., J, J), NaN where one is singular or not finite."""
+    finite = np.all(np.isfinite(weights), axis=(-1, -2), keepdims=True)
+    unit = np.eye(weights.shape[-1])
+    weights = np.where(finite, weights, unit)
+    with np.errstate(all="ignore"):
+        try:
+            inverse = np.linalg.inv(weights)
+        except np.linalg.LinAlgError:
+            rank = np.asarray(np.linalg.matrix_rank(weights))[..., None, None]
+            finite = finite & (rank == len(unit))
+            inverse = np.linalg.inv(np.where(finite, weights, unit))
+        return np.where(finite, inverse, np.nan)
+
+
+def count_independent(weights: FloatArray) -> int:
+    """Return how many rows of W (a, J) are independent."""
+    scale = np.abs(weights).max(axis=1, initial=0.0, keepdims=True)
+    s = np.linalg.svd(weights / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
+    return int(are_nonzero(s, SINGULAR).sum())
+
+
+# --- Triangle drives: a linear actuator that turns a revolute joint through two anchor points.
+
+TRIANGLE_TERMS = (
+    *("foot.x", "foot.y", "foot.z", "head.x", "head.y", "head.z", "skew.x", "skew.y"),
+    *("side", "middle"),
+)
+"""Terms of a triangle, (.., 10). `side` is +1 or -1, the sign of sin(theta - gamma), and `middle`
+the nominal angle between the dead points; no parameter changes these two."""
+MOVABLE = 8
+"""Number of the terms that parameters can change."""
+
+
+def compute_angle(length: FloatArray, triangle: FloatArray) -> FloatArray:
+    """Return the joint angle [rad] at a length (..) [m] of triangles (.., 10).
+
+    It is NaN where no angle reaches the length, which a negative one never does.
+    """
+    level, reach, gamma = _describe(triangle)
+    side, middle = triangle[..., 8], triangle[..., 9]
+    with np.errstate(invalid="ignore"):
+        square = np.where(length < 0.0, np.nan, length * length)
+        opening = np.arccos((level - square) / reach)
+    return middle + geometry.wrap_angle(gamma + side * opening - middle)
+
+
+def compute_length(angle: FloatArray, triangle: FloatArray) -> FloatArray:
+    """Return the length of the actuator [m] at joint angles (..) [rad] of triangles (.., 10)."""
+    level, reach, gamma = _describe(triangle)
+    return np.sqrt(level - reach * np.cos(angle - gamma))
+
+
+def compute_range(triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lengths [m] at the dead points of triangles (.., 10): the least, the largest."""
+    level, reach, _ = _describe(triangle)
+    return np.sqrt(np.maximum(level - reach, 0.0)), np.sqrt(level + reach)
+
+
+def find_side(start: float, triangle: FloatArray) -> tuple[float, float]:
+    """Return sin(theta - gamma) at a start angle [rad], and the middle of its side [rad].
+
+    triangle : (10,), of which the last two are not used.
+    """
+    _, _, gamma = _describe(triangle)
+    lead = geometry.wrap_angle(start - gamma)
+    sine = float(np.sin(lead))
+    return sine, float(start - lead + np.sign(sine) * np.pi / 2)
+
+
+def turn_head(angle: FloatArray, triangle: FloatArray) -> FloatArray:
+    """Return the head (.., 3) [m] at joint angles (..) of triangles (.., 10), h = S Rz S' H."""
+    return _apply(_turn(angle, triangle), triangle[..., 3:6])
+
+
+def differentiate_length(angle: FloatArray, triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of the length by the angle (..) and by the movable terms (.., 8).
+
+    With n the unit vector from head to foot, k the axis of the joint and h the turned head:
+    dl/dtheta = k . (n x h), the arm of the actuator's force; dl/dF = n; dl/dH = -Q'n with
+    Q = S Rz S'; dl/ds = J_l' (H x Q'n - h x n) with the left Jacobian J_l of S.
+    """
+    foot, head = triangle[..., 0:3], triangle[..., 3:6]
+    skew = _pad(triangle[..., 6:8])
+    S, Q = geometry.exp_so3(skew), _turn(angle, triangle)
+    turned = _apply(Q, head)
+    n = foot - turned
+    n = n / np.sqrt((n * n).sum(axis=-1, keepdims=True))
+    back = _apply(np.swapaxes(Q, -1, -2), n)
+    arm = (S[..., :, 2] * np.cross(n, turned)).sum(axis=-1)
+    tilt = np.cross(head, back) - np.cross(turned, n)
+    slope = np.swapaxes(geometry.left_jacobian_so3(skew), -1, -2)
+    by_skew = np.einsum("...ij,...j->...i", slope, tilt)[..., :2]
+    shape = np.broadcast_shapes(n.shape, (*by_skew.shape[:-1], 1))[:-1]
+    slopes = [np.broadcast_to(d, (*shape, d.shape[-1])) for d in (n, -back, by_skew)]
+    return arm, np.concatenate(slopes, axis=-1)
+
+
+def _describe(triangle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a, b and gamma of l^2 = a - b cos(theta - gamma) for triangles (.., 10)."""
+    tilt = np.swapaxes(geometry.exp_so3(_pad(triangle[..., 6:8])), -1, -2)
+    u, v = _apply(tilt, triangle[..., 0:3]), _apply(tilt, triangle[..., 3:6])
+    level = (u * u).sum(axis=-1) + (v * v).sum(axis=-1) - 2 * u[..., 2] * v[..., 2]
+    reach = 2 * np.hypot(u[..., 0], u[..., 1]) * np.hypot(v[..., 0], v[..., 1])
+    gamma = np.arctan2(u[..., 1], u[..., 0]) - np.arctan2(v[..., 1], v[..., 0])
+    return level, reach, gamma
+
+
+def _turn(angle: FloatArray, triangle: FloatArray) -> FloatArray:
+    """Return the rotations (.., 3, 3) of the head, S Rz(theta) S'."""
+    S = geometry.exp_so3(_pad(triangle[..., 6:8]))
+    return S @ geometry.rotation_about_axis(angle, 2) @ np.swapaxes(S, -1, -2)
+
+
+def _pad(skew: FloatArray) -> FloatArray:
+    """Return skews (.., 2) as rotation vectors (.., 3)."""
+    return np.concatenate([skew, np.zeros_like(skew[..., :1])], axis=-1)
+
+
+def _apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return matrices (.., 3, 3) times vectors (.., 3)."""
+    return np.matmul(matrix, vector[..., None])[..., 0]
+
+
+TERMS = ("offset", "gain", "curve", "sin1", "cos1", "sin2", "cos2", "backlash")
+"""Terms in the order of the last axis of tau (t, a, 8).
+
+Each has the joint's unit, per power of the reading's unit; of a triangle drive, that of its length.
+"""
+ALL_TERMS = (*TERMS, *TRIANGLE_TERMS)
+"""Terms of a robot with triangle drives, in the order of the last axis of tau (t, a, 18)."""
+SIDE = ALL_TERMS.index("side")
+WEIGHT = "weight."
+"""What the name of the term of a weight begins with; the name of a driven joint follows."""
+
+
+def name_terms(actuators: Sequence[Actuator]) -> tuple[str, ...]:
+    """Return the names of the terms of actuators, in the order of the last axis of tau."""
+    if any(a.weights for a in actuators):
+        joints = dict.fromkeys(name for a in actuators for name in a.driven_joints)
+        return (*ALL_TERMS, *(f"{WEIGHT}{name}" for name in joints))
+    return ALL_TERMS if any("side" in a.terms for a in actuators) else TERMS
+
+
+def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
+    """Return the nominal transmission terms (a, 8), or (a, 18) if one is a triangle drive.
+
+    With summed drives they are (a, 18 + J).
+
+    Raises
+    ------
+    MechanismError
+        Unknown term, or a gain of zero.
+    """
+    for actuator in actuators:
+        wrong = sorted(set(actuator.terms) - set(ALL_TERMS))
+        if wrong:
+            raise MechanismError(
+                f"actuator {actuator.name!r} has an unknown term {wrong[0]!r}; allowed are "
+                f"{', '.join(TERMS)}"
+            )
+        if actuator.terms.get("gain", 1.0) == 0.0:
+            raise MechanismError(
+                f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing; "
+                "state a gain other than 0"
+            )
+    terms, rows = name_terms(actuators), []
+    for a in actuators:
+        weights = {f"{WEIGHT}{name}": w for name, w in (a.weights or {a.name: 1.0}).items()}
+        stated = {"gain": 1.0, **a.terms, **weights}
+        rows.append([stated.get(term, 0.0) for term in terms])
+    return np.array(rows, dtype=float).reshape(-1, len(terms))
+
+
+def harmonic_frequencies(actuators: Sequence[Actuator]) -> FloatArray:
+    """Return the angular frequency of the harmonics (a,) [rad per unit of reading], 0 for none."""
+    return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
+
+
+def term_derivatives(
+    q: FloatArray, tau: FloatArray, w: FloatArray, terms: Sequence[int] | None = None
+) -> list[FloatArray]:
+    """Return the derivative of the joint values in each of the terms, or in some of them, arrays
+    (t | 1, n, a).
+    """
+    chosen = range(min(tau.shape[-1], len(TERMS) + MOVABLE)) if terms is None else terms
+    r, approach = split_readings(q, len(w))
+    # with w = 0 the cosines would repeat the offset
+    on = (w != 0).astype(float)
+    columns = {
+        "offset": lambda: np.ones_like(r),
+        "gain": lambda: r,
+        "curve": lambda: r * r,
+        "sin1": lambda: np.sin(w * r),
+        "cos1": lambda: on * np.cos(w * r),
+        "sin2": lambda: np.sin(2 * w * r),
+        "cos2": lambda: on * np.cos(2 * w * r),
+        "backlash": lambda: 0.5 * approach,
+    }
+    triangles = find_triangles(tau)
+    if not len(triangles):
+        return [columns[TERMS[term]]() for term in chosen]
+    arm, by_term = _differentiate_triangles(joints_from_readings(q, tau, w), tau, triangles)
+    results = []
+    for term in chosen:
+        column = columns[TERMS[term]]() if term < len(TERMS) else np.zeros_like(r)
+        column = np.array(np.broadcast_to(column, (*arm.shape[:2], len(w))))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if term < len(TERMS):
+                column[..., triangles] /= arm
+            else:
+                column[..., triangles] = -by_term[..., term - len(TERMS)] / arm
+        results.append(column)
+    return results
+
+
+def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return the joint values (t, n, a) of readings q under terms tau (t | 1, a, 8 | 18 | 18 + a).
+
+    The angle of a triangle drive is NaN where no angle reaches its length. Summed drives must have
+    as many readings as joints.
+    """
+    values = transmit_readings(q, tau, w)
+    if (weights := select_weights(tau)) is not None:
+        return apply_weights(invert_weights(weights), values)
+    return values
+
+
+def transmit_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return what the transmissions give (t, n, a): joint values, and of summed drives the sums."""
+    values = evaluate_sums(q, tau, w)
+    triangles = find_triangles(tau)
+    if len(triangles):
+        values = np.array(values)
+        values[..., triangles] = compute_angle(
+            values[..., triangles], _select_triangles(tau, triangles)
+        )
+    return values
+
+
+def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return d joint / d reading (t, n, a), of plain gains (t | 1, 1, a).
+
+    Of summed drives it is d sum / d reading.
+    """
+    slopes, triangles = _evaluate_slopes(q, tau, w), find_triangles(tau)
+    if not len(triangles):
+        return slopes
+    arm, _ = _differentiate_triangles(joints_from_readings(q, tau, w), tau, triangles)
+    slopes = np.array(np.broadcast_to(slopes, (*arm.shape[:2], len(w))))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes[..., triangles] /= arm
+    return slopes
+
+
+def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return the readings (t, n, a) of joint values, without backlash.
+
+    The linear terms are inverted exactly; Newton's method adds the others. Joints that read their
+    own values are returned as they are.
+    """
+    if (weights := select_weights(tau)) is not None:
+        joints = apply_weights(weights, joints)
+    triangles = find_triangles(tau)
+    if len(triangles):
+        shape = np.broadcast_shapes(joints.shape, (len(tau), 1, 1))
+        joints = np.array(np.broadcast_to(joints, shape))
+        joints[..., triangles] = compute_length(
+            joints[..., triangles], _select_triangles(tau, triangles)
+        )
+    if len(tau) == 1 and not tau[..., 0].any() and bool((tau[..., 1] == 1.0).all()):
+        readings = joints
+    else:
+        readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
+    if not tau[..., 2:7].any():
+        return readings
+    for _ in range(20):
+        step = (evaluate_sums(readings, tau, w) - joints) / _evaluate_slopes(readings, tau, w)
+        readings = readings - step
+        if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
+            break
+    return readings
+
+
+def select_weights(tau: FloatArray) -> FloatArray | None:
+    """Return the weights (t | 1, a, J) of summed drives, None of a machine without them."""
+    return tau[..., len(ALL_TERMS) :] if tau.shape[-1] > len(ALL_TERMS) else None
+
+
+def differentiate_sums(
+    q: FloatArray, tau: FloatArray, w: FloatArray, joints: FloatArray
+) -> FloatArray:
+    """Return d (s - W joints) / d tau at constant readings and joints (t, n, J), (t, n, a, k)."""
+    columns = term_derivatives(q, tau[..., : len(TERMS)], w)
+    shape = np.broadcast_shapes(columns[0].shape, (*joints.shape[:2], len(w)))
+    slopes = np.zeros((*shape, tau.shape[-1]))
+    for i, column in enumerate(columns):
+        slopes[..., i] = column
+    slopes[..., len(ALL_TERMS) :] = -joints[:, :, None]
+    return slopes
+
+
+def find_triangles(tau: FloatArray) -> IntArray:
+    """Return the places of the actuators that are triangle drives; tau : (t | 1, a, 8 | 18)."""
+    if tau.shape[-1] == len(TERMS):
+        return np.zeros(0, np.int64)
+    return np.flatnonzero(tau[0, :, SIDE])
+
+
+def measure_excess(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return by how much the lengths of triangles are out of their reach (t, n) [m], the largest.
+
+    It is NaN where a reading is not a number.
+    """
+    triangles = find_triangles(tau)
+    length = evaluate_sums(q, tau, w)[..., triangles]
+    low, high = compute_range(_select_triangles(tau, triangles))
+    return np.maximum(np.maximum(low - length, length - high), 0.0).max(axis=-1)
+
+
+def evaluate_sums(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return the joint values (t, n, a) of readings; of triangle drives lengths, else sums."""
+    if not tau[..., 2 : len(TERMS)].any():
+        readings = q[..., : len(w)]
+        if len(tau) in (1, len(q)) and (tau[..., :2] == (0.0, 1.0)).all():
+            return readings + 0.0  # no offset and no gain: one pass, with the same bits
+        return tau[:, None, :, 0] + readings * tau[:, None, :, 1]
+    columns = term_derivatives(q, tau[..., : len(TERMS)], w)
+    return sum(
+        (columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
+        start=columns[0] * tau[:, None, :, 0],
+    )
+
+
+def _evaluate_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Return d joint / d reading; of triangle drives d length / d reading."""
+    if not tau[..., 2:7].any():
+        return tau[:, None, :, 1]
+    r, _ = split_readings(q, len(w))
+    turn = w * r
+    _, gain, curve, sin1, cos1, sin2, cos2, *_ = np.moveaxis(tau[:, None], -1, 0)
+    first = w * (sin1 * np.cos(turn) - cos1 * np.sin(turn))
+    second = 2 * w * (sin2 * np.cos(2 * turn) - cos2 * np.sin(2 * turn))
+    return gain + 2 * curve * r + first + second
+
+
+def _select_triangles(tau: FloatArray, triangles: IntArray) -> FloatArray:
+    """Return the terms (t | 1, 1, k, 10) of triangles."""
+    return tau[:, None, triangles, len(TERMS) : len(ALL_TERMS)]
+
+
+def _differentiate_triangles(
+    joints: FloatArray, tau: FloatArray, triangles: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of lengths by angles (t, n, k) and by movable terms (t, n, k, 8)."""
+    return differentiate_length(joints[..., triangles], _select_triangles(tau, triangles))
+
+
+def split_readings(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
+    """Return readings and directions of approach, the latter 0 where none are given."""
+    return q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])

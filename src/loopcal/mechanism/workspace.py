@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of strokes, joints and rods, and random positions within the stated workspace."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal.engine import State
+from loopcal.errors import MechanismError
+from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import round_to_digits
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import Solution, inverse
+from loopcal.presentation import HtmlResult
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+MIN_DRAWS = 2000
+"""Positions drawn before a workspace is refused."""
+MIN_REACHABLE_SHARE = 1e-2
+"""Share of them that must be reachable: drawing n positions tries at most 100 n."""
+
+
+class Limit(NamedTuple):
+    """A quantity that must stay between two bounds.
+
+    Attributes
+    ----------
+    name : e.g. `stroke of q3`. dimension : length or angle. low, high : bounds [m or rad].
+    value : (t, n) [m or rad]. is_stroke : whether it is the stroke of an actuator.
+    """
+
+    name: str
+    dimension: Dimension
+    low: float
+    high: float
+    value: FloatArray
+    is_stroke: bool = False
+
+    @property
+    def margin(self) -> FloatArray:
+        """Distance to the nearer bound (t, n), negative outside [m or rad]."""
+        return np.minimum(self.value - self.low, self.high - self.value)
+
+
+def evaluate_limits(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[Limit, ...]:
+    """Return all limits of a machine at readings q (t | 1, n, a) and their states (t, n)."""
+    shape = state.status.shape
+    limits = [
+        Limit(
+            f"stroke of {a.name}", a.dimension, *a.stroke, np.broadcast_to(q[..., i], shape), True
+        )
+        for i, a in enumerate(robot.actuators)
+        if a.stroke is not None
+    ]
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        for k, i in enumerate(group.limbs):
+            limb = robot.assembly.limbs[i]
+            for j, joint in enumerate(limb.joints):
+                if joint.limits is not None:
+                    name, value = f"{limb.name}.{joint.name}", joints[:, :, k, j]
+                    limits.append(Limit(name, joint.dimension, *joint.limits, value))
+    if any(limb.cones for limb in robot.assembly.limbs):
+        limits += _evaluate_cones(robot, values, state)
+    return tuple(limits)
+
+
+def check_limits(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[BoolArray, NDArray[np.object_]]:
+    """Return which rows are within all limits (t, n), and a finding where one is not (t, n).
+
+    The findings are None where everything is allowed. A row is explained by its first exceeded
+    limit.
+    """
+    allowed, findings = np.ones(state.status.shape, bool), np.full(state.status.shape, None)
+    for limit in evaluate_limits(robot, values, q, state):
+        # a bound itself is allowed, up to the rounding of its own number
+        outside = ~(limit.margin >= -1e-12 * max(abs(limit.low), abs(limit.high)))
+        for row in zip(*np.nonzero(outside & allowed), strict=True):
+            findings[row] = _report_exceeded(robot, limit, float(limit.value[row]))
+        allowed &= ~outside
+    return allowed, findings
+
+
+def _report_exceeded(robot: Mechanism, limit: Limit, reached: float) -> Finding:
+    """Return the finding of an exceeded limit, in the robot's display unit."""
+    value, low, high = (
+        robot.to_quantity(number, limit.dimension) for number in (reached, limit.low, limit.high)
+    )
+    return report_finding("limits.exceeded", name=limit.name, value=value, low=low, high=high)
+
+
+def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
+    """Return the angles between rods and the axes of their cones."""
+    from loopcal.mechanism.kinematics import compute_limb_frames
+
+    limits = []
+    all_frames = compute_limb_frames(robot, values, state)
+    for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):
+        rod = frames[:, :, -1, :3, 3] - frames[:, :, -2, :3, 3]
+        rod = rod / np.linalg.norm(rod, axis=-1, keepdims=True)
+        for cone in limb.cones:
+            frame, sign = (frames[:, :, -2], 1.0) if cone.end == "tip" else (frames[:, :, -1], -1.0)
+            axis = frame[..., :3, :3] @ (np.array(cone.axis) / np.linalg.norm(cone.axis))
+            sine = np.linalg.norm(np.cross(axis, rod), axis=-1)
+            angle = np.arctan2(sine, sign * (axis * rod).sum(axis=-1))
+            name = f"inclination of {limb.name} at its {cone.end}"
+            limits.append(Limit(name, Dimension.ANGLE, 0.0, cone.angle, angle))
+    return limits
+
+
+@dataclass(frozen=True, eq=False)
+class WorkspaceSample(HtmlResult):
+    """Positions drawn at random from a workspace.
+
+    Attributes
+    ----------
+    coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses.
+    reachable_share : share of the stated ranges that the machine reaches.
+    rejected : number of rejected positions by reason, the most frequent first.
+    """
+
+    coordinates: FloatArray
+    solution: Solution
+    reachable_share: float
+    rejected: Mapping[str, int]
+
+    def __repr__(self) -> str:
+        share = f"{round_to_digits(100 * self.reachable_share)} % of the stated workspace"
+        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share} is reachable>"
+
+
+def sample_workspace(
+    robot: Mechanism, n: int, seed: int | np.random.Generator = 0
+) -> WorkspaceSample:
+    """Draw n positions evenly from the ranges of `workspace`; draw unreachable ones again.
+
+    Coordinates are uniform in their ranges; phi and theta are uniform over the area of the sphere
+    that they enclose. Positions are rejected if the loops cannot be closed, if a stroke, a joint
+    limit or a cone is exceeded, and where the readings lead from home to another pose (see
+    `inverse`).
+
+    Parameters
+    ----------
+    n : number of positions. seed : of the random stream, or the stream itself.
+
+    Returns
+    -------
+    WorkspaceSample; the same for the same robot, n and seed.
+
+    Raises
+    ------
+    MechanismError
+        n is below 1, the robot states no range for a controlled coordinate, or almost nothing of
+        its workspace can be reached.
+    """
+    if n < 1:
+        raise MechanismError(f"{n} positions to draw; give 1 or more")
+    rng = np.random.default_rng(seed)
+    wanted = workspace_ranges(robot)
+    rejected: Counter[str] = Counter()
+    batches: list[FloatArray] = []
+    kept = tried = 0
+    while kept < n or not tried:
+        coordinates = draw_coordinates(rng, robot.controlled, wanted, max(n, MIN_DRAWS // 8))
+        good = _find_reachable(robot, coordinates, rejected)
+        batches.append(coordinates[good])
+        kept, tried = kept + int(good.sum()), tried + len(coordinates)
+        if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
+            reason, count = rejected.most_common(1)[0]
+            raise MechanismError(
+                f"{robot.name} reaches almost nothing of its workspace: {kept} of {tried} random "
+                f"positions (at least {MIN_REACHABLE_SHARE:.0%} are needed); most frequent reason: "
+                f"{reason} ({count} positions); correct `workspace:`, the strokes or the limits"
+            )
+    coordinates = np.concatenate(batches)[:n]
+    return WorkspaceSample(
+        coordinates, inverse(robot, coordinates), kept / tried, dict((+rejected).most_common())
+    )
+
+
+def resolve_poses(robot: Mechanism, poses: ArrayLike | int, seed: int) -> FloatArray:
+    """Return coordinates (n, c) [m, rad]: those given, or a number of them from the workspace."""
+    if isinstance(poses, int):
+        return sample_workspace(robot, poses, seed).coordinates
+    return np.asarray(poses, dtype=np.float64)
+
+
+def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
+    """Return the range of every controlled coordinate [m, rad]; phi is a full turn by default.
+
+    Raises
+    ------
+    MechanismError
+        The robot states no range for a coordinate.
+    """
+    stated = dict(robot.assembly.workspace)
+    if "theta" in stated:
+        stated.setdefault("phi", (-np.pi, np.pi))
+    missing = [name for name in robot.controlled if name not in stated]
+    if missing:
+        raise MechanismError(
+            f"{robot.name} states no workspace for {', '.join(missing)}; add `workspace:` with a "
+            f"range for each of {', '.join(robot.controlled)} to its file"
+        )
+    return {name: stated[name] for name in robot.controlled}
+
+
+def draw_coordinates(
+    rng: np.random.Generator,
+    names: tuple[str, ...],
+    ranges: Mapping[str, tuple[float, float]],
+    n: int,
+) -> FloatArray:
+    """Draw coordinates (n, c) evenly from their ranges [m, rad], reachable or not."""
+    columns = []
+    for name in names:
+        low, high = ranges[name]
+        if name == "theta":
+            # the area of a cap grows with 1 - cos(theta)
+            columns.append(np.arccos(rng.uniform(np.cos(high), np.cos(max(low, 0.0)), n)))
+        else:
+            columns.append(rng.uniform(low, high, n))
+    return np.stack(columns, axis=-1)
+
+
+def _find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]) -> BoolArray:
+    """Return which rows the machine reaches (n,); count the reasons of the others."""
+    values, solution = robot.values[None], inverse(robot, coordinates)
+    good = np.array(solution.closed)
+    rejected["the loops cannot be closed"] += int((~good).sum())
+    for limit in evaluate_limits(robot, values, solution.q[None], solution.state):
+        outside = good & ~(limit.margin[0] >= 0)
+        rejected[f"{limit.name} is exceeded"] += int(outside.sum())
+        good &= ~outside
+    rejected["in another mode than home"] += int((good & ~solution.converged).sum())
+    return good & solution.converged

@@ -1,0 +1,707 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Elimination of all unknowns of an elimination tree, nodes of equal structure together.
+
+The rows of a node are [own | ancestors | A | r]. The node's own columns are eliminated by
+orthogonal projection (`eliminate_columns`). What is left are rows of its parent,
+and what is left of the roots are rows [A | r] of the machine. Columns are scaled by their length
+over all rows before anything is eliminated, so that a direction that inner unknowns explain in full
+is recognized as unobservable. The best values follow from the roots inwards. Among all best values
+those of smallest length in these units are returned: the result equals one dense pseudo-inverse
+over a whole cluster. See docs/theory/identification.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import permutations
+from typing import ClassVar
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT, empty_factor
+from loopcal.numerics.statistics import find_distinct
+from loopcal.numerics.trial_batch import TrialBatch
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+# --- The elimination tree: in which order unknowns of different scopes are eliminated.
+
+SCOPES = ("machine", "session", "group", "pose")
+"""Scopes of unknowns, from the outermost to the innermost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """n nodes with as many unknowns, and as many columns in their paths, each.
+
+    Attributes
+    ----------
+    unknowns : (n, u) the unknowns of each node.
+    path : (n, w) the unknowns of each node, followed by those of its ancestors, innermost first.
+    parent : number of the structure of the parents, -1 without any.
+    parent_place : (n,) place of each node's parent in that structure.
+    """
+
+    unknowns: IntArray
+    path: IntArray
+    parent: int
+    parent_place: IntArray
+
+    def __len__(self) -> int:
+        return len(self.unknowns)
+
+    @property
+    def width(self) -> int:
+        """Number w of columns of a path."""
+        return self.path.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class EliminationTree:
+    """The nodes of U unknowns. A node has a larger number than its ancestors.
+
+    Attributes
+    ----------
+    node : (U,) node of each unknown, -1 where it is fixed. column : (U,) its column in that node.
+    cluster : (U,) cluster of each unknown, -1 where it is fixed.
+    width : (nodes,) number of columns of each path.
+    structure, place : (nodes,) structure of each node, and its place among the nodes of it.
+    structures : from the outermost to the innermost.
+    """
+
+    node: IntArray
+    column: IntArray
+    cluster: IntArray
+    width: IntArray
+    structure: IntArray
+    place: IntArray
+    structures: tuple[Structure, ...]
+
+    @property
+    def parents(self) -> frozenset[int]:
+        """Numbers of the structures that have children."""
+        return frozenset(s.parent for s in self.structures) - {-1}
+
+    def columns(self, nodes: IntArray, unknowns: IntArray) -> IntArray:
+        """Return the columns (k, u) of unknowns (k, u) in the paths of nodes (k,).
+
+        An unknown outside the path, such as a fixed one, has the column after the last.
+        """
+        node = self.node[unknowns]
+        last = self.width[nodes][:, None]
+        return np.where(node >= 0, last - self.width[node] + self.column[unknowns], last)
+
+
+def build_tree(is_free: BoolArray, scopes: Sequence[str], sets: IntArray) -> EliminationTree:
+    """Build the elimination tree of U unknowns.
+
+    Parameters
+    ----------
+    is_free : (U,) unknowns that are not fixed. scopes : (U,) the scope of each, see `SCOPES`.
+    sets : (k, 2) pairs (set, unknown). The unknowns of one set must lie on one path, because a
+        row, or rows that are eliminated together, use them.
+    """
+    if not is_free.any():
+        nowhere, nothing = np.full(len(is_free), -1), np.zeros(0, dtype=np.int64)
+        return EliminationTree(
+            nowhere, np.zeros_like(nowhere), nowhere, nothing, nothing, nothing, ()
+        )
+    rank = np.array([SCOPES.index(scope) for scope in scopes], dtype=np.int64)
+    pairs = sets[is_free[sets[:, 1]]]
+    candidates = [
+        _assign_nodes(is_free, rank, order, pairs)
+        for order in permutations(find_distinct(rank[is_free]).tolist())
+    ]
+    node, parent = min(candidates, key=_count_multiplications)
+    return _sort_by_structure(node, parent, _components(is_free, pairs))
+
+
+def find_connected_groups(links: IntArray, count: int) -> IntArray:
+    """Return the group (count,) of each item, numbered by first items.
+
+    `links` (k, 2) join items directly; items are in one group where links join them. The tests
+    compare it with scipy.sparse.csgraph, whose import alone would take 0.2 s.
+    """
+    lowest = np.arange(count)  # of the items that are known to be in a group with this one
+    while (apart := lowest[links[:, 0]] != lowest[links[:, 1]]).any():
+        ends = lowest[links[apart]]
+        np.minimum.at(lowest, ends.max(axis=1), ends.min(axis=1))
+        while (lowest[lowest] != lowest).any():
+            lowest = lowest[lowest]
+    return np.unique(lowest, return_inverse=True)[1].astype(np.int64)
+
+
+def _components(chosen: BoolArray, pairs: IntArray) -> IntArray:
+    """Return the component (U,) of each chosen unknown, numbered by first ones; -1 for others."""
+    U, inside = len(chosen), pairs[chosen[pairs[:, 1]]]
+    total = U + int(inside[:, 0].max(initial=-1)) + 1
+    links = np.column_stack([U + inside[:, 0], inside[:, 1]])
+    group = find_connected_groups(links, total)[:U][chosen]
+    component = np.full(U, -1)
+    component[chosen] = np.unique(group, return_inverse=True)[1]
+    return component
+
+
+def _assign_nodes(
+    is_free: BoolArray, rank: IntArray, order: Sequence[int], pairs: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Return the node (U,) of each unknown and the parent of each node (-1 without one).
+
+    Scopes are taken out in the given order. A node that is the only child of its parent is merged
+    with it.
+    """
+    U = len(is_free)
+    node, above, parent = np.full(U, -1), np.full(U, -1), np.zeros(0, dtype=np.int64)
+    left = is_free.copy()
+    for scope in order:
+        component = _components(left, pairs)
+        out = left & (rank == scope)
+        having, number = np.unique(component[out], return_inverse=True)
+        node[out] = len(parent) + number
+        member = np.flatnonzero(np.isin(component, having) & left)
+        place = np.searchsorted(having, component[member])
+        parents = np.zeros(len(having), dtype=np.int64)
+        parents[place] = above[member]
+        above[member] = len(parent) + place
+        parent = np.concatenate([parent, parents])
+        left &= ~out
+    children = np.bincount(parent[parent >= 0], minlength=len(parent))
+    is_only_child = (parent >= 0) & (children[parent] == 1)
+    into = np.arange(len(parent))
+    for _ in order:
+        into = np.where(is_only_child, into[parent], np.arange(len(parent)))
+    merged_parent = np.where(parent >= 0, into[parent], -1)
+    kept = into == np.arange(len(into))
+    new = np.cumsum(kept) - 1
+    node = np.where(node >= 0, new[into[node]], -1)
+    return node, np.where(merged_parent[kept] >= 0, new[merged_parent[kept]], -1)
+
+
+def _measure_nodes(node: IntArray, parent: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the unknowns, the columns of the path and the depth (nodes,) of each node.
+
+    Parents have smaller numbers.
+    """
+    unknowns = np.bincount(node[node >= 0], minlength=len(parent))
+    width, depth = unknowns.copy(), np.zeros(len(parent), dtype=np.int64)
+    for _ in SCOPES:
+        width = unknowns + np.where(parent >= 0, width[parent], 0)
+        depth = np.where(parent >= 0, depth[parent] + 1, 0)
+    return unknowns, width, depth
+
+
+def _count_multiplications(assignment: tuple[IntArray, IntArray]) -> int:
+    """Return about how many multiplications an elimination takes: u w^2, summed over nodes."""
+    unknowns, width, _ = _measure_nodes(*assignment)
+    return int((unknowns * width**2).sum())
+
+
+def _sort_by_structure(node: IntArray, parent: IntArray, cluster: IntArray) -> EliminationTree:
+    """Number the nodes by structure, from the outermost inwards."""
+    unknowns, width, depth = _measure_nodes(node, parent)
+    structure, place = np.full(len(parent), -1), np.zeros(len(parent), dtype=np.int64)
+    order, structures, column = [], [], np.zeros(len(node), dtype=np.int64)
+    by_node = np.argsort(node, kind="stable")[int((node < 0).sum()) :]
+    start = np.cumsum(unknowns) - unknowns
+    for d in range(int(depth.max()) + 1):
+        level = np.flatnonzero(depth == d)
+        outer = np.where(parent[level] >= 0, structure[parent[level]], -1)
+        for key in np.unique(np.column_stack([outer, unknowns[level]]), axis=0):
+            chosen = level[(outer == key[0]) & (unknowns[level] == key[1])]
+            columns = by_node[start[chosen][:, None] + np.arange(key[1])]
+            above = place[parent[chosen]] if d else np.full(len(chosen), -1)
+            path = (
+                np.concatenate([columns, structures[key[0]].path[above]], axis=1) if d else columns
+            )
+            column[columns] = np.arange(key[1])
+            structure[chosen], place[chosen] = len(structures), np.arange(len(chosen))
+            structures.append(Structure(columns, path, int(key[0]), above))
+            order.append(chosen)
+    sequence = np.concatenate(order)
+    new = np.zeros(len(parent), dtype=np.int64)
+    new[sequence] = np.arange(len(sequence))
+    return EliminationTree(
+        node=np.where(node >= 0, new[node], -1),
+        column=column,
+        cluster=cluster,
+        width=width[sequence],
+        structure=structure[sequence],
+        place=place[sequence],
+        structures=tuple(structures),
+    )
+
+
+SHORTEST_DIRECTION = 0.5
+"""Unobservable directions have at least length one when they are carried inwards. Shorter ones are
+rounding."""
+
+
+class NodeFactors:
+    """The triangular factors of all nodes: working memory while rows are folded.
+
+    Parameters
+    ----------
+    tree : of the U unknowns. trials : a. parameters : p of the machine.
+    """
+
+    tree: EliminationTree
+    trials: int
+    parameters: int
+
+    def __init__(self, tree: EliminationTree, trials: int, parameters: int) -> None:
+        self.tree, self.trials, self.parameters = tree, trials, parameters
+        self._factors: list[FloatArray | None] = [None] * len(tree.structures)
+        self._heights = [0] * len(tree.structures)
+
+    def add(self, structure: int, rows: FloatArray, places: IntArray) -> None:
+        """Fold rows (a, k, w + p + 1) into the nodes at `places` (k,) of one structure."""
+        factor, used = self._factors[structure], self._heights[structure]
+        if factor is None:
+            count = len(self.tree.structures[structure])
+            factor = np.zeros((self.trials, count, 0, rows.shape[-1]))
+        height = _folded_height(factor, used, places)
+        if height > factor.shape[2]:
+            factor = _with_height(factor, height)
+        _fold_in_place(factor, used, rows, places)
+        self._factors[structure], self._heights[structure] = factor, max(height, used)
+
+    def arrays(self) -> list[FloatArray]:
+        """Return the factors (a, n, h, w + p + 1) of every structure; h = 0 without rows."""
+        p = self.parameters + 1
+        pairs = zip(self._factors, self.tree.structures, strict=True)
+        return [
+            np.zeros((self.trials, len(s), 0, s.width + p)) if f is None else f for f, s in pairs
+        ]
+
+    def sum_of_squares(self) -> FloatArray:
+        """Return the sum of squares (a,) of the right-hand sides; infinite if not finite."""
+        total = np.zeros(self.trials)
+        for factor in self.arrays():
+            total = total + (factor[..., -1] ** 2).sum(axis=(1, 2))
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def squared_change(self, step: FloatArray) -> FloatArray:
+        """Return the squared length (a,) of the change of all rows by a step (a, U)."""
+        total = np.zeros(self.trials)
+        for factor, structure in zip(self.arrays(), self.tree.structures, strict=True):
+            columns = factor[..., : structure.width]
+            change = np.matmul(columns, step[:, structure.path][..., None])
+            total += (change**2).sum(axis=(1, 2, 3))
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSolution:
+    """Nodes of one structure after their elimination: x = -solution @ [ancestors, z, 1].
+
+    Attributes
+    ----------
+    inverse : (a, n, u, u) pseudo-inverse of the triangle of the node's own columns.
+    solution : (a, n, u, w - u + p + 1).
+    unobservable : (a, n, u, u) unobservable directions, one per row, in columns of length one; zero
+        rows for the others.
+    """
+
+    inverse: FloatArray
+    solution: FloatArray
+    unobservable: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class TreeElimination(TrialBatch):
+    """U eliminated unknowns: their best values are a linear function of the machine's deviation.
+
+    Attributes
+    ----------
+    tree : of the unknowns.
+    slope : (a, U, p) change of the best values by the machine's deviations.
+    shift : (a, U) step from the present values to the best ones at the present machine.
+    rank : (a,) number of observable directions.
+    is_unobservable : (a, U) unknowns with a part in an unobservable direction.
+    nodes : the solution of every structure.
+    """
+
+    shared: ClassVar[tuple[str, ...]] = ("tree",)
+
+    tree: EliminationTree
+    slope: FloatArray
+    shift: FloatArray
+    rank: IntArray
+    is_unobservable: BoolArray
+    nodes: tuple[NodeSolution, ...]
+
+    @cached_property
+    def roots(self) -> tuple[FloatArray, ...]:
+        """(a, n, w, w) of every structure: square roots of the covariance of each path.
+
+        With the rows F of a cluster, T T' = (F'F)^-1 where everything is observable: rows times T
+        are in units of the standard deviations of the path's unknowns.
+        """
+        roots: list[FloatArray] = []
+        for structure, node in zip(self.tree.structures, self.nodes, strict=True):
+            a, n, u, _ = node.inverse.shape
+            w = structure.width
+            root = np.zeros((a, n, w, w))
+            root[:, :, :u, :u] = node.inverse
+            if w > u:
+                above = roots[structure.parent][:, structure.parent_place]
+                root[:, :, u:, u:] = above
+                root[:, :, :u, u:] = -np.matmul(node.solution[..., : w - u], above)
+            roots.append(root)
+        return tuple(roots)
+
+    def at_nodes(self, nodes: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return paths (k, w), roots (k, w, w) and slopes (k, w, p) of nodes (k,), first trial.
+
+        The nodes must have one structure.
+        """
+        structure, places = int(self.tree.structure[nodes[0]]), self.tree.place[nodes]
+        path = self.tree.structures[structure].path[places]
+        return path, self.roots[structure][0][places], self.slope[0][path]
+
+    def joint_root(self) -> FloatArray:
+        """Return a square root (a, U, U) of the covariance of all unknowns at a known machine.
+
+        Its columns belong to independent standard normal variables; see `roots`.
+        """
+        joint = np.zeros((*self.shift.shape, self.shift.shape[1]))
+        for structure, root in zip(self.tree.structures, self.roots, strict=True):
+            u = structure.unknowns.shape[1]
+            rows, columns = structure.unknowns[:, :, None], structure.path[:, None, :]
+            joint[:, rows, columns] = root[:, :, :u]
+        return joint
+
+    def variances(self) -> FloatArray:
+        """Return the variance (a, U) of each unknown at a known machine, for unit noise.
+
+        It has no meaning where `is_unobservable`.
+        """
+        variance = np.zeros(self.shift.shape)
+        for structure, root in zip(self.tree.structures, self.roots, strict=True):
+            columns = root[:, :, : structure.unknowns.shape[1]]
+            variance[:, structure.unknowns] = (columns**2).sum(axis=-1)
+        return variance
+
+
+def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
+    """Eliminate all unknowns.
+
+    Returns
+    -------
+    elimination : what becomes of the unknowns.
+    factor : (a, p + 1, p + 1) of the machine's rows that are left.
+    """
+    tree, arrays = factors.tree, factors.arrays()
+    length = _column_lengths(factors, arrays)
+    rest = empty_factor(factors.trials, factors.parameters)
+    rank = np.zeros(factors.trials, dtype=np.int64)
+    solutions: list[NodeSolution] = []
+    for i in reversed(range(len(tree.structures))):
+        structure = tree.structures[i]
+        done = _eliminate_nodes(arrays[i], length[:, structure.unknowns], structure)
+        solutions.append(NodeSolution(done.inverse, done.solution, done.unobservable))
+        rank += done.rank.sum(axis=1)
+        u = structure.unknowns.shape[1]
+        left = done.rest[..., u:, :] if done.is_observable.all() else done.rest
+        rows = left.reshape(factors.trials, -1, left.shape[-1])
+        if structure.parent < 0:
+            rest = engine.fold(rest, rows)
+        else:
+            places = np.repeat(structure.parent_place, left.shape[2])
+            arrays[structure.parent] = fold_at(arrays[structure.parent], rows, places)
+    nodes = tuple(reversed(solutions))
+    values = _back_substitute(factors, nodes)
+    is_unobservable, values = _remove_unobservable(tree, nodes, length, values)
+    elimination = TreeElimination(
+        tree, values[..., :-1], values[..., -1], rank, is_unobservable, nodes
+    )
+    return elimination, rest
+
+
+def _eliminate_nodes(factor: FloatArray, length: FloatArray, structure: Structure) -> Elimination:
+    """Eliminate the own columns, of length (a, n, u) over all rows, of factors (a, n, h, ..)."""
+    u = structure.unknowns.shape[1]
+    if factor.shape[2] < u:
+        factor = _with_height(factor, u)
+    top, below = factor[:, :, :u], factor[:, :, u:, u:]
+    return eliminate_from_triangle(top[..., :u], top[..., u:], below, length)
+
+
+def _column_lengths(factors: NodeFactors, arrays: list[FloatArray]) -> FloatArray:
+    """Return the length (a, U) of every unknown's column over all rows; 1 where it is zero."""
+    squares = np.zeros((len(factors.tree.node), factors.trials))
+    for structure, factor in zip(factors.tree.structures, arrays, strict=True):
+        part = (factor[..., : structure.width] ** 2).sum(axis=2)
+        np.add.at(squares, structure.path.ravel(), part.reshape(len(part), -1).T)
+    return np.sqrt(np.where(squares > 0.0, squares, 1.0)).T
+
+
+def _back_substitute(factors: NodeFactors, nodes: tuple[NodeSolution, ...]) -> FloatArray:
+    """Return best values (a, U, p + 1): by the machine's deviations, and here."""
+    values = np.zeros((factors.trials, len(factors.tree.node), factors.parameters + 1))
+    for structure, node in zip(factors.tree.structures, nodes, strict=True):
+        w, u = structure.width, structure.unknowns.shape[1]
+        best = node.solution[..., w - u :]
+        if w > u:
+            best = best + np.matmul(node.solution[..., : w - u], values[:, structure.path[:, u:]])
+        values[:, structure.unknowns] = -best
+    return values
+
+
+def _remove_unobservable(
+    tree: EliminationTree, nodes: tuple[NodeSolution, ...], length: FloatArray, values: FloatArray
+) -> tuple[BoolArray, FloatArray]:
+    """Take the unobservable directions out of best values (a, U, q); mark unknowns in them.
+
+    A direction that is unobservable in a node has no part in the node's ancestors. It moves the
+    node's children along their best values. All directions that begin in one cluster are made
+    orthonormal together. Those of the innermost nodes have no part in any best value.
+    """
+    share = np.zeros(length.shape)
+    for i, (structure, node) in enumerate(zip(tree.structures, nodes, strict=True)):
+        if i not in tree.parents:
+            share[:, structure.unknowns] = (node.unobservable**2).sum(axis=2)
+    if not any(nodes[i].unobservable.any() for i in tree.parents):
+        return np.sqrt(share) > NULL_COMPONENT, values
+    values = values.copy()
+    carried, clusters = _carry_inwards(tree, nodes, length)
+    for c in clusters:
+        inside = np.flatnonzero(tree.cluster == c)
+        left, s, _ = np.linalg.svd(carried[:, inside], full_matrices=False)
+        basis = np.where((s > SHORTEST_DIRECTION)[:, None, :], left, 0.0)
+        scaled = values[:, inside] * length[:, inside, None]
+        along = np.matmul(basis, np.matmul(basis.swapaxes(-1, -2), scaled))
+        values[:, inside] = (scaled - along) / length[:, inside, None]
+        share[:, inside] += (basis**2).sum(axis=-1)
+    return np.sqrt(share) > NULL_COMPONENT, values
+
+
+def _carry_inwards(
+    tree: EliminationTree, nodes: tuple[NodeSolution, ...], length: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Return unobservable directions (a, U, k), from their nodes inwards, columns of length one.
+
+    Directions of different clusters share the k columns. The clusters that have any are returned,
+    too.
+    """
+    a, U = length.shape
+    begins = np.zeros(U, dtype=bool)
+    for i in tree.parents:
+        begins[tree.structures[i].unknowns] = True
+    chosen = np.flatnonzero(begins)
+    count = np.bincount(tree.cluster[chosen], minlength=1)
+    order = chosen[np.argsort(tree.cluster[chosen], kind="stable")]
+    slot = np.zeros(U, dtype=np.int64)
+    slot[order] = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    carried = np.zeros((a, U, int(count.max())))
+    for i, (structure, node) in enumerate(zip(tree.structures, nodes, strict=True)):
+        own, w, u = structure.unknowns, structure.width, structure.unknowns.shape[1]
+        if w > u:
+            above = structure.path[:, u:]
+            change = np.matmul(
+                node.solution[..., : w - u], carried[:, above] / length[:, above][..., None]
+            )
+            carried[:, own] = -change * length[:, own][..., None]
+        if i in tree.parents:
+            carried[:, own[:, :, None], slot[own][:, None, :]] += node.unobservable.swapaxes(-1, -2)
+    clusters = find_distinct(tree.cluster[np.flatnonzero(carried.any(axis=(0, 2)))])
+    return carried, clusters
+
+
+def fold_at(factor: FloatArray, rows: FloatArray, places: IntArray) -> FloatArray:
+    """Return factors (a, n, h, w) with rows (a, k, w) folded in at places (k,)."""
+    used = factor.shape[2]
+    out = _with_height(factor, max(used, _folded_height(factor, used, places)))
+    _fold_in_place(out, used, rows, places)
+    return out
+
+
+def _folded_height(factor: FloatArray, used: int, places: IntArray) -> int:
+    """Return the rows of factors after one more fold, of which `used` are in use before."""
+    return min(factor.shape[3], used + int(np.bincount(places, minlength=1).max()))
+
+
+def _with_height(factor: FloatArray, height: int) -> FloatArray:
+    """Return factors (a, n, height, w), rows of zeros below."""
+    out = np.zeros((*factor.shape[:2], height, factor.shape[3]))
+    out[:, :, : factor.shape[2]] = factor
+    return out
+
+
+def _fold_in_place(out: FloatArray, used: int, rows: FloatArray, places: IntArray) -> None:
+    """Fold rows (a, k, w) into factors (a, n, height, w) at places (k,).
+
+    The first `used` rows of the factors are in use. Factors that get about as many rows are worked
+    on together, padded with rows of zeros. The others are not touched.
+    """
+    a, n, _, w = out.shape
+    count = np.bincount(places, minlength=n)
+    order = np.argsort(places, kind="stable")
+    within = np.empty(len(places), dtype=np.int64)
+    within[order] = np.arange(len(places)) - np.repeat(np.cumsum(count) - count, count)
+    size = np.where(count > 0, np.ceil(np.log2(np.maximum(count, 1))), -1)
+    for alike in find_distinct(size[size >= 0]):
+        chosen = np.flatnonzero(size == alike)
+        index = np.full(n, -1)
+        index[chosen] = np.arange(len(chosen))
+        mine = np.flatnonzero(index[places] >= 0)
+        stacked = np.zeros((a, len(chosen), used + int(count[chosen].max()), w))
+        stacked[:, :, :used] = out[:, chosen, :used]
+        stacked[:, index[places[mine]], used + within[mine]] = rows[:, mine]
+        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+        out[:, chosen, : triangle.shape[2]] = triangle
+
+
+# --- Derivatives that are nothing but rounding.
+
+ROUNDING = 1e-12
+"""Share of the size of its terms below which a sum of a few products is rounding: some thousand
+units of the last place.
+"""
+
+
+def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
+    """Return derivatives with zeros where they are rounding.
+
+    They are rounding where they are at most ROUNDING of the size of the terms whose sum they are.
+    A column that is rounding must be set to zero BEFORE columns are scaled to length one: after
+    that, a few units of the last place look like any other direction and produce an unbounded step.
+
+    Parameters
+    ----------
+    values : any shape. size : of the terms, broadcast to it; with a size of zero, or not finite,
+        values stay.
+    """
+    return np.where(
+        (np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values
+    )
+
+
+# --- Elimination of leading columns of stacked rows by orthogonal projection.
+
+SMALLEST_ROW = 1e-14
+"""Rows that the projection leaves shorter than this share of the largest are rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """Rows [F | A] without the k columns F.
+
+    Attributes
+    ----------
+    rest : (.., m, w) rows left of A, free of the eliminated unknowns.
+    solution : (.., k, w); the best eliminated unknowns are x = -solution @ z.
+    inverse : (.., k, k) pseudo-inverse of the triangle of F.
+    is_observable : (.., k) directions that the rows determine.
+    directions : (.., k, k) the directions, one per row, in columns of length one.
+    singular_values : (.., k) of F with columns of length one, descending.
+    explained : (..,) squared length of the last column of A that the range of F explains.
+    """
+
+    rest: FloatArray
+    solution: FloatArray
+    inverse: FloatArray
+    is_observable: BoolArray
+    directions: FloatArray
+    singular_values: FloatArray
+    explained: FloatArray
+
+    @property
+    def rank(self) -> IntArray:
+        """(..,) number of observable directions."""
+        return self.is_observable.sum(axis=-1)
+
+    @property
+    def unobservable(self) -> FloatArray:
+        """(.., k, k) the unobservable directions, one per row; zero for the observable ones."""
+        return np.where(self.is_observable[..., None], 0.0, self.directions)
+
+
+def eliminate_from_triangle(
+    triangle: FloatArray, right: FloatArray, below: FloatArray, length: FloatArray | None = None
+) -> Elimination:
+    """Eliminate k unknowns from rows [[triangle, right], [0, below]].
+
+    Parameters
+    ----------
+    triangle : (.., k, k). right : (.., k, w). below : (.., m, w).
+    length : (.., k), optional. Lengths of the columns over all rows, where the triangle is what
+        earlier eliminations left of them; by default those of the triangle's columns.
+
+    Returns
+    -------
+    Elimination; its `rest` has k + m rows, those of observable directions being zero.
+    """
+    if length is None:
+        norm = np.linalg.norm(triangle, axis=-2)
+        length = np.where(norm > 0.0, norm, 1.0)
+    return _eliminate(triangle / length[..., None, :], right, below, length)
+
+
+def _eliminate(
+    scaled_triangle: FloatArray, right: FloatArray, below: FloatArray, length: FloatArray
+) -> Elimination:
+    """Eliminate k unknowns whose triangle (.., k, k) is divided by the lengths of its columns."""
+    left, s, vt = np.linalg.svd(scaled_triangle)
+    # columns have length one: the largest singular value is at least one, unless earlier
+    # eliminations have left nothing but rounding
+    used = s > NUISANCE_TOLERANCE * np.maximum(s[..., :1], 1.0)
+    turned = np.matmul(left.swapaxes(-1, -2), right)
+    root = np.divide(1.0, s, out=np.zeros_like(s), where=used)
+    scaled = vt.swapaxes(-1, -2) * root[..., None, :] / length[..., None]
+    rest = np.concatenate([np.where(used[..., None], 0.0, turned), below], axis=-2)
+    return Elimination(
+        rest=rest,
+        solution=np.matmul(scaled, turned),
+        inverse=np.matmul(scaled, left.swapaxes(-1, -2)),
+        is_observable=used,
+        directions=vt,
+        singular_values=s,
+        explained=np.where(used, turned[..., -1] ** 2, 0.0).sum(axis=-1),
+    )
+
+
+def eliminate_columns(rows: FloatArray, count: int) -> Elimination:
+    """Eliminate the first `count` columns k of rows (.., N, k + w), N >= k.
+
+    What the projection leaves of a column that the eliminated ones explain in full is set to zero,
+    so that its rounding does not become a direction. What is left of rows that are not finite is
+    NaN.
+    """
+    # absent rows go last: no reflection touches them there, and they do not mix with the others
+    order = np.argsort(~rows.any(axis=-1), axis=-1, kind="stable")
+    rows = np.take_along_axis(rows, order[..., None], axis=-2)
+    bad = np.asarray(~np.isfinite(rows).all(axis=(-1, -2)))
+    if bad.any():
+        rows = np.where(bad[..., None, None], 0.0, rows)
+    norm = np.linalg.norm(rows[..., :count], axis=-2)
+    length = np.where(norm > 0.0, norm, 1.0)
+    q, r = np.linalg.qr(rows[..., :count] / length[..., None, :], mode="complete")
+    right = np.matmul(q.swapaxes(-1, -2), rows[..., count:])
+    done = _eliminate(r[..., :count, :], right[..., :count, :], right[..., count:, :], length)
+    rest = done.rest
+    before = np.linalg.norm(rows[..., None, count:-1], axis=-3)
+    rest[..., :-1] = without_rounding(rest[..., :-1], before)
+    size = np.abs(right).max(axis=(-1, -2), keepdims=True, initial=0.0)
+    largest = np.abs(rest).max(axis=-1, keepdims=True, initial=0.0)
+    rest[...] = np.where(largest > SMALLEST_ROW * size, rest, 0.0)
+    if bad.any():
+        rest[bad] = np.nan
+    return done
+
+
+def eliminate_from_factor(factor: FloatArray, count: int) -> FloatArray:
+    """Eliminate the first `count` columns k of one triangular factor (1, k + c, k + c).
+
+    Returns
+    -------
+    factor : (1, c, c) of the rows left.
+    """
+    if count == 0:
+        return factor
+    done = eliminate_from_triangle(
+        factor[:, :count, :count], factor[:, :count, count:], factor[:, count:, count:]
+    )
+    return np.asarray(np.linalg.qr(done.rest, mode="r"))

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chi-square and F distributions: tail probabilities and quantiles.
+
+The functions of scipy are imported when a function is called, so that `import loopcal` does not
+pay for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal.typing import FloatArray
+
+NODES = 101
+"""Values of the true noise of each source over which a probability is averaged."""
+
+
+def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatArray:
+    """Return the probability that chi-square exceeds a statistic; 1 without a degree of freedom.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom. statistic : sum of squares [1]. Both broadcast.
+    """
+    from loopcal.numerics.special_functions import chdtrc
+
+    degrees = np.asarray(degrees, dtype=float)
+    tail = chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic)
+    return np.where(degrees > 0.0, tail, 1.0)
+
+
+def compute_f_tail(degrees: ArrayLike, left: ArrayLike, statistic: ArrayLike) -> FloatArray:
+    """Return the probability that F exceeds a statistic; NaN without degrees of freedom left.
+
+    F is a chi-square per degree of freedom, where the noise is estimated from residuals.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom of the statistic; without one the probability is 1.
+    left : of the residuals; infinite for known noise. All broadcast.
+    """
+    from loopcal.numerics.special_functions import fdtrc
+
+    degrees, left = np.asarray(degrees, dtype=float), np.asarray(left, dtype=float)
+    tested = np.where(degrees > 0.0, degrees, 1.0)
+    is_estimated = (left > 0.0) & np.isfinite(left)
+    tail = np.where(
+        is_estimated,
+        fdtrc(tested, np.where(is_estimated, left, 1.0), statistic),
+        compute_chi_square_tail(tested, tested * np.asarray(statistic, dtype=float)),
+    )
+    return np.where(left > 0.0, np.where(degrees > 0.0, tail, 1.0), np.nan)
+
+
+def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:
+    """Return the statistic that chi-square exceeds with a probability.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom, above 0. probability : of a larger value [1]. Both broadcast.
+    """
+    from loopcal.numerics.special_functions import chdtri
+
+    return np.asarray(chdtri(degrees, probability), dtype=float)
+
+
+def compute_f_quantile(degrees: ArrayLike, left: ArrayLike, probability: ArrayLike) -> FloatArray:
+    """Return the statistic that F exceeds with a probability.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom of the statistic, above 0.
+    left : of the estimated noise, above 0; infinite for a known one: chi-square over `degrees`.
+    probability : of a larger value [1]. All broadcast.
+    """
+    from loopcal.numerics.special_functions import fdtri
+
+    left = np.asarray(left, dtype=float)
+    is_known = np.isinf(left)
+    known = compute_chi_square_quantile(degrees, probability) / np.asarray(degrees)
+    estimated = fdtri(degrees, np.where(is_known, 1.0, left), 1.0 - np.asarray(probability))
+    return np.where(is_known, known, estimated)
+
+
+def compute_averaged_tail(
+    chi_square: float, degrees: float, sources: Sequence[tuple[float, float]]
+) -> float:
+    """Return the probability of a larger chi-square where noise was estimated: the mean over the
+    true noise, given the estimated one (Behrens and Fisher; with one source the F distribution).
+
+    The true variance of a source is nu / chi-square(nu) times the estimated one.
+
+    Parameters
+    ----------
+    sources : the part of each source in the degrees of freedom of the chi-square, and the degrees
+        of freedom nu of its variance.
+    """
+    from loopcal.numerics.special_functions import chdtri
+
+    total = sum(part for part, _ in sources)
+    probability = (np.arange(NODES) + 0.5) / NODES
+    true = np.zeros(1)
+    for part, nu in sources:
+        times = np.ones(1) if np.isinf(nu) else nu / chdtri(nu, probability)
+        true = (true[:, None] + part / total * times).ravel()
+    return float(compute_chi_square_tail(degrees, chi_square / true).mean())
+
+
+# --- Levels and probabilities where several tests are made at once.
+
+NEAR_ONE = 1.0 - 1e-16
+"""Largest probability of a test whose complement a double still has."""
+
+
+def compute_any_probability(p_value: float, tests: int) -> float:
+    """Return the probability 1 - (1 - p)^n that any of n tests is as significant; p without any."""
+    return float(-np.expm1(max(tests, 1) * np.log1p(-min(p_value, NEAR_ONE))))
+
+
+def compute_single_level(level: float, tests: int) -> float:
+    """Return the level 1 - (1 - a)^(1 / n) of each of n tests, of which any finds something with
+    the probability a; a itself without any test.
+    """
+    return float(-np.expm1(np.log1p(-min(level, NEAR_ONE)) / max(tests, 1)))
+
+
+# --- A variance component of a vector whose elements else have equal, unknown variance.
+
+STEPS, NEWTON = 400, 100
+"""Values of tau that are compared, and most steps to the saddlepoint."""
+
+SMALLEST, LARGEST = 1e-3, 1e4
+"""Ends of the values of tau: the strongest element gains this share of sigma, and this many."""
+
+
+class VarianceComponent(NamedTuple):
+    """The estimate of a variance component.
+
+    Attributes
+    ----------
+    variance : mean of sigma^2 tau^2. degrees : its degrees of freedom.
+    ratio : of variances, tau^2 at which the likelihood is largest.
+    """
+
+    variance: float
+    degrees: float
+    ratio: float
+
+
+def compute_component_tail(weights: FloatArray, y: FloatArray) -> float:
+    """Return the probability of a larger Q without the component; 1 where there is no test.
+
+    Parameters
+    ----------
+    weights, y : (k,) elements.
+    """
+    total, largest = float((y**2).sum()), float(weights.max(initial=0.0))
+    if not (total > 0.0 and largest > 0.0):
+        return 1.0
+    return _tail(weights / largest - float(weights @ y**2) / (largest * total))
+
+
+def estimate_variance_component(
+    weights: FloatArray, y: FloatArray, known: float = 0.0
+) -> VarianceComponent:
+    """Return the size of a component; arguments as of `compute_component_tail`.
+
+    `known` degrees of freedom say that sigma is 1; infinite ones, that it is exactly 1.
+    """
+    largest = float(weights.max())
+    tau = np.geomspace(SMALLEST, LARGEST, STEPS) / np.sqrt(largest)
+    ratio = tau**2
+    scale = 1.0 + ratio[:, None] * weights
+    square, count = (y**2 / scale).sum(axis=1), len(y) + known
+    if np.isinf(known):
+        by_size, variance = -0.5 * square, np.ones(STEPS)
+    else:
+        by_size, variance = -0.5 * count * np.log(square + known), (square + known) / count
+    density = by_size - 0.5 * np.log(scale).sum(axis=1)
+    share = np.exp(density - density.max()) * np.gradient(tau)
+    share /= share.sum()
+    values = ratio * variance
+    mean = float(share @ values)
+    # sigma^2 at each tau has a relative variance of its own
+    own = 2.0 / max(count - 4.0, 1.0)
+    spread = float(share @ ((values - mean) ** 2 + own * values**2))
+    degrees = max(2.0 * mean**2 / spread, 1.0)
+    return VarianceComponent(mean, degrees, float(ratio[np.argmax(density)]))
+
+
+def _tail(values: FloatArray) -> float:
+    """Return P(sum of values_i times chi-square of one degree > 0), saddlepoint t:
+
+    K(t) = -1/2 sum log(1 - 2 t values), K'(t) = 0, w = sign(t) sqrt(-2 K(t)),
+    v = t sqrt(K''(t)), tail = 1 - Phi(w + log(v / w) / w).
+    """
+    from loopcal.numerics.special_functions import ndtr
+
+    if not (values.max() > 0.0 > values.min()):
+        return 1.0 if values.min() >= 0.0 else 0.0
+    low, high = 0.5 / values.min(), 0.5 / values.max()
+
+    def slope(t: float) -> float:
+        return float((values / (1.0 - 2.0 * t * values)).sum())
+
+    t = 0.0
+    for _ in range(NEWTON):  # K' grows: bisection cannot fail
+        low, high = (t, high) if slope(t) < 0.0 else (low, t)
+        before, t = t, 0.5 * (low + high)
+        if t == before:
+            break
+    K = -0.5 * float(np.log1p(-2.0 * t * values).sum())
+    curvature = 2.0 * float(((values / (1.0 - 2.0 * t * values)) ** 2).sum())
+    w, v = np.sign(t) * np.sqrt(max(-2.0 * K, 0.0)), t * np.sqrt(curvature)
+    if abs(w) < 1e-4:  # the limit at the mean
+        third = 8.0 * float(((values / (1.0 - 2.0 * t * values)) ** 3).sum())
+        return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
+    return float(ndtr(-(w + np.log(v / w) / w)))
+
+
+# --- Distinct values and medians without masked arrays.
+
+
+def find_distinct(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the distinct values of an array, of any shape and type, in ascending order.
+
+    They are those of `np.unique`. With `return_counts`, it does not ask whether the array is masked
+    (numpy 2.4).
+    """
+    return np.unique(values, return_counts=True)[0]
+
+
+def compute_median(values: FloatArray) -> float:
+    """Return the median of at least one number: NaN if one is NaN, as `np.median`.
+
+    values : any shape.
+    """
+    ordered = np.sort(values, axis=None)  # NaN come last
+    if np.isnan(ordered[-1]):
+        return float("nan")
+    return float(np.mean(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1]))

@@ -1,0 +1,568 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Information of designs: prior rows, observable directions, and the factor of a chosen design.
+
+A **group** is what is measured together: one pose, or several poses that one row compares. Its rows
+[F | A] have the nuisance parameters of the instruments (F, to be eliminated) before the unknowns of
+the machine (A). Directions of the machine that no candidate separates from the nuisance parameters
+are removed once, by a stated tolerance, for all designs alike. See docs/theory/planning.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.errors import EstimationError
+from loopcal.findings import report_finding
+from loopcal.numerics.decomposition import RANK_TOLERANCE, are_nonzero
+from loopcal.numerics.elimination import eliminate_from_triangle
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PriorInformation:
+    """Information that exists before the first new pose.
+
+    Attributes
+    ----------
+    rows : (k, o + p) whitened and in tolerances: rows measured already, or identity rows for
+        tolerances.
+    n_nuisance : o, number of nuisance parameters; their columns come first.
+    """
+
+    rows: FloatArray
+    n_nuisance: int = 0
+
+    @classmethod
+    def none(cls, machine: int, nuisance: int = 0) -> PriorInformation:
+        """Return no information on `machine` unknowns and `nuisance` nuisance parameters."""
+        return cls(np.zeros((0, nuisance + machine)), nuisance)
+
+    @classmethod
+    def from_tolerances(cls, machine: int, nuisance: int = 0) -> PriorInformation:
+        """Return variance 1 for each machine unknown and nothing for the nuisance parameters."""
+        return cls(np.eye(nuisance + machine)[nuisance:], nuisance)
+
+    def with_rows(self, rows: ArrayLike) -> PriorInformation:
+        """Return this with more rows (..., o + p): measured poses, or tolerances of nuisance
+        parameters.
+        """
+        added = np.asarray(rows, dtype=np.float64).reshape(-1, self.rows.shape[1])
+        return PriorInformation(factor_rows(np.concatenate([self.rows, added])), self.n_nuisance)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservableSpace:
+    """The directions that a set of rows can determine; designs are compared in this space.
+
+    Attributes
+    ----------
+    machine : (p, q) orthonormal directions of the machine's unknowns.
+    nuisance : (o, o') directions of the nuisance parameters.
+    singular_values : (p,) of the machine's columns after elimination, descending.
+    """
+
+    machine: FloatArray
+    nuisance: FloatArray
+    singular_values: FloatArray
+
+    def __len__(self) -> int:
+        return self.machine.shape[1]
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of nuisance and machine directions together."""
+        return self.nuisance.shape[1] + self.machine.shape[1]
+
+    def project(self, rows: FloatArray) -> FloatArray:
+        """Return rows (..., o + p) in these directions, (..., o' + q), nuisance first."""
+        o = len(self.nuisance)
+        return np.concatenate(
+            [rows[..., :o] @ self.nuisance, rows[..., o:] @ self.machine], axis=-1
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A chosen set of groups.
+
+    Attributes
+    ----------
+    chosen : (n,) indices of the candidates, ascending.
+    value : of the criterion.
+    history : values of the best start: after it began, and after each exchange.
+    values : final value of each start.
+    space : the directions in which the value counts.
+    is_converged : whether no single exchange improves it; False where the exchanges ran out.
+    """
+
+    chosen: IntArray
+    value: float
+    history: tuple[float, ...]
+    values: tuple[float, ...]
+    space: ObservableSpace
+    is_converged: bool = True
+
+
+def factor_rows(rows: FloatArray) -> FloatArray:
+    """Return the triangular factor R of rows (m, c), at most (c, c): R'R is their information."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:
+    """Return X R^-1 for rows X (..., q) and a nonsingular triangular factor R (q, q)."""
+    from scipy.linalg.blas import dtrsm  # pyright: ignore[reportAttributeAccessIssue]
+
+    flat = rows.reshape(-1, rows.shape[-1])
+    # R' is lower triangular, and both transposes are already in the order of BLAS
+    return np.asarray(dtrsm(1.0, R.T, flat.T, lower=1).T, dtype=np.float64).reshape(rows.shape)
+
+
+def is_allowed(rows: FloatArray) -> BoolArray:
+    """Return for rows (N, r, c) of N groups which groups (N,) contain no NaN."""
+    return np.asarray(np.isfinite(rows).all(axis=(1, 2)))
+
+
+def find_observable_space(
+    rows: FloatArray, prior: PriorInformation, tolerance: float = RANK_TOLERANCE
+) -> ObservableSpace:
+    """Return the directions that all groups and the prior determine together.
+
+    The nuisance parameters are eliminated by `loopcal.numerics.elimination`. The remainder
+    of the machine's columns is cut at `tolerance` times its largest singular value.
+
+    Parameters
+    ----------
+    rows : (N, r, o + p); NaN where a group is not allowed.
+    """
+    allowed = rows[is_allowed(rows)].reshape(-1, rows.shape[-1])
+    o = prior.n_nuisance
+    R = _pad_factor(factor_rows(np.concatenate([prior.rows, allowed])))
+    nuisance, rest = np.zeros((0, 0)), R
+    if o:
+        norm = np.linalg.norm(R[:o, :o], axis=0)
+        length = np.where(norm > 0.0, norm, 1.0)
+        done = eliminate_from_triangle(R[:o, :o], R[:o, o:], R[o:, o:], length)
+        nuisance, rest = done.directions[done.is_observable].T / length[:, None], done.rest
+    _, s, vt = np.linalg.svd(rest)
+    observable = vt[: len(s)][are_nonzero(s, tolerance)]
+    return ObservableSpace(observable.T, nuisance, s)
+
+
+def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSpace) -> FloatArray:
+    """Return the factor (q, q) of a design in the machine's observable directions.
+
+    The factor covers rows (n, r, o + p) and the prior; the nuisance parameters are eliminated.
+    """
+    stacked = np.concatenate([prior.rows, rows.reshape(-1, rows.shape[-1])])
+    R = _pad_factor(factor_rows(space.project(stacked)))
+    o = space.nuisance.shape[1]
+    return R[o:, o:]
+
+
+def require_enough(
+    n: int, rows: FloatArray, prior: PriorInformation, space: ObservableSpace, repeats: bool = True
+) -> None:
+    """Refuse a number of groups that cannot determine all directions.
+
+    Raises
+    ------
+    EstimationError
+        No candidate is allowed; nothing is observable; n groups have fewer rows than the prior
+        leaves unknowns; or, without repeats, fewer candidates are allowed than n.
+    """
+    count = int(is_allowed(rows).sum())
+    if count == 0:
+        raise EstimationError(report_finding("plan.no-candidate-allowed", total=len(rows)))
+    if len(space) == 0:
+        raise EstimationError(report_finding("plan.no-direction-observable"))
+    if n > count and not repeats:
+        raise EstimationError(
+            report_finding("plan.too-few-candidates", requested=n, what="poses", available=count)
+        )
+    needed = count_groups_needed(rows.shape[1], prior, space)
+    if n < needed:
+        raise EstimationError(
+            report_finding(
+                "plan.design-too-small",
+                requested=n,
+                equations=n * rows.shape[1],
+                unknowns=space.n_unknowns - _prior_rank(prior, space),
+                needed=needed,
+            )
+        )
+
+
+def count_groups_needed(equations: int, prior: PriorInformation, space: ObservableSpace) -> int:
+    """Return the smallest number of groups, of `equations` rows each, that can determine all
+    directions together with the prior.
+    """
+    return max(-(-(space.n_unknowns - _prior_rank(prior, space)) // equations), 1)
+
+
+def _prior_rank(prior: PriorInformation, space: ObservableSpace) -> int:
+    """Return how many directions, nuisance and machine together, the prior determines."""
+    if not prior.rows.any():
+        return 0
+    s = np.linalg.svd(space.project(prior.rows), compute_uv=False)
+    return int(are_nonzero(s).sum())
+
+
+def _pad_factor(R: FloatArray) -> FloatArray:
+    """Return a factor (m, c) of few rows with rows of zeros below, (c, c)."""
+    return np.concatenate([R, np.zeros((max(R.shape[1] - len(R), 0), R.shape[1]))])
+
+
+# --- Criteria of optimal design: scalar figures of the covariance C of the machine's unknowns.
+
+
+@dataclass(frozen=True)
+class D:
+    """Log determinant of the information on the machine.
+
+    A large value means a small volume of uncertainty. The best design does not depend on scaling.
+    """
+
+    name: ClassVar[str] = "D"
+
+
+@dataclass(frozen=True, eq=False)
+class I:  # noqa: E742
+    """Mean variance of a prediction.
+
+    Attributes
+    ----------
+    weights : (k, p) rows L: derivatives of all predicted quantities by the machine's unknowns [per
+        tolerance].
+    count : number of predictions (poses) in `weights`; the sum of the variances is divided by it.
+    """
+
+    weights: FloatArray
+    count: int = 1
+    name: ClassVar[str] = "I"
+
+
+@dataclass(frozen=True)
+class A:
+    """Sum of the variances of the observable directions, in squared tolerances."""
+
+    name: ClassVar[str] = "A"
+
+
+@dataclass(frozen=True)
+class E:
+    """Variance of the worst observable direction, in squared tolerances; never optimized."""
+
+    name: ClassVar[str] = "E"
+
+
+Criterion = D | I | A | E
+
+
+def is_full_rank(singular_values: np.ndarray) -> bool:
+    """Return whether a triangular factor with these descending singular values can be inverted.
+
+    The threshold is the rounding of the decomposition: a design that determines a direction barely
+    is poor, and the criterion says so, but it is not singular.
+    """
+    s = singular_values
+    return not s.size or bool(s[-1] > np.finfo(np.float64).eps * len(s) * s[0])
+
+
+def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatArray) -> float:
+    """Return the value of a criterion.
+
+    Parameters
+    ----------
+    factor : (q, q) upper triangular R; R'R is the information on the observable directions.
+    machine : (p, q) these directions, orthonormal in the machine's unknowns.
+
+    Returns
+    -------
+    value : -inf for D and inf for the others where R is singular.
+    """
+    s = np.linalg.svd(factor, compute_uv=False)
+    if not is_full_rank(s):
+        return -np.inf if isinstance(criterion, D) else np.inf
+    match criterion:
+        case D():
+            return float(2.0 * np.log(s).sum())
+        case A():
+            return float((1.0 / s**2).sum())
+        case E():
+            return float(1.0 / s[-1] ** 2) if s.size else 0.0
+        case I():
+            projected = divide_by_factor(criterion.weights @ machine, factor)
+            return float((projected**2).sum() / criterion.count)
+
+
+def compute_efficiency(criterion: Criterion, value: float, best: float, n_directions: int) -> float:
+    """Return the efficiency of a value relative to the best possible one, 0 to 1.
+
+    It is (ratio of determinants)^(1 / n_directions) for D, the ratio of variances for the others.
+    """
+    if isinstance(criterion, D):
+        return float(np.exp((value - best) / n_directions))
+    return float(best / value)
+
+
+# --- Score of a design in scaled coordinates, and the change of score by every swap at once.
+
+SINGULAR = 1e-6
+"""A design is singular where it determines a direction with less than this share of the mean
+design's information, as a ratio of standard deviations.
+"""
+
+GAIN = 1e-7
+"""An exchange or a move must multiply the efficiency by more than 1 + this."""
+
+RIDGE = 1e-3
+"""Ridge that is added to a singular start, as a ratio of standard deviations to the mean design."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scoring:
+    """A criterion in the coordinates of the mean design.
+
+    Attributes
+    ----------
+    space : the observable directions.
+    transform : (o + p, Q) from given rows to scaled rows, Q = o' + q, nuisance directions first.
+    prior_rows : (k, Q) scaled rows of the prior.
+    prediction : (j, q) K of I and A, in the same coordinates; None for D.
+    offset : value of D where the score is zero.
+    """
+
+    space: ObservableSpace
+    transform: FloatArray
+    prior_rows: FloatArray
+    prediction: FloatArray | None
+    offset: float
+
+    @property
+    def n_nuisance(self) -> int:
+        """Number o' of nuisance directions."""
+        return self.space.nuisance.shape[1]
+
+    @property
+    def height(self) -> float:
+        """Number h: the score grows by h log c where all information is multiplied by c."""
+        return float(len(self.space)) if self.prediction is None else 1.0
+
+    def scale_rows(self, rows: FloatArray) -> FloatArray:
+        """Return rows (..., r, o + p) in these coordinates, (..., r, Q); more than Q rows are
+        folded to Q.
+        """
+        scaled = rows @ self.transform
+        return (
+            scaled
+            if scaled.shape[-2] <= scaled.shape[-1]
+            else np.asarray(np.linalg.qr(scaled, mode="r"))
+        )
+
+    def factor(self, scaled: FloatArray) -> FloatArray:
+        """Return R (Q, Q) of the prior and scaled rows (..., Q), padded with rows of zeros."""
+        columns = self.prior_rows.shape[1]
+        R = factor_rows(np.concatenate([self.prior_rows, scaled.reshape(-1, columns)]))
+        return np.concatenate([R, np.zeros((columns - len(R), columns))])
+
+    def score(self, R: FloatArray) -> float:
+        """Return the score of a factor; -inf where it is singular."""
+        pivots = np.abs(np.diagonal(R))
+        if not (pivots > SINGULAR**2).all():
+            return -np.inf
+        if self.prediction is None:
+            return float(2.0 * np.log(pivots[self.n_nuisance :]).sum())
+        return float(-np.log((self.predict(R) ** 2).sum()))
+
+    def predict(self, R: FloatArray) -> FloatArray:
+        """Return P = K R_pp^-1 (j, q); the sum of its squares is the trace of I and A."""
+        assert self.prediction is not None
+        return divide_by_factor(self.prediction, R[self.n_nuisance :, self.n_nuisance :])
+
+    def value(self, score: float) -> float:
+        """Return the value of the criterion at a score."""
+        return score + self.offset if self.prediction is None else float(np.exp(-score))
+
+    def with_ridge(self, ridge: float) -> Scoring:
+        """Return this with `ridge`^2 of the mean design as prior; no design is singular then."""
+        rows = np.concatenate([self.prior_rows, ridge * np.eye(self.prior_rows.shape[1])])
+        return replace(self, prior_rows=rows)
+
+
+def is_determined(R: FloatArray) -> bool:
+    """Return whether a design with factor R determines all directions; see SINGULAR."""
+    return bool(np.linalg.svd(R, compute_uv=False)[-1] > SINGULAR)
+
+
+def build_scoring(
+    rows: FloatArray,
+    weight: float,
+    criterion: Criterion,
+    prior: PriorInformation,
+    space: ObservableSpace,
+) -> Scoring:
+    """Return the scoring whose mean design is the prior and every group with the same weight.
+
+    Parameters
+    ----------
+    rows : (N, r, o + p), finite. weight : of each group.
+
+    Raises
+    ------
+    EstimationError
+        The criterion is E, or the weights of I depend on no observable direction.
+    """
+    if isinstance(criterion, E):
+        raise EstimationError("criterion E cannot be optimized; choose D, I or A")
+    o, p = space.nuisance.shape
+    blocks = np.zeros((o + len(space.machine), space.n_unknowns))
+    blocks[:o, :p], blocks[o:, p:] = space.nuisance, space.machine
+    stacked = np.concatenate([prior.rows, np.sqrt(weight) * rows.reshape(-1, rows.shape[-1])])
+    reference = factor_rows(stacked @ blocks)
+    transform = divide_by_factor(blocks, reference)
+    inner, prediction = reference[p:, p:], None
+    if not isinstance(criterion, D):
+        L = (
+            criterion.weights @ space.machine / np.sqrt(criterion.count)
+            if isinstance(criterion, I)
+            else np.eye(len(space))
+        )
+        prediction = factor_rows(divide_by_factor(L, inner))
+        if not prediction.any():
+            raise EstimationError(report_finding("plan.prediction-unobservable"))
+    offset = float(2.0 * np.log(np.abs(np.diagonal(inner))).sum())
+    prior_rows = factor_rows(prior.rows @ transform)
+    return Scoring(space, transform, prior_rows, prediction, offset)
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledCandidates:
+    """The allowed groups of a problem in the coordinates of its scoring.
+
+    Attributes
+    ----------
+    scoring : of designs. rows : (N, r, Q) scaled. indices : (N,) of the groups among all.
+    repeats : whether a group may be chosen more than once.
+    """
+
+    scoring: Scoring
+    rows: FloatArray
+    indices: IntArray
+    repeats: bool
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def take(self, chosen: IntArray) -> ScaledCandidates:
+        """Return some of the groups."""
+        return replace(self, rows=self.rows[chosen], indices=self.indices[chosen])
+
+    def factor(self, chosen: IntArray) -> FloatArray:
+        """Return the factor (Q, Q) of the prior and the chosen groups (n,)."""
+        return self.scoring.factor(self.rows[chosen])
+
+    def is_determined(self, chosen: IntArray) -> bool:
+        """Return whether the chosen groups (n,) determine all directions."""
+        return is_determined(self.factor(chosen))
+
+
+def scale_candidates(
+    rows: FloatArray, n: int, criterion: Criterion, prior: PriorInformation, repeats: bool
+) -> ScaledCandidates:
+    """Return the allowed groups scaled by the mean design of n of them.
+
+    Raises
+    ------
+    EstimationError
+        See `require_enough` and `build_scoring`.
+    """
+    space = find_observable_space(rows, prior)
+    require_enough(n, rows, prior, space, repeats)
+    usable = np.flatnonzero(is_allowed(rows))
+    scoring = build_scoring(rows[usable], n / len(usable), criterion, prior, space)
+    return ScaledCandidates(scoring, scoring.scale_rows(rows[usable]), usable, repeats)
+
+
+@dataclass(frozen=True, eq=False)
+class SwapTerms:
+    """Terms of the swap formulas for all groups at the present design.
+
+    Attributes
+    ----------
+    Y : (N, r, Q). W : (N, r, r).
+    log_added : (N,) log det(I + G_kk).
+    nuisance : the same terms in the nuisance columns; None without any, and for I and A.
+    V : (N, r, j) for I and A; None for D.
+    gram : (N, r, r) V V'; None for D.
+    trace : |P|^2.
+    """
+
+    Y: FloatArray
+    W: FloatArray
+    log_added: FloatArray
+    nuisance: SwapTerms | None = None
+    V: FloatArray | None = None
+    gram: FloatArray | None = None
+    trace: float = 0.0
+
+
+def compute_swap_terms(scoring: Scoring, R: FloatArray, scaled: FloatArray) -> SwapTerms:
+    """Return the swap terms of scaled rows (N, r, Q) for a nonsingular factor R (Q, Q)."""
+    Y = divide_by_factor(scaled, R)
+    if scoring.prediction is None:
+        return _determinant_terms(Y, scoring.n_nuisance)
+    P = scoring.predict(R)
+    V = Y[:, :, scoring.n_nuisance :] @ P.T
+    base = _determinant_terms(Y, 0)
+    gram = V @ V.swapaxes(1, 2)
+    return replace(base, V=V, gram=gram, trace=float((P**2).sum()))
+
+
+def _determinant_terms(Y: FloatArray, n_nuisance: int) -> SwapTerms:
+    """Return the terms that D needs."""
+    total = np.eye(Y.shape[1]) + Y @ Y.swapaxes(1, 2)
+    return SwapTerms(
+        Y,
+        np.asarray(np.linalg.inv(total), dtype=np.float64),
+        np.asarray(np.linalg.slogdet(total)[1], dtype=np.float64),
+        _determinant_terms(Y[:, :, :n_nuisance], 0) if n_nuisance else None,
+    )
+
+
+def score_additions(terms: SwapTerms) -> FloatArray:
+    """Return the change of score (N,) when one group is added and none is removed."""
+    if terms.V is None or terms.gram is None:
+        return terms.log_added - (0.0 if terms.nuisance is None else terms.nuisance.log_added)
+    trace = terms.trace - (terms.W * terms.gram).sum(axis=(1, 2))
+    return np.log(terms.trace) - np.log(np.maximum(trace, np.finfo(np.float64).tiny))
+
+
+def score_swaps(terms: SwapTerms, j: int) -> FloatArray:
+    """Return the change of score (N,) when each group replaces group j, which is in the design.
+
+    -inf where the new design is singular.
+    """
+    Y = terms.Y[j]
+    U = terms.Y @ Y.T
+    WU = terms.W @ U
+    S = np.eye(len(Y)) - Y @ Y.T + U.swapaxes(1, 2) @ WU
+    sign, logdet = np.linalg.slogdet(S)
+    regular = sign > 0.0
+    if terms.V is None or terms.gram is None:
+        nuisance = 0.0 if terms.nuisance is None else score_swaps(terms.nuisance, j)
+        return np.where(regular, terms.log_added + logdet - nuisance, -np.inf)
+    V = terms.V[j]
+    cross = WU.swapaxes(1, 2) @ (terms.V @ V.T)
+    product = V @ V.T - cross - cross.swapaxes(1, 2) + WU.swapaxes(1, 2) @ terms.gram @ WU
+    S = np.where(regular[:, None, None], S, np.eye(len(Y)))
+    back = np.trace(np.linalg.solve(S, product), axis1=1, axis2=2)
+    trace = terms.trace - (terms.W * terms.gram).sum(axis=(1, 2)) + back
+    return np.where(
+        regular & (trace > 0.0),
+        np.log(terms.trace) - np.log(np.where(trace > 0.0, trace, 1.0)),
+        -np.inf,
+    )

@@ -1,0 +1,758 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The block bootstrap of one calibration: the scatter of its estimates over resampled data.
+
+Blocks of poses that may share an error are resampled together. In the world of the bootstrap the
+estimate is the truth, and each of the t resamples is fitted as the data were, by the same method,
+nonlinearly, with setup parameters and poses of uncertain readings. Priors are observations whose
+errors are drawn from their stated distributions.
+
+    wild     errors of a block, corrected for leverage, times one random number (default)
+    pairs    blocks are drawn with replacement: multinomial weights
+    normal   independent normal errors of the stated sigmas (Monte Carlo, JCGM 101)
+
+See docs/theory/resampling.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from loopcal.diagnose.cluster_covariance import (
+    FEWEST_CLUSTERS,
+    FEWEST_DEGREES,
+    Clusters,
+    compute_robust_spread,
+    divide_into_clusters,
+)
+from loopcal.diagnose.influence import TESTABLE
+from loopcal.errors import EstimationError
+from loopcal.estimate.elimination import spread_columns
+from loopcal.estimate.fit_input import check_fitted_data, exclude_poses
+from loopcal.estimate.fit_linearization import FitLinearization, linearize_fit
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.observation_rows import ObservationRows, linked_blocks
+from loopcal.estimate.penalties import MAP, LeastSquares
+from loopcal.estimate.pose_linearization import linearize_rows
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.resampling import Resamples, draw_centers, fit_resamples, join_fits
+from loopcal.estimate.residual_test import LEVEL
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.readings import fill_in_reading_sigma
+from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, are_nonzero
+from loopcal.numerics.elimination import find_connected_groups
+from loopcal.numerics.statistics import compute_single_level
+from loopcal.presentation import TableResult
+from loopcal.sampling.intervals import (
+    NAMED,
+    OFF,
+    Intervals,
+    compare_ends,
+    half_widths,
+    report_intervals,
+)
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
+
+# --- Whitened rows of a fit in the order of its kinds, with columns for everything that they
+# determine.
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedColumns:
+    """The whitened rows of one kind (one trial).
+
+    Attributes
+    ----------
+    residual : (r, m).
+    by_nuisance : (r, m, U) by the nuisance parameters, in units of their standard deviations.
+    by_parameters : (r, m, p) by the machine's deviations, as the nuisance parameters follow it.
+    by_coordinates : (r, links, m, k) by the coordinates of each linked pose; None where poses have
+        none.
+    """
+
+    residual: FloatArray
+    by_nuisance: FloatArray
+    by_parameters: FloatArray
+    by_coordinates: FloatArray | None
+
+
+def list_observed_columns(
+    problem: Problem, linearization: Linearization
+) -> tuple[ObservedColumns, ...]:
+    """Return the rows of every kind of a problem, at its linearization (one trial)."""
+    z, trials, estimate = linearization.deviation, problem.trials, linearization.nuisance
+    fixed = None if estimate is None else estimate.values
+    solution = problem.poses.solve(z, trials, linearization.next_start, problem.control, fixed)
+    root = None if estimate is None else estimate.elimination.joint_root()[0]
+    width = 0 if root is None else len(root)
+    kinds = [_make_empty(problem, rows, width) for rows in problem.rows]
+    for block, poses in problem.poses.iterate_linearized(solution, z, trials):
+        for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
+            if not len(numbers):
+                continue
+            own = linearize_rows(rows, poses, trials, fixed)
+            columns = own.by_parameters[0]
+            if own.by_nuisance is not None and estimate is not None:
+                wide = spread_columns(own.by_nuisance, rows.nuisance, width)[0]
+                columns = columns + wide @ estimate.elimination.slope[0]
+                kind.by_nuisance[numbers] = wide @ root
+            kind.residual[numbers], kind.by_parameters[numbers] = own.residual[0], columns
+            if own.by_coordinates is not None and kind.by_coordinates is not None:
+                kind.by_coordinates[numbers] = own.by_coordinates[0]
+    return tuple(kinds)
+
+
+def _make_empty(problem: Problem, rows: ObservationRows, width: int) -> ObservedColumns:
+    """Return arrays of zeros for the rows of a kind and `width` nuisance parameters."""
+    r, m = rows.whitener.shape[1:3]
+    coordinates = None
+    if problem.coordinates is not None:
+        links = rows.poses_by_link.shape[1]
+        coordinates = np.zeros((r, links, m, problem.coordinates.freedoms))
+    by_parameters = np.zeros((r, m, problem.parameters))
+    return ObservedColumns(np.zeros((r, m)), np.zeros((r, m, width)), by_parameters, coordinates)
+
+
+# --- Errors of the blocks of a fit, estimated from its residuals and corrected for leverage.
+
+
+@dataclass(frozen=True, eq=False)
+class BlockErrors:
+    """Errors of the M present measured values, block by block.
+
+    Attributes
+    ----------
+    residual : (M,) whitened residuals at the truth of the resamples.
+    error : (M,) those at the estimate, corrected for leverage.
+    block : (M,) number of the block of each, ascending. count : of blocks.
+    untested : of every block (M_g, d) an orthonormal basis of the directions without residuals.
+    places : of every kind, where (r, m) its components are among the M; -1 where absent.
+    """
+
+    residual: FloatArray
+    error: FloatArray
+    block: IntArray
+    count: int
+    untested: tuple[FloatArray, ...]
+    places: tuple[IntArray, ...]
+
+    def draw(
+        self, factor: FloatArray, sigma: float, rng: np.random.Generator
+    ) -> tuple[FloatArray, ...]:
+        """Return offsets (t, r, m) of every kind that replace the residuals by errors.
+
+        Parameters
+        ----------
+        factor : (t, count) by which the error of each block is multiplied.
+        sigma : standard deviation of errors in untested directions.
+        """
+        offset = factor[:, self.block] * self.error - self.residual
+        for g, basis in enumerate(self.untested):
+            if basis.shape[1]:
+                drawn = rng.standard_normal((len(factor), basis.shape[1]))
+                offset[:, self.block == g] += sigma * drawn @ basis.T
+        return self._by_kind(offset)
+
+    def draw_normal(
+        self, count: int, sigma: float, rng: np.random.Generator
+    ) -> tuple[FloatArray, ...]:
+        """Return offsets (count, r, m) of every kind that replace the residuals by independent
+        normal errors.
+        """
+        drawn = sigma * rng.standard_normal((count, len(self.residual)))
+        return self._by_kind(drawn - self.residual)
+
+    def _by_kind(self, values: FloatArray) -> tuple[FloatArray, ...]:
+        """Return values (t, M) as arrays (t, r, m) of every kind, 0 where absent."""
+        padded = np.concatenate([values, np.zeros((len(values), 1))], axis=1)
+        return tuple(padded[:, places] for places in self.places)
+
+
+def compute_block_errors(
+    linear: FitLinearization, clusters: Clusters, shift: FloatArray
+) -> BlockErrors:
+    """Return the errors of the rows of a fit, by independent blocks of poses.
+
+    Parameters
+    ----------
+    shift : (p,) in tolerances, from the estimate to the truth of the resamples, at which the rows
+        have the residuals that the errors replace.
+    """
+    problem, kinds = linear.problem, list_observed_columns(linear.problem, linear.linearization)
+    cells = _list_cells(problem.rows, clusters)
+    V = linear.decomposition.scale[:, None] * linear.decomposition.directions[0]
+    total = linear.decomposition.singular_values[0] ** 2 + linear.penalty[0]
+    V = V[:, linear.is_estimated] / np.sqrt(total[linear.is_estimated])
+    residual, error = np.zeros(len(cells.block)), np.zeros(len(cells.block))
+    untested = []
+    for g in range(clusters.count):
+        mine = np.flatnonzero(cells.block == g)
+        cells_of_kinds = [cells.within(mine, i) for i in range(len(kinds))]
+        pairs = list(zip(kinds, cells_of_kinds, strict=True))
+        residual[mine] = np.concatenate([kind.residual[own_cells] for kind, own_cells in pairs])
+        by_nuisance = np.concatenate([kind.by_nuisance[own_cells] for kind, own_cells in pairs])
+        by_parameters = np.concatenate([kind.by_parameters[own_cells] for kind, own_cells in pairs])
+        half = np.concatenate([by_nuisance, by_parameters @ V], axis=1)
+        poses = _pose_columns(problem.rows, kinds, cells_of_kinds)
+        error[mine], lost = _correct(residual[mine], half, poses)
+        residual[mine] += by_parameters @ shift
+        untested.append(lost)
+    places = tuple(cells.places(i, kind.residual.shape) for i, kind in enumerate(kinds))
+    return BlockErrors(residual, error, cells.block, clusters.count, tuple(untested), places)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """The present components of all rows, sorted by block and kind: (M,) each."""
+
+    block: IntArray
+    kind: IntArray
+    row: IntArray
+    component: IntArray
+
+    def within(self, cells: IntArray, kind: int) -> tuple[IntArray, IntArray]:
+        """Return rows and components of those of some cells that are of one kind."""
+        mine = cells[self.kind[cells] == kind]
+        return self.row[mine], self.component[mine]
+
+    def places(self, kind: int, shape: tuple[int, ...]) -> IntArray:
+        """Return the cell (r, m) of each component of a kind; -1 where absent."""
+        places = np.full(shape, -1)
+        mine = np.flatnonzero(self.kind == kind)
+        places[self.row[mine], self.component[mine]] = mine
+        return places
+
+
+def _list_cells(rows: Sequence[ObservationRows], clusters: Clusters) -> _Cells:
+    """Return the present components of rows (one trial)."""
+    columns = []
+    for i, of_kind in enumerate(rows):
+        row, component = np.nonzero(of_kind.is_present[0])
+        block = clusters.member[of_kind.first_poses[row]]
+        columns.append(np.stack([block, np.full(len(row), i), row, component]))
+    cells = np.concatenate(columns, axis=1)
+    return _Cells(*cells[:, np.lexsort((cells[1], cells[0]))])
+
+
+def _pose_columns(
+    rows: Sequence[ObservationRows],
+    kinds: Sequence[ObservedColumns],
+    cells_of_kinds: Sequence[tuple[IntArray, IntArray]],
+) -> FloatArray:
+    """Return the columns (M, K) of a block's cells by the coordinates of its poses."""
+    if all(kind.by_coordinates is None for kind in kinds):
+        return np.zeros((sum(len(row) for row, _ in cells_of_kinds), 0))
+    linked = [r.poses_by_link[row] for r, (row, _) in zip(rows, cells_of_kinds, strict=True)]
+    poses = np.unique(np.concatenate([of_kind.ravel() for of_kind in linked]))
+    blocks = []
+    for kind, names, (row, component) in zip(kinds, linked, cells_of_kinds, strict=True):
+        assert kind.by_coordinates is not None
+        k = kind.by_coordinates.shape[-1]
+        wide = np.zeros((len(row), len(poses), k))
+        for link in range(names.shape[1]):
+            place = np.searchsorted(poses, names[:, link])
+            wide[np.arange(len(row)), place] += kind.by_coordinates[row, link, component]
+        blocks.append(wide.reshape(len(row), len(poses) * k))
+    return np.concatenate(blocks)
+
+
+def _correct(
+    residual: FloatArray, half: FloatArray, poses: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the corrected errors (M,) of a block, and a basis (M, d) of its untested directions.
+
+    Parameters
+    ----------
+    half : (M, w) with half half' the leverage of the block by setup and machine. poses : (M, K)
+        columns of the coordinates of its poses, whose range has leverage 1.
+    """
+    Q = _find_range(poses)
+    residual, half = residual - Q @ (Q.T @ residual), half - Q @ (Q.T @ half)
+    L, s, _ = np.linalg.svd(half, full_matrices=False)
+    remaining = 1.0 - s**2
+    is_tested = remaining > TESTABLE
+    gain = np.where(is_tested, 1.0 / np.sqrt(np.where(is_tested, remaining, 1.0)), 0.0)
+    error = residual + L @ ((gain - 1.0) * (L.T @ residual))
+    return error, np.concatenate([Q, L[:, ~is_tested]], axis=1)
+
+
+def _find_range(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (M, d) of the range of columns (M, K)."""
+    if not columns.shape[1]:
+        return columns
+    length = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns / np.where(length > 0.0, length, 1.0), full_matrices=False)
+    return u[:, are_nonzero(s, NUISANCE_TOLERANCE)]
+
+
+# --- The scatter of the errors of blocks against the stated uncertainty of each parameter.
+
+FALSE_ALARMS = 0.01
+"""Probability that any parameter is reported where errors are independent and as stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockScatter:
+    """The scatter of blocks, parameter by parameter (p,).
+
+    Attributes
+    ----------
+    ratio : cluster-robust standard deviation over the one of independent errors; NaN where the data
+        determine none.
+    noise_degrees : degrees of freedom of the part of the variance that the blocks show.
+    degrees : effective degrees of freedom of the whole variance (Welch-Satterthwaite): what a prior
+        contributes is known.
+    tail : probability of a larger ratio for independent errors of the stated size.
+    unit_sd : standard deviations [SI] for rows of unit variance. noise : factor on the stated
+        sigmas that the residuals show; NaN without degrees of freedom.
+    """
+
+    ratio: FloatArray
+    noise_degrees: FloatArray
+    degrees: FloatArray
+    tail: FloatArray
+    unit_sd: FloatArray
+    noise: float
+
+    def report(self, names: tuple[str, ...], ratio: FloatArray, blocks: Clusters) -> Finding:
+        """Return whether the ratio (p,) of bootstrapped to stated standard deviations is beyond
+        chance for any parameter.
+        """
+        off = self.find_off(ratio)
+        unit = {"unit": blocks.unit, "blocks": blocks.count, "limit": OFF}
+        if not off.any():
+            return report_finding("sampling.scatter-agrees", **unit)
+        order = np.argsort(-np.where(off, np.abs(np.log(ratio)), -1.0))[: int(off.sum())]
+        return report_finding(
+            "sampling.scatter-differs",
+            **unit,
+            count=int(off.sum()),
+            total=len(names),
+            names=tuple(names[i] for i in order[:NAMED]),
+            ratio=float(ratio[order[0]]),
+        )
+
+    def find_off(self, ratio: FloatArray) -> BoolArray:
+        """Return which ratios (p,) are off by more than `OFF`, beyond chance."""
+        tested = np.isfinite(self.tail) & (self.noise_degrees >= FEWEST_DEGREES)
+        level = 0.5 * compute_single_level(FALSE_ALARMS, int(tested.sum()))
+        larger = (ratio > 1.0 + OFF) & (self.tail < level)
+        smaller = (ratio < 1.0 / (1.0 + OFF)) & (self.tail > 1.0 - level)
+        return np.asarray(tested & (larger | smaller))
+
+
+def describe_scatter(
+    fit: Identification, blocks: Clusters, linear: FitLinearization
+) -> BlockScatter:
+    """Return the scatter of blocks of a fit; without intervals its degrees are blocks - 1."""
+    p = len(fit.names)
+    nan = np.full(p, np.nan)
+    d, penalty = linear.decomposition, linear.penalty
+    unit_sd = d.standard_deviations(penalty)[0] * fit.tolerance
+    left = float(d.rows[0] - d.filter_factors(penalty).sum())
+    noise = float(np.sqrt(d.remaining(penalty)[0] / left)) if left > 0.5 else np.nan
+    if not fit.residual_test.intervals:
+        few = np.full(p, float(blocks.count - 1))
+        return BlockScatter(nan, few, few, nan, unit_sd, noise)
+    spread = compute_robust_spread(fit, blocks, linear)
+    ratio, degrees, share, tail = nan.copy(), nan.copy(), nan.copy(), nan.copy()
+    tested_rows = spread.scaled_rows * spread.is_tested[:, None, :]
+    total = (spread.root**2).sum(axis=1)
+    for j, effect in enumerate(np.eye(p)):
+        compared = spread.compare(effect[None])
+        ratio[j], degrees[j] = compared.ratio, compared.degrees
+        by_blocks = float((np.matmul(spread.root[j], tested_rows) ** 2).sum())
+        share[j] = by_blocks / total[j] if total[j] > 0.0 else np.nan
+        tail[j] = compared.p_value
+    safe = np.where(np.isfinite(degrees) & (share > 0.0), share, 1.0)
+    effective = np.where(np.isfinite(degrees), degrees / safe**2, np.inf)
+    return BlockScatter(ratio, degrees, effective, tail, unit_sd, noise)
+
+
+# --- Choose which poses are resampled together.
+
+ENOUGH_BLOCKS = 12
+"""Blocks of a unit with which it is resampled by default: with fewer, the scatter of the resamples
+is itself known to 20 % at best.
+"""
+
+
+UNITS = ("pose", "block", "session", "day")
+"""Names of units."""
+
+
+def choose_blocks(data: Measurements, unit: str | int | None = None) -> Clusters:
+    """Return the blocks of poses that are resampled together.
+
+    Parameters
+    ----------
+    unit : "pose", "block", "session" or "day", or the number of consecutive poses of a block, in
+        the order of the column `time`, or else of the file. None takes the largest unit with at
+        least `ENOUGH_BLOCKS` blocks, or else the smallest.
+
+    Raises
+    ------
+    EstimationError : the data do not contain enough units of this name.
+    """
+    if isinstance(unit, int):
+        return _consecutive(data, unit)
+    if unit is not None and unit not in UNITS:
+        raise EstimationError(
+            f"unit is {unit!r}; it must be one of {', '.join(UNITS)}, or a number of consecutive "
+            "poses"
+        )
+    divisions = divide_into_clusters(data)
+    if not divisions:
+        raise EstimationError(report_finding("sampling.too-few-blocks", unit=unit or "pose"))
+    if unit is None:
+        enough = (blocks for blocks in divisions if blocks.count >= ENOUGH_BLOCKS)
+        return next(enough, divisions[-1])
+    named = [blocks for blocks in divisions if blocks.unit == unit]
+    if not named:
+        available = tuple(f"{blocks.count} {blocks.unit}s" for blocks in divisions)
+        raise EstimationError(
+            report_finding("sampling.unit-unknown", unit=unit, available=available)
+        )
+    return named[0]
+
+
+def _consecutive(data: Measurements, length: int) -> Clusters:
+    """Return runs of `length` consecutive poses; blocks of linked poses stay together."""
+    if length < 1:
+        raise EstimationError(f"blocks of {length} poses: give a number of at least 1")
+    n, linked = data.n_poses, linked_blocks(data)
+    order = np.arange(n)
+    time = data.context.get("time")
+    if time is not None and not np.isnan(time).any():
+        order = np.argsort(time, kind="stable")
+    run = np.empty(n, dtype=np.int64)
+    run[order] = np.arange(n) // length
+    links: IntArray = np.column_stack([run, run.max() + 1 + linked])
+    joined = find_connected_groups(links, int(links.max()) + 1)[run]
+    names, member = np.unique(joined, return_inverse=True)
+    name = f"{length}-pose run"
+    if len(names) < FEWEST_CLUSTERS:
+        raise EstimationError(report_finding("sampling.too-few-blocks", unit=name))
+    return Clusters(name, member, len(names))
+
+
+Scheme = Literal["wild", "pairs", "normal"]
+"""How resamples are drawn."""
+
+IntervalKind = Literal["widened", "percentile", "bias-corrected", "studentized"]
+"""How intervals are read from the resamples, see `Bootstrap.intervals`."""
+
+MOST_FAILED = 0.02
+"""Share of resamples that do not converge above which it is reported."""
+
+BATCH = 250
+"""Resamples that are fitted at once; progress is reported between them."""
+
+FEW_BLOCKS = 12
+"""Number of blocks below which the random factor of the wild bootstrap has six values instead of
+two, so that there are enough different resamples (Webb, 2023).
+"""
+
+WEBB = np.sqrt([0.5, 1.0, 1.5])
+"""Sizes of the six values +/-."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap(TableResult):
+    """Estimates of T resamples of one calibration. Arrays over parameters are (p,) as in the fit.
+
+    Attributes
+    ----------
+    fit : the calibration. scheme : "wild", "pairs" or "normal". seed : of the random numbers.
+    blocks : what was resampled together.
+    draws : (T, p) [SI] estimates of the resamples that converged.
+    linear : (T, p) [SI] the same to first order about the estimate.
+    sd : (T, p) [SI] standard deviations that each resample states by its own residuals; NaN without
+        degrees of freedom.
+    failed : number of resamples that did not converge; they are left out.
+    scatter : the scatter of the blocks' errors against the stated uncertainty.
+    """
+
+    fit: Identification
+    scheme: Scheme
+    seed: int
+    blocks: Clusters
+    draws: FloatArray
+    linear: FloatArray
+    sd: FloatArray
+    failed: int
+    scatter: BlockScatter
+
+    def __repr__(self) -> str:
+        """Return scheme, blocks and number of resamples."""
+        blocks = f"{self.blocks.count} {self.blocks.unit}s"
+        return f"<Bootstrap: {len(self.draws)} resamples of {blocks}, scheme {self.scheme}>"
+
+    @property
+    def is_known(self) -> BoolArray:
+        """(p,) parameters whose standard deviation the fit states."""
+        return np.isfinite(self.fit.standard_deviations)
+
+    @property
+    def standard_deviations(self) -> FloatArray:
+        """(p,) of the resamples [SI]; infinite where the data determine no parameter."""
+        return np.where(self.is_known, self.draws.std(axis=0, ddof=1), np.inf)
+
+    def intervals(self, level: float = LEVEL, kind: IntervalKind = "widened") -> Intervals:
+        """Return intervals of the parameters.
+
+        Parameters
+        ----------
+        level : coverage of each. kind : "percentile": between quantiles of the resamples.
+            "widened" (default): the same, its ends moved away from the estimate by t(nu) / 1.96,
+            because the scatter was estimated from few blocks (nu: see `BlockScatter`).
+            "bias-corrected": quantiles shifted by the share of resamples below the estimate (Efron,
+            1981). "studentized": quantiles of (resample - estimate) / sd, each with its own noise.
+        """
+        if kind not in get_args(IntervalKind):
+            words = ", ".join(get_args(IntervalKind))
+            raise EstimationError(f"kind of interval is {kind!r}; it must be one of {words}")
+        estimate, weight = self.fit.estimate, np.full(len(self.draws), 1.0 / len(self.draws))
+        ends = compare_ends(self.draws, weight, self.linear, weight, level)
+        known = np.where(self.is_known, 1.0, np.nan)
+        half = 0.5 * (ends.linear[1] - ends.linear[0])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shift, error = (ends.quantile - ends.linear) / half, ends.error / half
+        lower, upper = self._ends(kind, level, ends.quantile)
+        degrees = self.scatter.degrees if self.scheme != "normal" else np.inf
+        widen = half_widths(level, degrees) / half_widths(level)
+        linear = estimate + (ends.linear - estimate) * (widen if kind == "widened" else 1.0)
+        return Intervals(
+            names=self.fit.names,
+            level=level,
+            source=f"{self.scheme} bootstrap, {kind}",
+            center=self.draws.mean(axis=0) * known,
+            sd=self.draws.std(axis=0, ddof=1) * known,
+            lower=lower * known,
+            upper=upper * known,
+            linear_lower=linear[0] * known,
+            linear_upper=linear[1] * known,
+            shift=shift * known,
+            shift_error=error * known,
+        )
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """How many resamples failed, and whether the stated intervals agree with the scatter."""
+        total = len(self.draws) + self.failed
+        findings = []
+        if self.failed > MOST_FAILED * total:
+            findings.append(report_finding("sampling.failures", failed=self.failed, count=total))
+        codes = ("sampling.bootstrap-agrees", "sampling.bootstrap-differs")
+        findings += report_intervals(self.intervals(kind="percentile"), *codes)
+        if not isinstance(self.fit.method, MAP | LeastSquares):
+            name = type(self.fit.method).__name__
+            findings.append(report_finding("sampling.bias-not-drawn", method=name))
+        if self.scheme == "normal" or not isinstance(self.fit.method, MAP | LeastSquares):
+            return tuple(findings)
+        stated = np.where(self.is_known, self.fit.standard_deviations, np.nan)
+        ratio = self.standard_deviations / stated
+        return (*findings, self.scatter.report(self.fit.names, ratio, self.blocks))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was drawn and what was found, for JSON."""
+        return {
+            "robot": self.fit.robot.name,
+            "scheme": self.scheme,
+            "seed": self.seed,
+            "unit": self.blocks.unit,
+            "blocks": self.blocks.count,
+            "resamples": len(self.draws),
+            "failed": self.failed,
+            "degrees": self.scatter.degrees,
+            "findings": self.findings,
+        }
+
+    def _ends(
+        self, kind: IntervalKind, level: float, quantile: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the ends (p,) of intervals; `quantile` (2, p) are those of the resamples."""
+        estimate, tails = self.fit.estimate, np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
+        if kind == "percentile" or (kind == "widened" and self.scheme == "normal"):
+            return quantile[0], quantile[1]
+        if kind == "widened":
+            factor = half_widths(level, self.scatter.degrees) / half_widths(level)
+            return tuple(estimate + (quantile - estimate) * factor)
+        if kind == "studentized":
+            ratio = (self.draws - estimate) / self.sd
+            q = np.quantile(ratio, tails, axis=0)
+            own = self.scatter.noise * self.scatter.unit_sd
+            return estimate - q[1] * own, estimate - q[0] * own
+        return self._bias_corrected(tails)
+
+    def _bias_corrected(self, tails: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return quantiles (p,) shifted by the share of resamples below the estimate."""
+        from loopcal.numerics.special_functions import ndtr, ndtri
+
+        share = (self.draws < self.fit.estimate).mean(axis=0)
+        least = 0.5 / len(self.draws)
+        z = 2.0 * ndtri(np.clip(share, least, 1.0 - least)) + ndtri(tails)[:, None]
+        columns = range(self.draws.shape[1])
+        probabilities = ndtr(z)
+        ends = [
+            [np.quantile(self.draws[:, j], probabilities[i, j]) for j in columns] for i in (0, 1)
+        ]
+        return np.array(ends[0]), np.array(ends[1])
+
+
+def bootstrap(
+    fit: Identification,
+    data: Measurements,
+    count: int = 1000,
+    *,
+    scheme: Scheme = "wild",
+    unit: str | int | None = None,
+    seed: int = 1,
+    progress: Progress = report_no_progress,
+) -> Bootstrap:
+    """Resample a calibration by blocks.
+
+    Parameters
+    ----------
+    fit : an identification that converged. data : the measurements it was made from.
+    count : number of resamples. scheme : see the module.
+    unit : what is resampled together: "pose", "block", "session", "day", or a number of
+        consecutive poses; None takes the largest unit of which there are enough, see
+        `choose_blocks`.
+    seed : of all random numbers. progress : receives the resamples that are done.
+
+    Raises
+    ------
+    EstimationError : the fit did not converge, the data have no such unit, or fewer than two
+        resamples converged.
+    """
+    check_fitted_data(fit, data)
+    if scheme not in get_args(Scheme):
+        raise EstimationError(f"scheme is {scheme!r}; it must be wild, pairs or normal")
+    if count < 2:
+        raise EstimationError(f"{count} resamples: give at least 2")
+    if not fit.converged:
+        raise EstimationError(report_finding("sampling.not-converged"))
+    if not np.isfinite(fit.standard_deviations).any():
+        raise EstimationError(report_finding("sampling.without-intervals"))
+    if scheme == "pairs" and isinstance(fit.method, MAP) and callable(fit.method.inflation):
+        raise EstimationError(report_finding("sampling.pairs-with-rule"))
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    blocks, linear = choose_blocks(data, unit), linearize_fit(fit, data)
+    draw = _Draw(fit, linear, blocks, scheme, np.random.default_rng(np.random.SeedSequence(seed)))
+    batches = []
+    for first in range(0, count, BATCH):
+        progress(first, count, "fitting resamples")
+        batches.append(fit_resamples(fit, linear, draw(min(BATCH, count - first))))
+    progress(count, count, "fitting resamples")
+    fits = join_fits(batches)
+    kept = fits.take(np.flatnonzero(fits.converged))
+    if len(kept.deviation) < 2:
+        raise EstimationError(report_finding("sampling.resamples-failed", count=count))
+    nominal, unit_of = fit.nominal, fit.tolerance
+    noise = np.sqrt(kept.noise)[:, None]
+    return Bootstrap(
+        fit=fit,
+        scheme=scheme,
+        seed=seed,
+        blocks=blocks,
+        draws=nominal + unit_of * kept.deviation,
+        linear=nominal + unit_of * kept.linear,
+        sd=unit_of * kept.sd * noise,
+        failed=count - len(kept.deviation),
+        scatter=describe_scatter(fit, blocks, linear),
+    )
+
+
+class _Draw:
+    """Draws resamples of the rows of a fit."""
+
+    def __init__(
+        self,
+        fit: Identification,
+        linear: FitLinearization,
+        blocks: Clusters,
+        scheme: Scheme,
+        rng: np.random.Generator,
+    ) -> None:
+        self.fit, self.linear, self.blocks = fit, linear, blocks
+        self.scheme, self.rng = scheme, rng
+        self.is_prior = isinstance(fit.method, MAP)
+        self.errors = None
+        if scheme != "pairs":
+            self.errors = compute_block_errors(linear, blocks, self._shift_truth())
+
+    def __call__(self, count: int) -> Resamples:
+        """Draw `count` resamples."""
+        G, sigma = self.blocks.count, self.fit.residual_test.sigma_scale
+        base = int(self.linear.linearization.equations[0])
+        equations = np.full(count, base)
+        weight, offset = None, None
+        if self.errors is None:
+            drawn = self.rng.multinomial(G, np.full(G, 1.0 / G), count)
+            weight = drawn[:, self.blocks.member].astype(np.float64)
+            equations = equations + (drawn - 1) @ self._count_rows()
+        elif self.scheme == "normal":
+            offset = self.errors.draw_normal(count, sigma, self.rng)
+        else:
+            offset = self.errors.draw(self._draw_factors(count), sigma, self.rng)
+        center, prior, nuisance = self._draw_priors(count)
+        return Resamples(weight, offset, center, prior, nuisance, equations)
+
+    def _shift_truth(self) -> FloatArray:
+        """Return the step (p,) from the estimate to the truth of the resamples.
+
+        The penalty of a ridge or a truncation is no observation and stays as it is. Then the truth
+        is the least-squares solution, so that the resamples scatter about the estimate.
+        """
+        d, z = self.linear.decomposition, self.linear.linearization.deviation
+        if self.is_prior:
+            return np.zeros(z.shape[1])
+        unpenalized = np.where(d.used, 0.0, np.inf)
+        return (d.deviation(d.solution(unpenalized)) - z)[0]
+
+    def _draw_factors(self, count: int) -> FloatArray:
+        """Return random factors (count, G) of mean 0 and variance 1."""
+        sign = self.rng.choice([-1.0, 1.0], (count, self.blocks.count))
+        if self.blocks.count >= FEW_BLOCKS:
+            return sign
+        return sign * self.rng.choice(WEBB, sign.shape)
+
+    def _draw_priors(self, count: int) -> tuple[FloatArray, FloatArray | None, FloatArray]:
+        """Return drawn centers of the tolerances, errors of the rows of an earlier calibration, and
+        means of the priors of nuisance parameters.
+
+        They scatter about the truth of the resamples where errors of rows are drawn, and about the
+        given values where the residuals keep their bias.
+        """
+        linear, fit, rng = self.linear, self.fit, self.rng
+        is_recentered = self.errors is not None
+        z, nuisance = linear.linearization.deviation, linear.problem.nuisance
+        center = np.zeros((count, z.shape[1]))
+        if self.is_prior:
+            center = draw_centers(linear, count, rng) + (z if is_recentered else 0.0)
+        prior = None
+        if fit.options.prior is not None:
+            rows = fit.options.prior.added(linear.problem)
+            at_estimate = rows.residuals(z) if is_recentered else 0.0
+            prior = rng.standard_normal((count, rows.constant.shape[1])) - at_estimate
+        if nuisance is None:
+            return center, prior, np.zeros((count, 0))
+        has_prior, table = nuisance.has_prior, nuisance.local.table
+        sd = np.where(has_prior, np.nan_to_num(table.tolerance), 0.0)
+        mean = fit.nuisance.estimate if is_recentered else table.nominal
+        return center, prior, mean + sd * rng.standard_normal((count, len(sd)))
+
+    def _count_rows(self) -> IntArray:
+        """Return the number (G,) of present residuals of each block."""
+        total = np.zeros(self.blocks.count, dtype=np.int64)
+        for rows in self.linear.problem.rows:
+            present = rows.is_present[0].sum(axis=1)
+            owner = self.blocks.member[rows.first_poses]
+            total += np.bincount(owner, present, self.blocks.count).astype(np.int64)
+        return total

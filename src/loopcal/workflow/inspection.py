@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Analyze what measurements determine, and which further measurements determine the rest."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
+from loopcal.diagnose.parameter_subset import (
+    IdentifiableSubset,
+    UsefulAccuracy,
+    choose_identifiable_subset,
+    judge_useful_accuracy,
+)
+from loopcal.diagnose.suggestions import MeasurementSuggestion, suggest_measurements
+from loopcal.findings import Finding, report_finding
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism.families.joint_release import propose_added_joints
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.solutions import inverse
+from loopcal.mechanism.workspace import evaluate_limits
+from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.serialization import json_fields
+from loopcal.typing import FloatArray
+from loopcal.workflow.calibration_findings import (
+    is_readings_alone,
+    report_readings_gauge,
+    sort_open_freedoms,
+)
+
+FEW = 3
+"""Combinations that change poses and that a summary lists one by one."""
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiabilityReport:
+    """What measurements determine.
+
+    Attributes
+    ----------
+    analysis : rank, singular values and a statement on each parameter.
+    suggestions : further measurements for open combinations.
+    subset : a smallest set of parameters; None where it was not asked for.
+    useful : what is determined to a useful accuracy; None where none was stated.
+    is_readings_alone : whether nothing but redundant readings was measured.
+    """
+
+    analysis: Identifiability
+    suggestions: tuple[MeasurementSuggestion, ...]
+    subset: IdentifiableSubset | None
+    useful: UsefulAccuracy | None = None
+    is_readings_alone: bool = False
+
+    @cached_property
+    def summary(self) -> tuple[Finding, ...]:
+        """Rank, what is undetermined in words, what is known poorly, and what to measure."""
+        by_code = {finding.code: finding for finding in self.analysis.findings}
+        return (
+            by_code["identifiability.rank"],
+            *(f for code, f in by_code.items() if code == "identifiability.arbitrary-cut"),
+            *(() if self.useful is None else self.useful.findings),
+            *self._report_undetermined(),
+            by_code["identifiability.improved"],
+            *self._report_measurement(),
+        )
+
+    def _report_undetermined(self) -> list[Finding]:
+        """Return how many undetermined combinations move frames, and how many change poses."""
+        analysis = self.analysis
+        if not analysis.unidentifiable:
+            return []
+        freedoms = sort_open_freedoms(
+            analysis.posterior, analysis.unidentifiable, analysis.n_parameters - analysis.rank
+        )
+        motions, changing = freedoms.motions, freedoms.changing
+        findings = []
+        if self.is_readings_alone:
+            findings.append(report_readings_gauge(motions, freedoms.count))
+        if motions.count:
+            findings.append(
+                report_finding(
+                    "identifiability.frames-only", count=motions.count, frames=motions.frames
+                )
+            )
+        if (count := freedoms.changing_count) > 0:
+            findings.append(
+                report_finding("identifiability.changes-poses", count=count, names=freedoms.names)
+            )
+            findings += [c.finding for c in changing] if len(changing) <= FEW else []
+        return findings
+
+    def _report_measurement(self) -> list[Finding]:
+        """Return the further measurement that determines most combinations, the simplest of them;
+        or that none does.
+        """
+        solved = Counter(m.words for s in self.suggestions for m in s.measurements)
+        if not solved:
+            return [s.finding for s in self.suggestions]
+        words, count = max(solved.items(), key=lambda item: item[1])
+        total = len(self.suggestions)
+        return [
+            report_finding(
+                "identifiability.measure-for-all",
+                words=words,
+                count=count,
+                total=total,
+                left=total - count,
+            )
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report by name for JSON."""
+        document = {
+            **json_fields(self.analysis),
+            "summary": self.summary,
+            "remedies": self.suggestions,
+        }
+        if self.useful is not None:
+            document["useful"] = self.useful
+        return document if self.subset is None else {**document, "reduction": self.subset}
+
+
+def analyze_identifiability(
+    robot: Mechanism,
+    data: Measurements,
+    choose_subset: bool = False,
+    rank_tolerance: float = RANK_TOLERANCE,
+    useful: tuple[float, float | None] | None = None,
+) -> IdentifiabilityReport:
+    """Return what measurements determine of a robot's free parameters.
+
+    Parameters
+    ----------
+    data : measurements, or simulated ones without noise for an instrument that is considered.
+    choose_subset : also choose a smallest set of parameters that says the same.
+    rank_tolerance : share of the largest singular value below which one counts as zero.
+    useful : accuracy of lengths [m] and angles [rad] to which combinations are to be determined;
+        see `loopcal.diagnose.parameter_subset.judge_useful_accuracy`.
+    """
+    analysis = identifiability(robot, data, rank_tolerance)
+    subset = choose_identifiable_subset(analysis) if choose_subset else None
+    accuracy = None if useful is None else judge_useful_accuracy(analysis, *useful)
+    suggestions = suggest_measurements(analysis)
+    return IdentifiabilityReport(analysis, suggestions, subset, accuracy, is_readings_alone(data))
+
+
+# --- Inspect a robot: its readings at home, and the limits that home exceeds.
+
+ROUNDING = 1e-9
+"""How far home may exceed a limit by rounding [m or rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotInspection:
+    """A robot and what it does at home.
+
+    Attributes
+    ----------
+    robot : the robot. home_readings : (a,) readings of the actuators at home [SI].
+    findings : notes of the robot file, and limits that home exceeds.
+    """
+
+    robot: Mechanism
+    home_readings: FloatArray
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the robot by name for JSON, SI."""
+        robot, table = self.robot, self.robot.parameters
+        return {
+            "name": robot.name,
+            "path": robot.record.path,
+            "freedoms": robot.freedoms,
+            "controlled": robot.controlled,
+            "size": robot.size,
+            "home": robot.home,
+            "tool": robot.tool,
+            "actuators": [
+                {"name": a.name, "dimension": a.dimension, "stroke": a.stroke}
+                for a in robot.actuators
+            ],
+            "parameters": [
+                {
+                    "name": p.name,
+                    "dimension": p.dimension,
+                    "nominal": p.nominal,
+                    "value": robot.values[i],
+                    "tolerance": p.tolerance,
+                    "free": p.free,
+                }
+                for i, p in enumerate(table.entries)
+            ],
+            "common_errors": [
+                {"name": c.name, "parameters": c.parameters, "tolerance": c.tolerance}
+                for c in table.common
+            ],
+            "notes": [str(finding) for finding in robot.findings],
+            "findings": self.findings,
+        }
+
+
+def inspect_robot(robot: Mechanism) -> RobotInspection:
+    """Return the readings at home, and findings."""
+    solution = inverse(robot, robot.home[None])
+    limits = evaluate_limits(robot, robot.values[None], solution.q[None], solution.state)
+    exceeded = tuple(limit.name for limit in limits if limit.margin[0, 0] < -ROUNDING)
+    findings = list(robot.findings)
+    proposal = propose_added_joints(robot)
+    if proposal is not None:
+        findings.append(proposal)
+    if exceeded:
+        findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
+    if not len(robot.parameters):
+        findings.append(report_finding("workflow.no-unknowns"))
+    return RobotInspection(robot, solution.q[0], tuple(findings))
