@@ -162,7 +162,6 @@ def compare_fifty_points(study: Study) -> list[list[Any]]:
     ]
 
 
-# size: a list of tables with their columns
 def collect() -> dict[str, Any]:
     """Collect the 3 x 4 cells, five starts, one plane and ten, weights, interpretations of
     figure 5, and fifty points.

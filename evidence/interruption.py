@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# size: one experiment, which reads from top to bottom
 """Every command that writes, killed and interrupted while it writes.
 
 A command runs in a process of its own up to the moment before it creates its first temporary file.

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# size: one study of all kinds, with its tables
 """Each measurement kind alone: rank, recovery of the machine up to its gauge freedom, and coverage
 of intervals.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules of the repository: sizes, layers, licenses, and consistent documentation."""
+"""Rules of the repository: layers, licenses, and consistent documentation."""
 
 import ast
 import re
@@ -8,8 +8,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-
-from tools import check_sizes
 
 # Folders that exist on one machine only; assembled here so that this file does not contain them.
 MACHINE_PATH = re.compile(
@@ -31,19 +29,6 @@ def test_changelog_has_an_unreleased_section(root: Path) -> None:
     assert re.search(
         r"^## \[Unreleased\]$", (root / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
     )
-
-
-def test_long_function_is_reported_unless_a_reason_is_given() -> None:
-    body = "    x = 1\n" * check_sizes.FUNCTION_LIMIT
-    assert len(check_sizes.check_text("a.py", "def f():\n" + body)) == 1
-    assert check_sizes.check_text("a.py", "# size: a table\ndef f():\n" + body) == []
-    assert check_sizes.check_text("a.py", "def f():  # size: a table\n" + body) == []
-
-
-def test_long_file_is_reported_unless_a_reason_is_given() -> None:
-    lines = "x = 1\n" * (check_sizes.FILE_LIMIT + 1)
-    assert len(check_sizes.check_text("a.py", lines)) == 1
-    assert check_sizes.check_text("a.py", "# size: generated\n" + lines) == []
 
 
 def test_every_package_has_a_layer(root: Path) -> None:

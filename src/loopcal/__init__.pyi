@@ -52,6 +52,7 @@ from .errors import MechanismError as MechanismError
 from .errors import MissingPackageError as MissingPackageError
 from .errors import StudyError as StudyError
 from .errors import UnitError as UnitError
+from .estimate.descent import DescentStatus as DescentStatus
 from .estimate.descent import StepControl as StepControl
 from .estimate.identification import identify as identify
 from .estimate.losses import Huber as Huber
@@ -122,7 +123,6 @@ from .mechanism.solutions import inverse as inverse
 from .mechanism.solutions import jacobian as jacobian
 from .mechanism.states import Status as Status
 from .mechanism.workspace import sample_workspace as sample_workspace
-from .numerics.gauss_newton import DescentStatus as DescentStatus
 from .planning.constraints import Constraints as Constraints
 from .planning.constraints import LineOfSight as LineOfSight
 from .planning.constraints import PlanOptions as PlanOptions

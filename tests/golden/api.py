@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# size: the only file of the golden results that knows names of loopcal, so that one file changes
 # with them
 """The adapter between the golden cases and loopcal: the only file of the golden results that
 imports loopcal.

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# size: a list of cases, to be read as one
 """The registry of golden cases: small calibrations with fixed seeds, each a function that returns
 plain results.
 
