@@ -127,7 +127,10 @@ def test_user_error_prints_one_sentence_and_gives_exit_code_1(
 
 
 def test_closed_output_pipe_causes_no_traceback() -> None:
-    code = "import sys; from loopcal.cli.entry_point import main; sys.exit(main(['check', 'hexapod-42']))"
+    code = (
+        "import sys; from loopcal.cli.entry_point import main; "
+        "sys.exit(main(['check', 'hexapod-42']))"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:

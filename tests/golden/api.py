@@ -18,8 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal import apply, diagnose, estimate, geometry, measure, planning
+import loopcal as lc
+from loopcal import geometry
 from loopcal.diagnose.conventions.convention_check import compare_conventions
+from loopcal.diagnose.cross_validation import score_leave_one_out
+from loopcal.diagnose.row_errors import PoseErrors
+from loopcal.diagnose.start_values import check_start_values
 from loopcal.diagnose.suggestions import suggest_measurements
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.measure.instrument import Gaussian, Instrument, Sensor
@@ -80,7 +84,7 @@ def free_only(machine: Robot, endings: Sequence[str]) -> Robot:
 
 def true_values(machine: Robot, seed: int, trials: int = 1) -> Array:
     """Draw true parameter values (t, p) from the tolerances."""
-    return measure.sample_truth(machine, trials, seed)
+    return lc.sample_truth(machine, trials, seed)
 
 
 def with_values(machine: Robot, values: Array) -> Robot:
@@ -223,7 +227,7 @@ def simulate_data(
     """Simulate measurements of a machine with these true values."""
     looking = Instrument(tuple(sensors))
     true = machine.with_values(values)
-    return measure.simulate(
+    return lc.simulate(
         true, coordinates, looking, seed, nuisance_values=unknowns, reading_sigma=reading_sigma
     )
 
@@ -232,7 +236,7 @@ def simulate_trials(
     machine: Robot, values: Array, coordinates: Array, sensors: Iterable[Any], seed: int
 ) -> Data:
     """Simulate stacked measurements of machines with true values (t, p)."""
-    return measure.simulate_trials(machine, values, coordinates, Instrument(tuple(sensors)), seed)
+    return lc.simulate_trials(machine, values, coordinates, Instrument(tuple(sensors)), seed)
 
 
 def select_trial(trials: Data, i: int) -> Data:
@@ -306,21 +310,21 @@ def make_method(name: str, value: Any = None) -> Any:
     from loopcal.estimate.tolerance_components import InflatedTolerances
 
     makers = {
-        "ls": estimate.LeastSquares,
-        "map": lambda: estimate.MAP() if value is None else estimate.MAP(value),
-        "map-widened": lambda: estimate.MAP(InflatedTolerances()),
-        "ridge": lambda: estimate.Ridge(value),
-        "ridge-gcv": lambda: estimate.Ridge(estimate.GCV()),
-        "ridge-likelihood": lambda: estimate.Ridge(estimate.MarginalLikelihood()),
-        "tsvd": lambda: estimate.TruncatedSVD(value),
-        "tsvd-gcv": lambda: estimate.TruncatedSVD(estimate.TruncationGCV()),
+        "ls": lc.LeastSquares,
+        "map": lambda: lc.MAP() if value is None else lc.MAP(value),
+        "map-widened": lambda: lc.MAP(InflatedTolerances()),
+        "ridge": lambda: lc.Ridge(value),
+        "ridge-gcv": lambda: lc.Ridge(lc.GCV()),
+        "ridge-likelihood": lambda: lc.Ridge(lc.MarginalLikelihood()),
+        "tsvd": lambda: lc.TruncatedSVD(value),
+        "tsvd-gcv": lambda: lc.TruncatedSVD(lc.TruncationGCV()),
     }
     return makers[name]()
 
 
 def make_loss(name: str, constant: float | None = None) -> Any:
     """Make a loss by its name: huber, tukey."""
-    made = {"huber": estimate.Huber, "tukey": estimate.Tukey}[name]
+    made = {"huber": lc.Huber, "tukey": lc.Tukey}[name]
     return made() if constant is None else made(constant)
 
 
@@ -329,7 +333,7 @@ def fit(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
     names = {"drop": "excluded_poses", "local": "nuisance"}
     given = {names.get(name, name): value for name, value in options.items()}
     given = {"sigma_uncertainty": 0.0, **given}
-    return estimate.identify(machine, data, how, options=estimate.FitOptions(**given))
+    return lc.identify(machine, data, how, options=lc.FitOptions(**given))
 
 
 def fit_to_rounding(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
@@ -339,7 +343,7 @@ def fit_to_rounding(machine: Robot, data: Data, how: Any = None, **options: Any)
     the minimum.
     """
     result = fit(machine, data, how, **options)
-    one_step = estimate.StepControl(relative=1e-4)
+    one_step = lc.StepControl(relative=1e-4)
     for _ in range(3):
         result = fit(machine, data, how, start=result.robot.values, control=one_step, **options)
     return result
@@ -435,7 +439,7 @@ def _report_unidentifiable(names: Sequence[str], combinations: Sequence[Any]) ->
 
 def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
     """Identify stacked trials at once."""
-    result = estimate.identify_trials(machine, trials, how)
+    result = lc.identify_trials(machine, trials, how)
     free = result.free_parameters
     return {
         "status": result.status,
@@ -452,7 +456,7 @@ def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
 
 def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> Report:
     """Score methods by leave-one-out from one linearization."""
-    result = diagnose.score_leave_one_out(machine, data, tuple(methods))
+    result = score_leave_one_out(machine, data, tuple(methods))
     return {"score": result.score, "dof": result.dof, "best": list(methods).index(result.best)}
 
 
@@ -477,15 +481,15 @@ def set_setup_prior(data: Data, pattern: str, sd: float) -> Any:
 
 def make_prior(earlier: Fit) -> Any:
     """Make a prior of an earlier fit."""
-    return estimate.prior_from(earlier.posterior)
+    return lc.prior_from(earlier.posterior)
 
 
 def report_recalibration(
     machine: Robot, data: Data, earlier: Fit, limb: str | None = None
 ) -> Report:
     """Calibrate again with an earlier fit as prior, and test for a change."""
-    exact = estimate.FitOptions(sigma_uncertainty=0.0)
-    result, change = estimate.recalibrate(machine, data, earlier.posterior, limb, options=exact)
+    exact = lc.FitOptions(sigma_uncertainty=0.0)
+    result, change = lc.recalibrate(machine, data, earlier.posterior, limb, options=exact)
     tested = {
         "what": change.subject,
         "names": list(change.names),
@@ -504,7 +508,7 @@ def report_recalibration(
 
 def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> Report:
     """Report what the data determine, and with `cures` the suggested measurements."""
-    outcome = diagnose.identifiability(machine, data)
+    outcome = lc.identifiability(machine, data)
     result: Report = {
         "rank": outcome.rank,
         "n_parameters": outcome.n_parameters,
@@ -530,7 +534,7 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
     return result
 
 
-def add_millimeters_and_radians(errors: diagnose.PoseErrors) -> Array:
+def add_millimeters_and_radians(errors: PoseErrors) -> Array:
     """Return position [mm] plus orientation error [rad], which core has no more, of the rows that
     measure both.
     """
@@ -544,7 +548,7 @@ def add_millimeters_and_radians(errors: diagnose.PoseErrors) -> Array:
 
 def report_validation(found: Fit, data: Data) -> Report:
     """Report held-out errors."""
-    checked = apply.validate(found, data)
+    checked = lc.validate(found, data)
     errors = {
         name.replace(" ", "_"): {
             "position": e.position,
@@ -573,7 +577,7 @@ def report_validation(found: Fit, data: Data) -> Report:
 
 def report_cross_validation(machine: Robot, data: Data, how: Any, count: int, seed: int) -> Report:
     """Score a method on folds."""
-    result = diagnose.cross_validate(machine, data, how, count=count, seed=seed)
+    result = lc.cross_validate(machine, data, how, count=count, seed=seed)
     return {
         "poses": list(result.poses),
         "score": result.score,
@@ -587,7 +591,7 @@ def report_cross_validation(machine: Robot, data: Data, how: Any, count: int, se
 
 def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Report:
     """Choose a set of parameters by cross-validation."""
-    result = diagnose.choose_model(machine, data, None, how, count=count)
+    result = lc.choose_model(machine, data, None, how, count=count)
     return {
         "names": [c.name for c in result.candidates],
         "parameters": [list(c.parameters) for c in result.candidates],
@@ -599,7 +603,7 @@ def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Rep
 
 def report_accuracy(found: Fit, data: Data, n: int, seed: int, frame: Any = "base") -> Report:
     """Report uncertainties over the workspace."""
-    at = apply.accuracy_map(found, data.readings, n, seed, frame)
+    at = lc.accuracy_map(found, data.readings, n, seed, frame)
     return {
         "names": list(at.names),
         "coordinates": at.coordinates,
@@ -616,7 +620,7 @@ def report_monte_carlo(
     machine: Robot, coordinates: Array, sensors: Iterable[Any], where: Array, trials: int
 ) -> Report:
     """Compare predicted with observed uncertainties over a few drawn machines."""
-    result = apply.simulate_accuracy(
+    result = lc.simulate_accuracy(
         machine, coordinates, Instrument(tuple(sensors)), where, trials=trials
     )
     return {
@@ -629,7 +633,7 @@ def report_monte_carlo(
 
 def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -> Report:
     """Report compensated commands."""
-    done = apply.compensate(found, targets, mode, **options)
+    done = lc.compensate(found, targets, mode, **options)
     robot_ = done.robot
     strokes = np.array([_size(robot_, a.dimension) for a in robot_.actuators])
     rows = np.array([1.0] * 3 + [1.0 / robot_.size] * 3)
@@ -652,7 +656,7 @@ def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -
 
 def report_outliers(found: Fit, data: Data) -> Report:
     """Report outliers."""
-    seen = diagnose.find_outliers(found, data)
+    seen = lc.find_outliers(found, data)
     return {
         "names": list(seen.names),
         "undecided": [[list(block) for block in one.poses] for one in seen.ambiguous],
@@ -668,8 +672,8 @@ def report_outliers(found: Fit, data: Data) -> Report:
 
 def report_examination(found: Fit, data: Data) -> Report:
     """Report lack of fit, correlated parameters, the expected gain, and the check of the start."""
-    seen = diagnose.examine_fit(found, data)
-    lack, worth, start = seen.lack_of_fit, seen.gain, diagnose.check_start_values(found)
+    seen = lc.examine_fit(found, data)
+    lack, worth, start = seen.lack_of_fit, seen.gain, check_start_values(found)
     return {
         "groups": lack.groups,
         "pure": lack.pure,
@@ -706,7 +710,7 @@ def report_conventions(machine: Robot, data: Data) -> Report:
 
 def report_parameter_error(found: Fit, truth: Array) -> Report:
     """Report errors of parameters with and without the unidentifiable combinations."""
-    off = diagnose.compare_with_truth(found, truth)
+    off = lc.compare_with_truth(found, truth)
     return {
         "names": list(off.names),
         "raw": off.raw,
@@ -727,9 +731,7 @@ def report_plan(
     """
     if "candidates" in options:
         options["n_candidates"] = options.pop("candidates")
-    plan = planning.plan(
-        machine, Instrument(tuple(sensors)), n, criterion, planning.PlanOptions(**options)
-    )
+    plan = lc.plan(machine, Instrument(tuple(sensors)), n, criterion, lc.PlanOptions(**options))
     poses, errors = plan.poses, plan.errors
     result: Report = {
         "labels": list(poses.labels),
@@ -753,7 +755,7 @@ def report_fedorov(
     machine: Robot, sensors: Iterable[Any], n: int, criterion: str, candidates: int, starts: int
 ) -> Report:
     """Choose n units from candidates by exchange: their numbers and the criterion."""
-    settings = planning.PlanOptions(n_candidates=candidates)
+    settings = lc.PlanOptions(n_candidates=candidates)
     problem = prepare_problem(machine, Instrument(tuple(sensors)), settings)
     wanted = problem.build_criterion(criterion, "pose")
     rows = problem.groups.rows
@@ -792,7 +794,7 @@ def report_coordinate_exchange(
 
 def report_surface_plan(machine: Robot, groups: int, points: int) -> Report:
     """Plan points on planes and perpendicular lines."""
-    plan = planning.plan_surfaces(machine, planning.SurfaceOptions(groups, points))
+    plan = lc.plan_surfaces(machine, lc.SurfaceOptions(groups, points))
     u, k = plan.poses.groups.shape
     return {
         "labels": list(plan.poses.labels),
@@ -958,6 +960,6 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     study = plan_points(load_machine(), groups, points, AXES, 0, 0)
     q = study.layout.solve_readings(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.build_measurements(study.layout, q[0], noise)
-    options = estimate.FitOptions(rank_tolerance=1e-5, sigma_uncertainty=0.0)
-    result = estimate.identify(study.robot, data, estimate.MAP(), options=options)
+    options = lc.FitOptions(rank_tolerance=1e-5, sigma_uncertainty=0.0)
+    result = lc.identify(study.robot, data, lc.MAP(), options=options)
     return report_fit(result, parts=False)

@@ -15,17 +15,22 @@ from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-from loopcal.report import figures
-from loopcal.report.figures.fit_figures import compute_correlation, list_series
+from loopcal.report.figures.fit_figures import (
+    compute_correlation,
+    draw_convergence,
+    draw_correlation,
+    draw_identifiability,
+    draw_parameters,
+    draw_residuals,
+    list_series,
+)
+from loopcal.report.figures.plan_figures import draw_plan
+from loopcal.report.figures.result_figures import draw_accuracy_map, draw_validation
+from loopcal.report.figures.robot_figure import draw_robot
 from loopcal.report.figures.style import label_poses, shorten, start_figure
 from loopcal.report.pictures import render_figure
 
-OF_FITS = [
-    figures.draw_residuals,
-    figures.draw_parameters,
-    figures.draw_correlation,
-    figures.draw_convergence,
-]
+OF_FITS = [draw_residuals, draw_parameters, draw_correlation, draw_convergence]
 WITHOUT_UNIT = {"", "pose"}
 """Labels of axes that have names in place of numbers."""
 
@@ -62,7 +67,7 @@ def test_figure_has_the_same_bytes_each_time(draw, five_bar) -> None:
 
 
 def test_residuals_by_pose_are_those_of_the_fit_in_the_unit_of_the_file(five_bar) -> None:
-    figure = figures.draw_residuals(five_bar.fit)
+    figure = draw_residuals(five_bar.fit)
     by_pose = figure.axes[0]
     rows = five_bar.fit.residuals[0]
     assert by_pose.get_ylabel() == "position residual [mm]"
@@ -81,12 +86,12 @@ def test_residuals_by_pose_are_those_of_the_fit_in_the_unit_of_the_file(five_bar
 
 
 def test_residual_figure_names_the_fitted_frame(linear_delta) -> None:
-    title = figures.draw_residuals(linear_delta.fit).get_suptitle()
+    title = draw_residuals(linear_delta.fit).get_suptitle()
     assert title.endswith("predicted - measured, after the best fit of tracker")
 
 
 def test_components_show_their_rms_over_sigma(five_bar) -> None:
-    figure = figures.draw_residuals(five_bar.fit)
+    figure = draw_residuals(five_bar.fit)
     (panel,) = (axes for axes in figure.axes if axes.get_title().startswith("by component"))
     rms = np.sqrt((five_bar.fit.residuals[0].whitened ** 2).mean(axis=0))
     assert [text.get_text() for text in panel.texts] == [f"{value:.2f}" for value in rms]
@@ -95,7 +100,7 @@ def test_components_show_their_rms_over_sigma(five_bar) -> None:
 def test_residuals_of_estimated_readings_are_no_part_of_the_histogram(hexapod) -> None:
     fit = hexapod.fit
     assert fit.residuals[-1].kind == "readings"
-    figure = figures.draw_residuals(fit)
+    figure = draw_residuals(fit)
     (normal,) = (axes for axes in figure.axes if axes.get_title().startswith("normal plot"))
     assert list_points(normal, "o") == fit.residuals[0].raw.size
 
@@ -112,7 +117,7 @@ def test_missing_components_and_rows_of_weight_zero_are_not_drawn(five_bar) -> N
         n - 1,
         n - 1,
     ]
-    check(figures.draw_residuals(changed))
+    check(draw_residuals(changed))
 
 
 def test_residuals_against_time_and_temperature_that_were_recorded(five_bar) -> None:
@@ -120,7 +125,7 @@ def test_residuals_against_time_and_temperature_that_were_recorded(five_bar) -> 
     n = len(rows.raw)
     context = {"time": np.arange(n) * 60.0, "temperature.base": np.linspace(20.0, 22.0, n)}
     rows = replace(rows, context={**context, "temperature": np.full(n, 20.0)})
-    figure = figures.draw_residuals(replace(five_bar.fit, residuals=(rows,)))
+    figure = draw_residuals(replace(five_bar.fit, residuals=(rows,)))
     labels = [axes.get_xlabel() for axes in figure.axes]
     assert "time [s]" in labels
     assert "temperature.base [degC]" in labels
@@ -138,13 +143,13 @@ def test_many_residuals_are_a_picture_within_the_svg(five_bar) -> None:
         whitened=np.tile(rows.whitened, (times, 1)),
         readings=np.tile(rows.readings, (times, 1)),
     )
-    figure = figures.draw_residuals(replace(five_bar.fit, residuals=(many,)))
+    figure = draw_residuals(replace(five_bar.fit, residuals=(many,)))
     assert len(render_figure(figure, ".svg")) < 2_000_000
 
 
 def test_parameters_are_drawn_in_tolerances_with_their_intervals(five_bar) -> None:
     fit = five_bar.fit
-    shifts, widths = figures.draw_parameters(fit).axes
+    shifts, widths = draw_parameters(fit).axes
     (bars,) = shifts.containers
     assert_allclose(bars[0].get_xdata(), (fit.estimate - fit.nominal) / fit.tolerance)
     segments = np.array([path[:, 0] for path in bars[2][0].get_segments()])
@@ -159,23 +164,23 @@ def test_parameters_that_are_not_determined_have_no_interval(five_bar) -> None:
     covariance = five_bar.fit.covariance.copy()
     covariance[0, 0] = np.inf
     fit = replace(five_bar.fit, covariance=covariance)
-    figure = figures.draw_parameters(fit)
+    figure = draw_parameters(fit)
     crosses = [line for line in figure.axes[0].lines if line.get_marker() == "x"]
     assert [len(line.get_xdata()) for line in crosses] == [1]
     assert figure.axes[1].get_yticklabels()[0].get_text().endswith("± unknown mm")
-    assert "without a finite uncertainty" in figures.draw_correlation(fit).get_suptitle()
+    assert "without a finite uncertainty" in draw_correlation(fit).get_suptitle()
     check(figure)
-    check(figures.draw_correlation(fit))
+    check(draw_correlation(fit))
 
 
 def test_fit_that_did_not_converge_has_last_values_only(five_bar) -> None:
     history = replace(five_bar.fit.history, status=lc.DescentStatus.OUT_OF_ITERATIONS)
     fit = replace(five_bar.fit, history=history)
-    figure = figures.draw_parameters(fit)
+    figure = draw_parameters(fit)
     assert "no estimates" in figure.get_suptitle()
     assert not any("±" in text.get_text() for text in figure.axes[1].get_yticklabels())
     check(figure)
-    assert "out of iterations after" in figures.draw_convergence(fit).get_suptitle()
+    assert "out of iterations after" in draw_convergence(fit).get_suptitle()
 
 
 def test_correlation_is_one_on_the_diagonal_and_names_every_parameter(hexapod) -> None:
@@ -183,13 +188,13 @@ def test_correlation_is_one_on_the_diagonal_and_names_every_parameter(hexapod) -
     correlation = compute_correlation(fit)
     known = np.isfinite(fit.standard_deviations)
     assert_allclose(np.diag(correlation)[known], 1.0)
-    axes = figures.draw_correlation(fit).axes[0]
+    axes = draw_correlation(fit).axes[0]
     assert_allclose(axes.images[0].get_array().filled(np.nan), correlation)
     assert [text.get_text() for text in axes.get_yticklabels()] == list(fit.names)
 
 
 def test_convergence_shows_every_step(five_bar) -> None:
-    cost, parameters = figures.draw_convergence(five_bar.fit).axes
+    cost, parameters = draw_convergence(five_bar.fit).axes
     assert_allclose(cost.lines[0].get_ydata(), five_bar.fit.history.cost)
     assert len(parameters.lines[0].get_xdata()) == five_bar.fit.history.iterations
 
@@ -198,7 +203,7 @@ def test_convergence_shows_every_step(five_bar) -> None:
 def test_validation_shows_errors_before_and_after_with_floor_and_limit(name, request) -> None:
     example = request.getfixturevalue(name)
     validation = lc.validate(example.fit, example.held_out, limit_position=1e-4)
-    figure = figures.draw_validation(validation)
+    figure = draw_validation(validation)
     axes = figure.axes[0]
     (after,) = (line for line in axes.lines if line.get_marker() == "o")
     assert_allclose(after.get_ydata(), 1e3 * validation.after["position"].size)
@@ -207,7 +212,7 @@ def test_validation_shows_errors_before_and_after_with_floor_and_limit(name, req
     assert legend == ["before, line: rms", "after, line: rms", "noise floor (rms)", "limit"]
     assert figure.get_suptitle().endswith(validation.frame)
     check(figure)
-    alone = figures.draw_validation(validation, with_before=False)
+    alone = draw_validation(validation, with_before=False)
     assert not [line for line in alone.axes[0].lines if line.get_marker() == "s"]
     check(alone)
 
@@ -216,7 +221,7 @@ def test_validation_shows_errors_before_and_after_with_floor_and_limit(name, req
 def test_accuracy_map_shows_every_pose_once_in_slices(name, request) -> None:
     example = request.getfixturevalue(name)
     accuracy = lc.accuracy_map(example.fit, example.fitted.readings, poses=60)
-    figure = figures.draw_accuracy_map(accuracy)
+    figure = draw_accuracy_map(accuracy)
     panels = [axes for axes in figure.axes if axes.get_xlabel()]
     bounded = np.isfinite(accuracy.uncertainty.position)
     slices = 1 if name == "five_bar" else 3
@@ -230,7 +235,7 @@ def test_accuracy_map_shows_every_pose_once_in_slices(name, request) -> None:
 
 def test_identifiability_shows_rank_gap_and_null_vectors(hexapod) -> None:
     analysis = lc.identifiability(hexapod.robot, hexapod.fitted)
-    figure = figures.draw_identifiability(analysis)
+    figure = draw_identifiability(analysis)
     spectrum, vectors = figure.axes[:2]
     counted, cut = spectrum.lines[:2]
     assert len(counted.get_xdata()) == analysis.rank
@@ -245,13 +250,13 @@ def test_identifiability_shows_rank_gap_and_null_vectors(hexapod) -> None:
 def test_identifiability_of_what_is_determined_has_no_second_panel(five_bar) -> None:
     robot = five_bar.robot
     some = lc.identifiability(robot, five_bar.fitted)
-    figure = figures.draw_identifiability(replace(some, weak=()))
+    figure = draw_identifiability(replace(some, weak=()))
     assert len(figure.axes) == 1
     check(figure)
 
 
 def test_plan_numbers_every_pose(plan) -> None:
-    figure = figures.draw_plan(plan)
+    figure = draw_plan(plan)
     for axes in figure.axes:
         numbers = ", ".join(text.get_text().replace("\n", ", ") for text in axes.texts)
         drawn = sorted(int(number) for number in numbers.split(", ") if number)
@@ -261,7 +266,7 @@ def test_plan_numbers_every_pose(plan) -> None:
 
 def test_plan_that_goes_via_home_says_so(plan) -> None:
     via = np.arange(len(plan.poses)) == 2
-    figure = figures.draw_plan(replace(plan, poses=replace(plan.poses, via_home=via)))
+    figure = draw_plan(replace(plan, poses=replace(plan.poses, via_home=via)))
     assert "path via home" in [text.get_text() for text in figure.legends[0].texts]
     assert sum(line.get_linestyle() == "--" for line in figure.axes[0].lines) == 2
 
@@ -301,7 +306,7 @@ def test_one_parameter_and_one_pose_are_singular(five_bar, tmp_path) -> None:
 
 @pytest.mark.parametrize(("name", "panels"), [("five-bar", 1), ("3-rrr", 1), ("linear-delta", 2)])
 def test_planar_robot_has_one_flat_view(name, panels) -> None:
-    figure = figures.draw_robot(lc.load_robot(name))
+    figure = draw_robot(lc.load_robot(name))
     assert len(figure.axes) == panels
     assert figure.axes[-1].name == "rectilinear"
 
@@ -325,6 +330,6 @@ def test_labels_of_many_poses_are_numbers_and_long_ones_are_shortened() -> None:
 
 
 def test_figure_is_shown_in_a_notebook_without_pyplot(five_bar) -> None:
-    content, size = figures.draw_convergence(five_bar.fit)._repr_png_()
+    content, size = draw_convergence(five_bar.fit)._repr_png_()
     assert content.startswith(b"\x89PNG")
     assert size == {"width": 864, "height": 374}

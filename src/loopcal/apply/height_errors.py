@@ -29,7 +29,8 @@ from loopcal.diagnose.row_errors import (
 from loopcal.errors import DataError
 from loopcal.estimate.result import Identification
 from loopcal.findings.wording import round_to_digits
-from loopcal.measure import kinds
+from loopcal.measure.kinds.poses import Component
+from loopcal.measure.kinds.surfaces import Plane
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism.assembly import AXES
@@ -192,9 +193,9 @@ def _measures_height(rows: Observations) -> bool:
     kind = rows.kind
     if rows.measured.shape[1] != 1:  # asked first: most data need no import of these two kinds
         return False
-    if isinstance(kind, kinds.Component):
+    if isinstance(kind, Component):
         return kind.components == ("z",) and bool(kind.T_base_frame[2, 2] > UPRIGHT)
-    return isinstance(kind, kinds.Plane) and len(kind.targets) == 1
+    return isinstance(kind, Plane) and len(kind.targets) == 1
 
 
 def _list_heights(
@@ -208,7 +209,7 @@ def _list_heights(
             continue
         points = _locate_points(compared.after.T[0, o.rows.reshape(len(o))], o, robot)
         extent = np.ptp(points, axis=0)
-        if isinstance(o.kind, kinds.Plane) and extent[2] > LEVEL * extent[:2].max():
+        if isinstance(o.kind, Plane) and extent[2] > LEVEL * extent[:2].max():
             continue  # a wall
         labels = tuple(compared.data.labels[k] for k in o.rows.reshape(len(o)))
         yield labels, points[:, :2], before[i][:, 0], after[i][:, 0]
@@ -218,8 +219,8 @@ def _locate_points(T: FloatArray, rows: Observations, robot: Mechanism) -> Float
     """Return the touching points (r, 3) [m] in the base, with the tool or target as stated."""
     kind = rows.kind
     place = robot.tool[:3, 3]
-    if isinstance(kind, kinds.Component) and kind.T_platform_tool is not None:
+    if isinstance(kind, Component) and kind.T_platform_tool is not None:
         place = kind.T_platform_tool[:3, 3]
-    if isinstance(kind, kinds.Plane) and kind.places is not None:
+    if isinstance(kind, Plane) and kind.places is not None:
         place = kind.places[0]
     return T[:, :3, :3] @ place + T[:, :3, 3]

@@ -474,7 +474,16 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     DataError
         A number that belongs to another method.
     """
-    from loopcal import estimate
+    from loopcal.estimate.losses import Huber, Tukey
+    from loopcal.estimate.options import FitOptions
+    from loopcal.estimate.penalties import (
+        GCV,
+        MAP,
+        LeastSquares,
+        Ridge,
+        TruncatedSVD,
+        TruncationGCV,
+    )
     from loopcal.estimate.residual_test import SIGMA_UNCERTAINTY
     from loopcal.numerics.decomposition import RANK_TOLERANCE
 
@@ -495,15 +504,15 @@ def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
     if name == "auto":
         method = _make_default(inflation)
     elif name == "ridge":
-        method = estimate.Ridge(estimate.GCV() if lam is None else lam)
+        method = Ridge(GCV() if lam is None else lam)
     elif name == "tsvd":
-        method = estimate.TruncatedSVD(estimate.TruncationGCV() if keep is None else keep)
+        method = TruncatedSVD(TruncationGCV() if keep is None else keep)
     else:
-        method = estimate.MAP() if name == "map" else estimate.LeastSquares()
+        method = MAP() if name == "map" else LeastSquares()
     loss = None
     if options["loss"] != "none":
-        loss = estimate.Huber() if options["loss"] == "huber" else estimate.Tukey()
-    return estimate.FitOptions(
+        loss = Huber() if options["loss"] == "huber" else Tukey()
+    return FitOptions(
         method=method,
         loss=loss,
         noise=options["noise"],

@@ -20,8 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine, geometry, measure
+from loopcal import engine, geometry
 from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.measure.kinds.position import Position
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.numerics.decomposition import decompose, empty_factor
@@ -97,7 +98,7 @@ class _Repeats(NamedTuple):
     (E, 3 k, 3 k) of their rows, and sessions (E,).
     """
 
-    kind: measure.Position
+    kind: Position
     points: FloatArray
     whitener: FloatArray
     session: list[str]
@@ -182,7 +183,7 @@ def _leave_out(data: Measurements, changed: Sequence[ShapeTest]) -> Measurements
     for rows in data.base_observations:
         kind, measured = rows.kind, np.array(rows.measured)
         for shape in changed:
-            if isinstance(kind, measure.Position) and (kind.frame, kind.targets) == (
+            if isinstance(kind, Position) and (kind.frame, kind.targets) == (
                 shape.frame,
                 shape.targets,
             ):
@@ -234,7 +235,7 @@ def compare_shapes(data: Measurements) -> tuple[ShapeTest, ...]:
     return tuple(tests)
 
 
-def _states_places(kind: measure.Position) -> bool:
+def _states_places(kind: Position) -> bool:
     """Return whether the places of targets are known."""
     return "targets" not in kind.unknown
 
@@ -246,11 +247,11 @@ def _list_repeats(data: Measurements, *, with_places: bool = False) -> Iterator[
     """
     groups: dict[tuple[str, tuple[str, ...]], list[Observations]] = {}
     for rows in data.base_observations:
-        if isinstance(rows.kind, measure.Position):
+        if isinstance(rows.kind, Position):
             groups.setdefault((rows.kind.frame, rows.kind.targets), []).append(rows)
     for alike in groups.values():
         kind = alike[0].kind
-        assert isinstance(kind, measure.Position)
+        assert isinstance(kind, Position)
         order = [_order_rows(rows) for rows in alike]
         pairs = list(zip(alike, order, strict=True))
         measured = np.concatenate([rows.measured[i] for rows, i in pairs])

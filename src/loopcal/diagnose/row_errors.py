@@ -28,10 +28,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loopcal import measure
 from loopcal.errors import DataError
 from loopcal.estimate.pose_estimate import PoseFit, fit_poses, predict_from_readings
 from loopcal.findings import Finding, report_finding
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.kinds.kind import list_error_groups
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
@@ -643,7 +643,7 @@ def predict_poses(
     values, kept = unknowns.values(), ()
     if setup is not None and len(unknowns):
         kept = tuple(name for name in unknowns.table.names if name in setup)
-        values = measure.guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
+        values = guess_nuisance_values(data, T, _fix_nuisance(unknowns, setup), joints)
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 

@@ -17,9 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine, measure
+from loopcal import engine
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.pose_linearization import KindRows
+from loopcal.measure.initial_values import guess_nuisance_values
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
@@ -190,7 +191,7 @@ class NuisanceElimination:
             observations=tuple(rows for rows, _, _ in chosen if not rows.kind.is_of_base),
             base_observations=tuple(rows for rows, _, _ in chosen if rows.kind.is_of_base),
         )
-        values[used] = measure.guess_nuisance_values(part, T, setup, joints)
+        values[used] = guess_nuisance_values(part, T, setup, joints)
 
     def keep_apart(
         self, parameters: int, nodes: IntArray

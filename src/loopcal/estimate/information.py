@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal import engine, measure
+from loopcal import engine
 from loopcal.estimate.frame_freedoms import frame_twists
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.pose_linearization import LinearizedPoses, linearize_at_readings
 from loopcal.estimate.problem import problem_of
+from loopcal.measure.initial_values import evaluate_measurements, whiten_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.readings import resolve_reading_sigma
@@ -89,10 +90,10 @@ def observe_rows(
     those of `poses.linearized`.
     """
     linearized = poses.linearized
-    evaluated = measure.evaluate_measurements(
+    evaluated = evaluate_measurements(
         measured, linearized.T, values[None], nuisance, linearized.joints
     )
-    rows = measure.whiten_rows(evaluated, linearized.by_parameters, linearized.joints_by_parameters)
+    rows = whiten_rows(evaluated, linearized.by_parameters, linearized.joints_by_parameters)
     p, u = linearized.by_parameters.shape[-1], len(nuisance)
     return np.concatenate([rows[..., p : p + u], rows[..., :p], rows[..., p + u :]], axis=-1)
 

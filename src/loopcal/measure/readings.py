@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal import mechanism
 from loopcal.engine import State
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds.kind import Kind
+from loopcal.mechanism.chains import select_platform_entries
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.solutions import Solution, inverse
 from loopcal.typing import BoolArray, FloatArray
@@ -99,7 +99,7 @@ def select_joint_values(
     """
     actuators = [actuator.name for actuator in robot.actuators]
     passive = _index_passive_joints(robot)
-    entries = mechanism.select_platform_entries(robot, state) if robot.stages else {}
+    entries = select_platform_entries(robot, state) if robot.stages else {}
     values = {}
     for name in names:
         if name in actuators:

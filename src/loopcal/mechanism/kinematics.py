@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import Program, State
-from loopcal.mechanism import actuation
-from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums
+from loopcal.mechanism.actuation import DrivenJoints, drive_joints, drive_sums, solve_open_sums
 from loopcal.mechanism.chains import (
     compute_stage_limb_frames,
     multiply_signs,
@@ -105,7 +104,7 @@ class Loops(NamedTuple):
         """Return states (t, n) at joint values or sums (t | 1, n, a)."""
         program = self.robot.program
         if self.weights is not None:
-            return actuation.solve_open_sums(program, self.e, self.weights, values, begin)
+            return solve_open_sums(program, self.e, self.weights, values, begin)
         return clear_sign(self.robot, engine.solve(program, self.e, values, begin, goal=goal))
 
     def read(self, state: State) -> FloatArray:
@@ -270,7 +269,7 @@ def step_towards_closure(
     """
     if robot.has_open_sums:
         e, sums, weights = drive_sums(robot, values, q)
-        return actuation.solve_open_sums(robot.program, e, weights, sums, begin, 1)
+        return solve_open_sums(robot.program, e, weights, sums, begin, 1)
     e, _, joints = drive_joints(robot, values, q)
     return engine.solve(robot.program, e, joints, begin, max_iterations=1)
 
@@ -387,7 +386,7 @@ def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> 
         weights = select_weights(tau)
         assert weights is not None
         sums = apply_weights(weights, joints)
-        return actuation.solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
+        return solve_open_sums(robot.program, e, weights, sums, state, 0).closure_sign
     return engine.solve(robot.program, e, joints, state, max_iterations=0).closure_sign
 
 

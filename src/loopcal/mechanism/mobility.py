@@ -14,7 +14,7 @@ from loopcal import engine
 from loopcal.engine import ENDINGS
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.mechanism import actuation
+from loopcal.mechanism.actuation import differentiate_lengths
 from loopcal.mechanism.assembly import (
     AXES,
     MOST_ACTUATORS,
@@ -116,7 +116,7 @@ def _check_open_sums(robot: Mechanism, scale: FloatArray) -> None:
     e, tau = robot.slots(robot.values[None])
     weights = select_weights(tau)
     assert weights is not None
-    slope = actuation.differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
+    slope = differentiate_lengths(robot.program, e, robot.home_state)[0, 0]
     if count_rank(np.linalg.svd(weights[0] @ slope * scale, compute_uv=False)) < len(scale):
         raise MechanismError(
             f"{robot.name}: the sums of its readings do not hold the platform at home, where it "

@@ -19,8 +19,14 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import State
-from loopcal.mechanism import actuation
-from loopcal.mechanism.actuation import DrivenJoints, drive_joints
+from loopcal.mechanism.actuation import (
+    DrivenJoints,
+    Motion,
+    differentiate_driven_joints,
+    differentiate_joints_by_readings,
+    differentiate_open_sums,
+    drive_joints,
+)
 from loopcal.mechanism.chains import (
     differentiate_end,
     differentiate_joints,
@@ -72,7 +78,7 @@ def differentiate_pose(
         whole = differentiate_end(robot, values, q, state, differentiate_pose, columns)
         return PoseSensitivity(*whole)
     if robot.has_open_sums:
-        derivatives = actuation.differentiate_open_sums(robot, values, q, state, columns)
+        derivatives = differentiate_open_sums(robot, values, q, state, columns)
     else:
         e, tau = robot.slots(values)
         joints = joints_from_readings(q, tau, robot.slots.frequency)
@@ -83,7 +89,7 @@ def differentiate_pose(
         derivatives = differentiate(robot.program, e, joints, state, inputs)
         if robot.has_sums:
             by_parameters, by_joints = derivatives
-            turns = actuation.differentiate_joints_by_readings(robot, values, q)
+            turns = differentiate_joints_by_readings(robot, values, q)
             derivatives = by_parameters, np.matmul(by_joints, turns)
     lost = ~is_closed(state.status)
     if lost.any():
@@ -145,8 +151,8 @@ def differentiate_passive_joints(
     platform, freedoms = differentiate_pose(robot, values, q, state), list(robot.program.freedoms)
     summed = None
     if robot.has_sums:
-        twist = actuation.Motion(platform.parameters, platform.readings)
-        summed = actuation.differentiate_driven_joints(robot, values, q, state, twist)
+        twist = Motion(platform.parameters, platform.readings)
+        summed = differentiate_driven_joints(robot, values, q, state, twist)
     for rows, limbs in linearize_limbs(robot, values, q, state):
         by_parameter = platform.parameters[rows][:, :, freedoms]
         by_reading = platform.readings[rows][:, :, freedoms]

@@ -134,7 +134,7 @@ def calibrate(
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
       loopcal calibrate robot.yaml samples.csv -o run --compare published.yaml
     """  # noqa: D301
-    from loopcal import io, workflow
+    from loopcal.io.robot.robot_file import load_robot, load_stored_values
     from loopcal.io.runs.run_folder import (
         build_document,
         load_run,
@@ -143,22 +143,24 @@ def calibrate(
         save_run,
     )
     from loopcal.report.calibration_view import view_calibration
+    from loopcal.workflow.calibration import calibrate
+    from loopcal.workflow.calibration_options import CalibrationOptions
 
     inputs = _list_inputs(robot, data, prior, compare)
-    machine = io.load_robot(robot)
-    settings = workflow.CalibrationOptions(
+    machine = load_robot(robot)
+    settings = CalibrationOptions(
         make_fit_options(options),
         hold_out,
         seed=seed,
         prior=None if prior is None else load_run(prior).load_posterior(),
-        compare_with=None if compare is None else io.load_stored_values(compare, machine),
+        compare_with=None if compare is None else load_stored_values(compare, machine),
         check_conventions=not options["allow_implausible"],
         **{name: options[name] for name in TAKEN_OPTIONS},
     )
     refuse_run_folder(output, force, list(inputs.values()))
     measurements = read_measurements(data, machine, **{name: options[name] for name in ALLOWED})
     with terminal.ProgressBar() as progress:
-        report = workflow.calibrate(machine, measurements, settings, progress)
+        report = calibrate(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
     with terminal.ProgressBar() as progress:
         progress(0, 1, "writing the run folder")

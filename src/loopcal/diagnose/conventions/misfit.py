@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine, measure
+from loopcal import engine
 from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.elimination import plan_elimination
@@ -25,6 +25,7 @@ from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
 from loopcal.estimate.problem import Problem, make_problem, problem_of
 from loopcal.findings import Quantity
+from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.mechanism.kinematics import find_directly_reachable, forward_trials
@@ -327,7 +328,7 @@ def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatA
         if t == 1:
             present = np.any(rows.whitener[0] != 0.0, axis=(1, 2))
             observations[i] = observations[i].with_weights(present * observations[i].weight)
-    return measure.guess_nuisance_values_batch(
+    return guess_nuisance_values_batch(
         replace(data, observations=tuple(observations)),
         measured,
         forward_trials(robot, robot.values[None], data.readings[None]).T,
@@ -429,7 +430,7 @@ def guess_frames(
     T[reached] = forward_trials(robot, robot.values[None], readings[reached][None]).T[0]
     measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
     most, steps = QUICK.candidates, QUICK.guess_steps
-    start = measure.guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
+    start = guess_nuisance_values_batch(data, measured, T, nuisance, most=most, steps=steps)
     sizes = [np.zeros((h, 0))]
     for o, places in zip(data.observations, nuisance.indices, strict=True):
         if len(o) and not o.kind.sensed_joints:

@@ -27,10 +27,11 @@ from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 
-from loopcal import geometry, mechanism
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import set_fields
 from loopcal.measure.kinds.setup_parameters import SetupItem
+from loopcal.mechanism.chains import name_platform_entries
 from loopcal.numerics.elimination import without_rounding
 from loopcal.numerics.statistics import find_distinct
 from loopcal.parameters import Parameter
@@ -326,7 +327,7 @@ def list_sensed_numbers(of: str) -> tuple[str, ...]:
     """Return the names of the numbers of the platform of a stage; none without a stage, or of the
     base.
     """
-    return mechanism.name_platform_entries(of) if of not in ("", BASE) else ()
+    return name_platform_entries(of) if of not in ("", BASE) else ()
 
 
 def find_platform(of: str, T: FloatArray, joints: FloatArray) -> FloatArray:
